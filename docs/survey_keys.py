@@ -57,15 +57,17 @@ def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
 
 
 def comments_of(section: type[Section]) -> dict[str, str]:
-    """Return the comment behind each field of a section, on one of its lines or the line before it."""
+    """Return the comment on each field of a section, from the lines before it and from its own lines."""
     source = inspect.getsource(section)
     lines, found = source.splitlines(), {}
     body: Any = ast.parse(source).body[0]
     for one in body.body:
         if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
             said = [line.partition("  # ")[2] for line in lines[one.lineno - 1 : one.end_lineno]]
-            if lines[one.lineno - 2].lstrip().startswith("# "):
-                said.insert(0, lines[one.lineno - 2].strip().removeprefix("# "))
+            above = one.lineno - 2
+            while lines[above].lstrip().startswith("# "):
+                said.insert(0, lines[above].strip().removeprefix("# "))
+                above -= 1
             texts = [text for text in said if text and not text.startswith("type:")]
             if texts:
                 found[one.target.id] = " ".join(texts)

@@ -35,14 +35,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.comparison.congruency import (
-    MIN_STABLE,
-    MOTIONS,
-    STABLE_FRACTION,
-    bending,
-    motions,
-    strain,
-)
+from sfm.comparison.congruency import MIN_STABLE, MOTIONS, STABLE_FRACTION, bending, motions, strain
 from sfm.comparison.pairing import ROUNDING, PointPairs, fit_affinity, fit_robustly, nearest_places
 from sfm.comparison.stable_points import (
     candidates_of,

@@ -1,6 +1,6 @@
-"""The survey beside other programs, and the result put together from what its stages returned.
+"""Assembly of the survey result from its stages, and comparison with other programs.
 
-The settings that a survey was run with, as its report lists them.
+The result also lists the settings that the survey was run with, for its report.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.plates import points_of_plates
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
-"""another adjuster: network and start values in, its solution out"""
+"""another adjuster: takes a network and start values, returns its solution"""
 
 
 def assemble_result(
@@ -43,10 +43,10 @@ def assemble_result(
     compared: SurveyComparison,
     clock: StageClock,
 ) -> SurveyResult:
-    """Return everything that a survey ends with; each argument is what the stage of that name returned."""
+    """Return the result of a survey; each argument is the return value of the stage of that name."""
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
-    is_in = set(adjustment.network.images)  # a photograph may fit at last, with a per-photograph camera
+    is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
     failed = tuple(
         FailedImage(*one)
         for one in (*start.failures, *matched.left_out, *solution.dropped_images)
@@ -104,7 +104,7 @@ def _plates(survey: Survey, code: IntArray) -> tuple[SeenPlate, ...]:
 
 
 def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
-    """Return the points of which the control table marks coordinates to check with."""
+    """Return the points with coordinates that the control table marks as check coordinates."""
     control = survey.control
     if control is None or control.check is None:
         return ()
@@ -115,10 +115,10 @@ def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
 
 
 def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
-    """Return (table of the survey file, its keys and values) of all that was stated or has a default.
+    """Return (table of the survey file, its keys and values) of all stated and default settings.
 
     Args:
-        survey: as it was run.
+        survey: the survey that was run.
     """
     sections: list[tuple[str, Section]] = [(f"camera {one.name}", one) for one in survey.cameras]
     if survey.observations is None:
@@ -146,7 +146,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
 
 
 def _words(values: dict[str, Any]) -> str:
-    """Return keys with values that are not empty."""
+    """Format the keys whose values are not empty."""
     return "; ".join(
         f"{key} = {_word(value)}"
         for key, value in values.items()
@@ -161,28 +161,28 @@ def _word(value: Any) -> str:
 
 
 Mapper = Callable[[Path, tuple[tuple[str, ...], ...]], Baseline]
-"""another pipeline: folder, and for each camera the names of its photographs in it, in; its solution out"""
+"""another pipeline: takes a folder and the names of each camera's photographs in it, returns its solution"""
 
 
 @dataclass(frozen=True)
 class OtherPrograms:
-    """Programs to compare a survey with; functions, so that the survey imports none of their libraries."""
+    """Programs to compare a survey with, as functions: the survey imports none of their libraries."""
 
     adjuster: Adjuster | None = None
     mapper: Mapper | None = None
 
 
 ALONE = OtherPrograms()
-"""compare with nothing"""
+"""no comparison"""
 
 
 @dataclass(frozen=True)
 class SurveyComparison:
-    """The survey beside what it was compared with; None where there is nothing."""
+    """Comparisons of a survey with other programs; None where there is none."""
 
     adjusters: AdjusterComparison | None = None
     baseline: BaselineComparison | None = None
-    remarks: tuple[Remark, ...] = ()  # comparisons that were asked for and failed, or were left out
+    remarks: tuple[Remark, ...] = ()  # on requested comparisons that failed or were left out
 
 
 def compare_solution(
@@ -190,14 +190,14 @@ def compare_solution(
 ) -> SurveyComparison:
     """Compare a solution with those of other programs.
 
-    The survey is valid without them: one that refuses is a warning in the result and does not lose it. A
-    library that is not installed is reported without a warning's weight, since it is no defect of the survey.
+    The survey is valid without them: if one of them fails, the result has a warning. A library that is not
+    installed gives a remark but no warning, since that is no defect of the survey.
 
     Args:
-        solution: of the survey.
-        others: what to compare with.
-        clock: of the survey; the stages it has timed so far are the time of the survey.
-        files: the photographs, for another pipeline.
+        solution: solution of the survey.
+        others: programs to compare with.
+        clock: times the stages; the stages timed so far are the time of the survey.
+        files: photographs for another pipeline.
     """
     own_seconds = sum(seconds for _, seconds in clock.seconds)
     adjusters = baseline = None

@@ -1,10 +1,10 @@
-"""Two cameras before a plate that looks alike turned: the same turn for what both photograph at once.
+"""Turns of a plate that looks alike when turned: cameras of a rig must see the same turn at one moment.
 
-For one camera any turn of a photograph is as good as another, since the points of the turned plate coincide
-with those of the plate. Between cameras it is not: their relative orientation is that of the rig in one turn
-only. Cameras mounted together have one relative orientation at all places of the plate, which a wrong turn
-has not, unless the plate was not moved. Photographs are of one moment by the last number in their names, or
-by their order.
+For a single camera any turn is as good as another, since the points of the turned plate coincide with those
+of the plate. For two cameras it is not: their relative orientation is that of the rig in one turn only.
+Cameras mounted together have the same relative orientation at every position of the plate. A wrong turn
+violates this, unless the plate was not moved. Photographs of one moment are found by the last number in their
+names, or by their order.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import build_network, name_coded
 from sfm.targets.codes.plates import PlateFamily
 
-RIGS_TRIED = 12  # pairs of photographs, spread over all, whose relative orientation is tried on the others
+RIGS_TRIED = 12  # evenly spread pairs of photographs whose relative orientation is tried on the others
 OF_A_RIG = 6  # parameters of a relative orientation with its scale
-ALPHA = 0.001  # probability with which turns are taken for certain though others are as true
+ALPHA = 0.001  # probability of accepting turns as certain although others are equally likely
 
 
 class Pair(NamedTuple):
@@ -46,38 +46,38 @@ class Pair(NamedTuple):
 class _Rig:
     """A relative orientation of two cameras, and how pairs of photographs agree with it."""
 
-    turn: IntArray  # of the plate in the right photograph, 0 where it is named alike, (p,)
-    misfit: FloatArray  # RMS distance of its points from where the left photograph places them, px, (p,)
-    agrees: BoolArray  # whether each is nearest to where the point of its number is placed, (p,)
+    turn: IntArray  # turn of the plate in the right photograph, 0 if both have the same names, (p,)
+    misfit: FloatArray  # RMS distance of its points from their positions by the left photograph, px, (p,)
+    agrees: BoolArray  # whether each point is nearest to the predicted position of its number, (p,)
 
     @classmethod
     def none(cls, count: int) -> _Rig:
-        """Return one that no pair agrees with."""
+        """Return a relative orientation that no pair agrees with."""
         return cls(np.zeros(count, dtype=np.int64), np.full(count, np.inf), np.zeros(count, dtype=bool))
 
     def squares(self, rows: BoolArray) -> float:
-        """Return the sum of the squared misfits of some pairs, px^2."""
+        """Return the sum of squared misfits of the selected pairs, px^2."""
         return float((self.misfit[rows] ** 2).sum())
 
     @property
     def rank(self) -> tuple[int, float]:
-        """Sort key, less for a turn that more pairs agree with, and more closely."""
+        """Sort key: smaller if more pairs agree, then if they agree more closely."""
         return -int(self.agrees.sum()), self.squares(self.agrees)
 
 
 def agree_on_turns(
     survey: Survey, measured: Measurements, start: Orientation
 ) -> tuple[Measurements, Orientation]:
-    """Name the points of a plate that looks alike turned in the same turn for cameras mounted together.
+    """Rename the points of a plate that looks alike turned, so that mounted cameras see the same turn.
 
     Args:
-        survey: with the plate.
-        measured: its points in each photograph, in any turn.
-        start: orientation from them.
+        survey: states the plate.
+        measured: points of the plate in each photograph, in any turn.
+        start: orientation from these points.
 
     Returns:
-        The image points, renamed where the turn was another than that of the first camera, and the
-        orientation from them, with a remark on the photographs of pairs whose turn remains uncertain.
+        The image points, renamed where the turn differed from that of the first camera, and the orientation
+        from them. A remark lists the photographs of pairs whose turn remains uncertain.
     """
     plate, photographs = survey.family, measured.photographs
     cameras = np.unique(measured.network.camera)
@@ -121,7 +121,7 @@ def agree_on_turns(
 
 
 def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair]]:
-    """Return the photographs of two cameras that may be of one moment, by number and by order."""
+    """Return the possible pairs of photographs of one moment: by number, and by order."""
     assert measured.files is not None
     files, row = measured.files, {name: i for i, name in enumerate(measured.network.images)}
     names = [
@@ -136,12 +136,12 @@ def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair
 
 
 def _pairs_in(row: dict[str, int], names: Iterable[tuple[str, str]]) -> list[Pair]:
-    """Return pairs of names as rows, those of which both are measured."""
+    """Return the pairs of names as rows, without pairs whose photographs are not both measured."""
     return [Pair(row[left], row[right]) for left, right in names if left in row and right in row]
 
 
 def _numbered(names: Sequence[str]) -> dict[int, str]:
-    """Return names by the last number in them; none that two have in common."""
+    """Return the names by the last number in them, without numbers that two names share."""
     found: dict[int, list[str]] = {}
     for name in names:
         digits = re.findall(r"\d+", PurePosixPath(name).stem)
@@ -153,10 +153,10 @@ def _numbered(names: Sequence[str]) -> dict[int, str]:
 def _common_rig(
     plate: PlateFamily, measured: Measurements, estimate: Estimate, pairs: Sequence[Pair]
 ) -> _Rig | None:
-    """Return the relative orientation of two cameras that most pairs agree on; None where two may be true.
+    """Return the relative orientation of two cameras that most pairs agree on; None if another is possible.
 
-    That of other turns may fit as well, if the plate was moved too little. Both have as many unknowns, so
-    that the ratio of their squared misfits decides.
+    If the plate was moved too little, the relative orientation of other turns may fit as well. Both have the
+    same number of unknowns, so the ratio of their squared misfits decides.
     """
     seen = np.flatnonzero([estimate.oriented[list(pair)].all() for pair in pairs])
     if len(seen) < 2:
@@ -174,7 +174,7 @@ def _common_rig(
 
 
 def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int) -> bool:
-    """Return whether most pairs agree with a relative orientation, and with no other as well (F test)."""
+    """Return whether most pairs agree with the best one, and no other fits as well (F test)."""
     agreeing = int(best.agrees.sum())
     if agreeing < 2 or 2 * agreeing <= pairs:
         return False
@@ -185,7 +185,7 @@ def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int) -> bool:
 
 
 class _Views:
-    """The photographs of a plate as they are oriented to it."""
+    """The photographs of a plate, with their orientation relative to it."""
 
     def __init__(self, plate: PlateFamily, measured: Measurements, estimate: Estimate) -> None:
         network, naming = measured.network, measured.naming
@@ -196,12 +196,12 @@ class _Views:
         rows = rows_of(network.image_points.image, len(network.images))
         self.number = [naming.code[network.image_points.point[some]] for some in rows]
         self.xy = [network.image_points.xy[some] for some in rows]
-        # approximate points are no plate that looks exactly alike turned
+        # the exact plate: the approximate points do not look exactly alike turned
         plane, known = plate.plane(1.0), estimate.determined
         self.points = fit_similarity(plane[naming.code[known]], estimate.points[known]).apply(plane)
 
     def relative_orientation(self, pair: Pair, turn: int) -> tuple[FloatArray, FloatArray]:
-        """Return rotation and base of the right camera in the frame of the left one, its plate turned."""
+        """Return rotation and base of the right camera, its plate turned, in the frame of the left one."""
         left, right = pair
         motion = fit_similarity(self.points, self.points[self.turns[turn]], scale=1.0)
         R, X0 = self.estimate.rotation, self.estimate.position
@@ -209,7 +209,7 @@ class _Views:
         return R[left].T @ motion.rotation @ R[right], R[left].T @ base
 
     def compare(self, pairs: Sequence[Pair], rows: IntArray, rotation: FloatArray, base: FloatArray) -> _Rig:
-        """Return how some of the pairs, each in its best turn, agree with a relative orientation."""
+        """Return how the selected pairs, each in its best turn, agree with a relative orientation."""
         found = _Rig.none(len(pairs))
         R, X0 = self.estimate.rotation, self.estimate.position
         for k in rows.tolist():

@@ -1,4 +1,8 @@
-"""The targets of a survey as circles in space: what is none, and the eccentricity of what is one."""
+"""Eccentricity of circular targets: the centre of an ellipse is not the image of the circle's centre.
+
+Each target's ellipses in several photographs give a circle in space. Image points of circles are corrected
+for eccentricity. Uncoded points whose outlines are not images of one circle are removed.
+"""
 
 from __future__ import annotations
 
@@ -19,43 +23,40 @@ from sfm.survey.placing import object_scale
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.outlines import Flag
 
-# No centres of ellipses: nothing is eccentric in these.
+# Points that are not centres of ellipses have no eccentricity.
 NO_CIRCLE = Flag.CORNER | Flag.CROSSING | Flag.CONCENTRIC
 
-NOT_A_CIRCLE = (
-    0.1  # relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2
-)
-
-
-OTHER_SIZE = 0.1  # relative difference of a stated diameter from that of the ellipses, which know 1 to 3 %
+# Relative misfit of the semi-axes; targets have 0.003 to 0.03, letters and leaves over 0.2.
+NOT_A_CIRCLE = 0.1
+# Relative difference of a stated diameter from that of the ellipses, which are good to 1 to 3 %.
+OTHER_SIZE = 0.1
 
 
 @dataclass(frozen=True)
 class CircleCheck:
     """The network after its targets were compared with circles in space."""
 
-    network: Network  # image points of the circles' centres
+    network: Network  # its image points are corrected to the centres of the circles
     estimate: Estimate  # without the points that are not circles
     no_circles: tuple[str, ...]  # uncoded points left out: their outlines are not images of one circle
-    eccentricity: Eccentricity | None  # what was corrected; None where nothing was
+    eccentricity: Eccentricity | None  # of the corrections; None without corrections
     remarks: tuple[Remark, ...] = ()  # on stated diameters
 
 
 def check_circles(
     survey: Survey, photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
 ) -> CircleCheck:
-    """Leave out uncoded points that are not circles, and correct the others for eccentricity.
+    """Remove uncoded points that are not circles, and correct the others for eccentricity.
 
-    Radius and normal of every target come from its ellipses; a diameter that the survey gives replaces the
+    Radius and normal of every target come from its ellipses. A diameter that the survey states replaces the
     radius. The covariance of the correction is added to that of the image point.
 
     Args:
         survey: states whether to correct the eccentricity, and the diameter if it is known.
         photographs: the targets that `network` was built from.
-        naming: which point each of them is.
+        naming: object point of each target.
         network: all image points.
         estimate: adjusted, in any datum and scale.
-
     """
     seen = network.image_points
     rows = _seen_twice(photographs, naming, network, estimate)
@@ -101,15 +102,15 @@ def check_circles(
 def circle_misfit(
     photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
 ) -> float:
-    """Return the median misfit of the targets as circles, relative to their size; infinite without any.
+    """Return the median misfit of the targets as circles, relative to their size; infinite without targets.
 
-    The misfits of a wrong solution of a plane are its distortion: there its circles are ellipses.
+    A wrong solution of a plane distorts the plane, so that its circles become ellipses with large misfits.
 
     Args:
         photographs: the targets that `network` was built from.
-        naming: which point each of them is.
+        naming: object point of each target.
         network: all image points.
-        estimate: in any datum and scale; what is NaN in it is left out.
+        estimate: in any datum and scale; points and photographs that are NaN are ignored.
     """
     rows = _seen_twice(photographs, naming, network, estimate)
     numbers, point = np.unique(network.image_points.point[rows], return_inverse=True)
@@ -122,7 +123,7 @@ def circle_misfit(
 def _seen_twice(
     photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
 ) -> BoolArray:
-    """Return which image points are of targets with an outline in two oriented photographs or more, (k,)."""
+    """Return which image points are of targets with outlines in two or more oriented photographs, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
     rows &= _named(photographs, naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
@@ -131,7 +132,7 @@ def _seen_twice(
 
 
 def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
-    """Return the radius of each target that the survey states, NaN where it does not, object unit, (n,)."""
+    """Return the stated radius of each target, NaN where none is stated, object unit, (n,)."""
     diameter = survey.targets.diameter
     radius = np.full(len(points), np.nan if diameter is None else diameter / 2)
     if survey.diameters is not None:
@@ -141,7 +142,7 @@ def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
 
 
 def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Remark, ...]:
-    """Return a remark on the ids of the table of diameters that no target of the survey has."""
+    """Return a remark on ids in the table of diameters that no target of the survey has."""
     known = set(points)
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
@@ -154,14 +155,14 @@ def _other_sizes(
 ) -> tuple[Remark, ...]:
     """Return remarks on stated diameters that the ellipses contradict.
 
-    The one diameter of all targets is judged by their median, since other round things may be among the
-    uncoded ones; those of a table are judged one by one.
+    The common diameter of all targets is judged by their median, since the uncoded ones may include other
+    round things. The diameters of a table are judged one by one.
 
     Args:
-        survey: states which diameters are of single targets.
+        survey: states which diameters apply to single targets.
         points: names of the targets, (n,).
-        stated: their radii, NaN where not stated, object unit, (n,).
-        found: their radii by the ellipses, object unit, (n,).
+        stated: stated radii, NaN where not stated, object unit, (n,).
+        found: radii from the ellipses, object unit, (n,).
     """
     single = np.zeros(len(points), dtype=bool)
     if survey.diameters is not None:
@@ -197,7 +198,10 @@ def _other_sizes(
 
 
 def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:
-    """Return what is known of the targets of each photograph for the image points made of them, (k, ...)."""
+    """Return the values of the named targets in the order of the image points, (k, ...).
+
+    values: one array for each photograph, with a row for each of its targets.
+    """
     targets = zip(values, naming.point, strict=True)
     return np.concatenate([of_photograph[named != UNNAMED] for of_photograph, named in targets])
 
@@ -210,7 +214,7 @@ def _views(
     rows: BoolArray,
     point: IntArray,
 ) -> CircleViews:
-    """Return the ellipses of some image points with the rays they were seen along."""
+    """Return the ellipses of the selected image points, with their rays."""
     shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
     shape = _named(photographs, naming, shapes)[rows]
     seen = network.image_points.select(rows)

@@ -1,4 +1,9 @@
-"""Which target is which object point: uncoded targets named by the orientation, and checked as circles."""
+"""Correspondences of a survey: all points of its network, and approximate values.
+
+Uncoded targets are matched with the oriented photographs, and checked as circles. Photographs of another
+object are removed by their contradicting codes. In a survey of texture, windows cover the photographs
+instead.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +16,13 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
-from sfm.network import (
-    Estimate,
-    Network,
-    rows_of,
-    without_given,
-)
+from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import MIN_IMAGE_POINTS, determined, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.result import (
-    Eccentricity,
-    PhotographTargets,
-)
+from sfm.result import Eccentricity, PhotographTargets
 from sfm.runtime.progress import reported
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
@@ -41,9 +38,9 @@ from sfm.survey.measuring.surface_points import cover_photographs
 from sfm.survey.measuring.tie_points import needed_rays
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
-ROUNDS = 3  # matching with the orientation at hand, with the adjusted one, and once more to confirm
-MAX_STRAY = 100.0  # tolerances: median residual of a photograph beyond which it has left its points
-MIN_TOLERANCE_PX = 1.0  # below it a difference is for the statistical test, not for the matching
+ROUNDS = 3  # of matching: with the given orientation, with the adjusted one, and once more to confirm
+MAX_STRAY = 100.0  # median residual, in tolerances, beyond which a photograph has lost its points
+MIN_TOLERANCE_PX = 1.0  # the statistical test judges smaller differences, not the matching
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 
 
@@ -52,31 +49,31 @@ class Correspondences:
     """The network of a survey with all its points, and approximate values."""
 
     network: Network
-    estimate: Estimate  # NaN for points that have left it
+    estimate: Estimate  # NaN for points that were removed
     min_rays: IntArray  # photographs that each point needs, (n,)
-    naming: Naming | None = None  # of targets; None without
-    eccentricity: Eccentricity | None = None  # what was corrected; None where nothing was
+    naming: Naming | None = None  # of the targets; None without targets
+    eccentricity: Eccentricity | None = None  # of the corrections; None without corrections
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     remarks: tuple[Remark, ...] = ()
     point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
-    given: bool = False  # whether the orientation started from approximate values that the survey gives
+    given: bool = False  # whether the orientation started from approximate values of the survey
     left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
-    suspected: tuple[str, ...] = ()  # photographs that could be matched with a per-photograph camera only
-    overlays: tuple[PhotographTargets, ...] | None = None  # what the report draws; None as it was measured
+    suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
+    overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
 
 
 def find_correspondences(
     survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
 ) -> Correspondences:
-    """Return the network with all its points: uncoded targets, or the texture that covers the photographs.
+    """Return the network with uncoded targets, or with the texture that covers the photographs.
 
-    Given image points are as they were.
+    Given image points do not change.
 
     Args:
-        survey: what to do.
+        survey: settings of the survey.
         measured: the named image points, and all targets.
-        start: orientation from the named ones, with the tolerance it has left.
-        jobs: photographs of texture worked on at a time.
+        start: orientation from the named image points, with its final tolerance.
+        jobs: number of photographs of texture processed in parallel.
 
     Raises:
         GeometryError: fewer than two photographs keep enough points.
@@ -121,7 +118,7 @@ def find_correspondences(
 
 @dataclass(frozen=True)
 class _Matched:
-    """All targets with their names, the network that they make, and its adjustment."""
+    """All targets with their names, their network, and its adjusted values."""
 
     naming: Naming
     network: Network
@@ -135,8 +132,8 @@ def _without_other_objects(
     """Match, leave out the photographs whose codes contradict the others, and match the others again.
 
     Returns:
-        The matches; photographs that are left out, with the reason; remarks on codes that are at
-        several places still.
+        The matches; photographs that are left out, with the reason; remarks on codes that are still at
+        several positions.
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
     found = find_contested_codes(photographs, matched.naming)
@@ -154,7 +151,7 @@ def _without_other_objects(
 def _without_contested(
     photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, found: ContestedCodes
 ) -> Estimate:
-    """Return the estimate without photographs of other objects, contested codes where the rest has them."""
+    """Return the estimate without left-out photographs, and with contested codes intersected anew."""
     position, rotation, points = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
     out = list(found.left_out)
     position[out], rotation[out] = np.nan, np.nan
@@ -186,13 +183,10 @@ def _match_and_adjust(
     """Name the uncoded targets and adjust in turn, with a tolerance that shrinks with the residuals.
 
     Args:
-        survey: what to do.
+        survey: settings of the survey.
         photographs: all measured targets.
-        naming: the coded targets by name.
-        start: orientation from the coded targets, with the tolerance it has left.
-
-    Returns:
-        The naming, its network, and the adjusted estimate.
+        naming: names of the coded targets.
+        start: orientation from the coded targets, with its final tolerance.
     """
     estimate, tolerance_px = start.estimate, float(start.tolerance_px.max())
     for _ in reported("rounds of matching", range(ROUNDS), ROUNDS):
@@ -213,17 +207,17 @@ def _match_and_adjust(
 def restore_strayed(
     before: Estimate, adjusted: Adjustment, images: BoolArray, points: BoolArray, *, tolerance_px: float
 ) -> Estimate:
-    """Return the adjusted values, and those before of photographs that have left their points.
+    """Return the adjusted values; photographs that lost their points get their earlier values back.
 
-    Robust weights reject a photograph that does not fit, as one that was zoomed, and it moves out of sight
-    of its points, or far away; the reason is looked for from where it was before.
+    Robust weights reject a photograph that does not fit, such as a zoomed one. It then moves away until it no
+    longer sees its points. The search for the reason starts from its earlier values.
 
     Args:
-        before: values of all photographs and points.
-        adjusted: some of them, adjusted.
-        images: photographs in it, (m,).
-        points: points in it, (n,).
-        tolerance_px: that the residuals were within before, px.
+        before: values of all photographs and points before the adjustment.
+        adjusted: adjustment of some of them.
+        images: photographs in the adjustment, (m,).
+        points: points in the adjustment, (n,).
+        tolerance_px: limit of the residuals before the adjustment, px.
     """
     estimate = merge_estimate(adjusted.estimate, images, points)
     length = np.nan_to_num(np.linalg.norm(adjusted.residuals, axis=1), nan=np.inf)
@@ -238,10 +232,10 @@ def restore_strayed(
 def _match_by_photograph_cameras(
     survey: Survey, photographs: MeasuredPhotographs, matched: _Matched, tolerance_px: float
 ) -> _Matched:
-    """Match photographs that fit only with a per-photograph camera by that camera; else return what is there.
+    """Match photographs that fit only with a per-photograph camera, using that camera; else return `matched`.
 
-    Which camera they have is for the adjustment; with the one of the others their targets lie beyond the
-    tolerance and would make other points.
+    With the shared camera their targets lie beyond the tolerance and would become other points. The
+    adjustment decides later which camera they have.
     """
     estimate = matched.estimate
     accepted = residual_lengths(matched.network, estimate) <= tolerance_px

@@ -1,10 +1,11 @@
-"""Which interior parameters are adjusted where the survey states none: those that its network determines.
+"""Choice of free interior parameters where the survey states none: those that its network determines.
 
-A lens that is held at nominal values bends the network; parameters that a network does not determine take
-its precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The one that the network
-determines worst is held until all others are known better than they are of any camera; then what else the
-image points demand is freed, by the test of held parameters. Three photographs fit many a c, with another
-shape of the object each: of them c is observed, with what a focal length of EXIF data is worth.
+A lens that is held at nominal values bends the network. Parameters that a network does not determine cost
+precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The worst determined parameter
+is held, one after the other, until the network determines all the others better than they are known of any
+camera. Then the test of held parameters frees others that the image points demand. Three photographs fit many
+values of c, each with another shape of the object. For three photographs c is therefore an observation, with
+the precision of a focal length from EXIF data.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 7.3.2 (self-calibration).
 """
@@ -29,41 +30,43 @@ from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
-MIN_PHOTOGRAPHS = 3  # of a free network; a pair determines hardly anything of a camera
-MIN_DETERMINING_C = 4  # photographs of a free network
-C_SIGMA = 0.1  # of c by EXIF data, of c: focusing from infinity to 1 : 5 makes twice as much, c = f (1 + 1/5)
-RATIO_SIGMA = 1e-3  # of the ratio of two focal lengths, which is that of the sides of a pixel
-MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # of a point, and of a photograph, that take part in the decision
-ROUNDS = 3  # of tests of what is still held
-FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # where nothing determines which; then the others
+MIN_PHOTOGRAPHS = 3  # in a free network; a pair determines almost no parameter of a camera
+MIN_DETERMINING_C = 4  # photographs of a free network that determine c
+# Relative sigma of c from EXIF data. Focusing from infinity to 1 : 5 changes c by twice as much, c = f (1 +
+# 1/5).
+C_SIGMA = 0.1
+RATIO_SIGMA = 1e-3  # sigma of the ratio of two focal lengths, which is the ratio of the sides of a pixel
+MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # needed by a point, and by a photograph, to take part in the decision
+ROUNDS = 3  # of the test of held parameters
+FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # order of holding if precision does not decide
 
-Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey states what is free
+Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey states them
 
 
 @dataclass(frozen=True)
 class FreeParameters:
     """Free parameters of the cameras of a survey."""
 
-    cameras: tuple[CameraSettings, ...]  # all of which state what is free, and of which c is observed
-    estimate: Estimate  # with the same freed in its cameras; observed ones keep their values
-    remarks: tuple[Remark, ...]  # on each camera that the survey does not describe
+    cameras: tuple[CameraSettings, ...]  # each states its free parameters, and whether c is observed
+    estimate: Estimate  # with the same parameters free in its cameras; observed ones keep their values
+    remarks: tuple[Remark, ...]  # on each camera whose free parameters the survey does not state
 
 
 def choose_free_parameters(
     survey: Survey, network: Network, estimate: Estimate, *, datum: str = "free", extend: bool = True
 ) -> FreeParameters:
-    """Return the interior parameters to adjust, of every camera of a survey.
+    """Choose the interior parameters to adjust for every camera of a survey.
 
     Args:
-        survey: states what is free of its cameras, or does not.
-        network: with one camera for each of the survey's, in their order.
-        estimate: start values; photographs and points without any take no part in the decision.
+        survey: may state the free parameters of its cameras.
+        network: has one camera for each camera of the survey, in the same order.
+        estimate: start values; photographs and points without them take no part in the decision.
         datum: kind of datum; control takes part where photographs by themselves do not determine c.
         extend: whether parameters beyond the candidates are tried.
 
     Returns:
-        The settings with what is free in each, and the estimate. Both as they were where the survey states it
-        of every camera.
+        The settings with the free parameters of each camera, and the estimate. Both are unchanged if the
+        survey states the free parameters of every camera.
     """
     silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
     if not silent:
@@ -90,7 +93,7 @@ def choose_free_parameters(
                 for a, (one, camera) in enumerate(zip(settings, start.cameras, strict=True))
             )
             of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
-            part, start = split_cameras(of_part, without_given(part), start)  # others are as they were
+            part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
             alone = _determined(part, start, names, "free", extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
             with_control = _determined(part, start, names, datum, extend=extend)
@@ -113,9 +116,9 @@ def choose_free_parameters(
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:
-    """Return the settings with c, or the focal lengths, as an observation of the given value.
+    """Return the settings with c, or the focal lengths, as observations.
 
-    It is that of the survey file, else that of the start values, by EXIF data.
+    The observed value is that of the survey file, else the start value, which EXIF data give.
     """
     start_mm = camera.c_px * float(np.mean(camera.pixel_mm))
     c = camera.parameters * ((settings.c_mm or start_mm) / start_mm)
@@ -131,14 +134,14 @@ def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings
 
 
 def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
-    """Return whether c is free of each camera of which it was to be."""
+    """Return whether c is free for each camera whose c was a candidate."""
     c = [camera.names[0] for camera in start.cameras]
     each = zip(c, asked, chosen, strict=True)
     return all(name in (free or ()) for name, may, free in each if name in (may or ()))
 
 
 def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool) -> Chosen:
-    """Return the candidates that a network determines, and what else its image points demand."""
+    """Return the candidates that a network determines, and other parameters that its image points demand."""
     names, adjusted = _held_back(part, start, names, datum)
     index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
@@ -157,9 +160,9 @@ def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, ex
 
 
 def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tuple[Chosen, Adjustment | None]:
-    """Hold the worst determined parameter until all others are known well enough; the last adjustment.
+    """Hold the worst parameters one by one until all others are determined; also the last adjustment.
 
-    Observed parameters are not held: with the precision of their values they take part.
+    Observed parameters are never held: they take part with the precision of their values.
     """
     observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
     while any(names):
@@ -180,7 +183,7 @@ def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tup
 
 
 def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
-    """Adjust with what is free, None where that cannot be done or does not determine everything."""
+    """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
         found = adjust(part, start, datum=Datum(datum), reject="tau", redundancy_numbers=False)
     except (GeometryError, np.linalg.LinAlgError):
@@ -190,7 +193,7 @@ def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
 
 
 def _defect_of_points(part: Network, found: Adjustment) -> int:
-    """Return what points whose rays were rejected add to the rank defect; it is no defect of the cameras."""
+    """Return the rank defect that points with rejected rays add; it is no defect of the cameras."""
     rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
     known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
     if found.datum == "control":
@@ -201,14 +204,14 @@ def _defect_of_points(part: Network, found: Adjustment) -> int:
 
 
 def _reach(adjusted: Adjustment, a: int, name: str) -> float:
-    """Return by how much a standard deviation of a parameter moves the corner, over the half diagonal."""
+    """Return the image shift at the corner by one sigma of a parameter, in half diagonals."""
     camera = adjusted.estimate.cameras[a]
     s = camera.names.index(name)
     return corner_shift(camera, s, float(adjusted.interior_sigma(a)[s]))
 
 
 def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
-    """Return the estimate with the chosen parameters free, those of other cameras as they are."""
+    """Return the estimate with the chosen parameters free; other cameras stay as they are."""
     cameras = tuple(
         camera if one is None else replace(camera, free=np.array([name in one for name in camera.names]))
         for camera, one in zip(estimate.cameras, names, strict=True)
@@ -217,7 +220,7 @@ def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
 
 
 def _rank(name: str) -> int:
-    """Return the place of a parameter in the order in which they are held where nothing determines which."""
+    """Return the rank of a parameter in the order of holding where precision does not decide."""
     return FIRST_HELD.index(name) if name in FIRST_HELD else len(FIRST_HELD)
 
 
@@ -226,7 +229,7 @@ def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
 
 
 def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int) -> list[Remark]:
-    """Return the remarks on what was chosen."""
+    """Return the remarks on the parameters chosen for a camera."""
     found = []
     for name, (value, sigma) in settings.weighted[:1]:
         unit = units[MODELS[settings.model].names.index(name)]

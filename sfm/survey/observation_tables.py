@@ -1,4 +1,8 @@
-"""Survey observations beside photographs: distances, levelling, angles, antenna positions, from tables."""
+"""Survey observations beside photographs: distances, levelling, angles and antenna positions from tables.
+
+Tables are read into observations of a network. Before the main adjustment, observations that contradict all
+others are found and removed, and known mistakes are tried as their explanation.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +33,9 @@ if TYPE_CHECKING:
 
 
 DISTANCE = "distance"
-MAX_WRONG = 1 / 3  # share of the observations of a kind that are wrong, beyond which none is believed
-ALARM = 0.001  # probability with which right observations of tables lose one
-MIN_REDUNDANCY = 0.01  # of an observation that is tested: others hardly check one below
+MAX_WRONG = 1 / 3  # share of wrong observations of a kind beyond which none of this kind is trusted
+ALARM = 0.001  # probability of rejecting any of the correct observations of the tables
+MIN_REDUNDANCY = 0.01  # redundancy number below which others hardly check an observation
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,9 @@ class ObservationTable:
     """A table of observations of one kind."""
 
     kind: str  # as in the survey file
-    value: FloatArray  # values without and with standard deviation, object unit or rad, (n, q + d)
+    value: FloatArray  # q values without and d with standard deviation, object unit or rad, (n, q + d)
     sigma: FloatArray  # object unit or rad, (n, d)
-    table: CsvTable  # with the names of points or photographs
+    table: CsvTable  # has the names of points or photographs
 
     @property
     def of(self) -> type[TableKind]:
@@ -50,7 +54,7 @@ class ObservationTable:
 
     @property
     def named(self) -> tuple[tuple[str, ...], ...]:
-        """The columns of names of points or photographs, without that of labels."""
+        """The columns with names of points or photographs, without the column of labels."""
         return self.table.texts[issubclass(self.of, Group) and self.of.labelled :]
 
     def points(self) -> Iterator[tuple[str, tuple[str, ...]]]:
@@ -60,7 +64,7 @@ class ObservationTable:
                 yield self.name(row), points
 
     def name(self, row: int) -> str:
-        """Return what an observation is called: "distance 12 - 15"."""
+        """Return the name of an observation, such as "distance 12 - 15"."""
         return f"{self.kind} {' - '.join(column[row] for column in self.table.texts)}"
 
 
@@ -68,13 +72,13 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     """Read a table of observations: names, values, standard deviations.
 
     Args:
-        kind: as in the survey file.
-        path: the table.
-        source: the survey file, for messages.
+        kind: kind as written in the survey file.
+        path: file of the table.
+        source: the survey file, for error messages.
 
     Raises:
-        SurveyFileError: an unknown kind, an unreadable table, wrong columns, or a standard deviation that is
-            not positive; an observation between a point and itself.
+        SurveyFileError: an unknown kind, an unreadable table, wrong columns, a standard deviation that is not
+            positive, or an observation between a point and itself.
     """
     if kind not in TABLES:
         raise SurveyFileError(f"{source}: kind = '{kind}', needed one of {listed(list(TABLES))}")
@@ -82,14 +86,14 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
 
 
 def observation_table(kind: str, table: CsvTable) -> ObservationTable:
-    """Return the observations of a table with the columns of their kind.
+    """Return the observations of a table that has the columns of their kind.
 
     Raises:
         SurveyFileError: a standard deviation that is not positive; an observation between a point and itself.
     """
     of = TABLES[kind]
     columns = of.columns()
-    d = min(len(of.components), len(columns))  # of lines one standard deviation for both offsets
+    d = min(len(of.components), len(columns))  # lines have one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
     if "length" in of.components:
@@ -113,7 +117,7 @@ def observation_table(kind: str, table: CsvTable) -> ObservationTable:
 
 
 def bars_of(table: ObservationTable) -> list[ScaleBar]:
-    """Return the distances of a table as scale bars, which they are; none of other kinds."""
+    """Return the distances of a table as scale bars; none if the table has another kind."""
     if table.kind != DISTANCE:
         return []
     return [
@@ -125,7 +129,7 @@ def bars_of(table: ObservationTable) -> list[ScaleBar]:
 
 
 def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network:
-    """Return the network with the observations of tables whose points or photographs it has."""
+    """Return the network with those observations of tables whose points or photographs it contains."""
     added: list[TableKind] = []
     for one, labels in zip(tables, _labels(tables), strict=True):
         known = _known(one, network)
@@ -158,7 +162,7 @@ def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network
 
 
 def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
-    """Return what the groups of each table are called: "S1", and "S1 (2)" where two tables have one."""
+    """Return the labels of the groups of each table: "S1", and "S1 (2)" if a second table has the name."""
     count, found = Counter[tuple[str, str]](), []
     for one in tables:
         labels = {}
@@ -171,7 +175,7 @@ def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
 
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
-    """Return the remarks on observations whose points or photographs are not in a network."""
+    """Return the remarks on observations whose points or photographs are not in the network."""
     frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
@@ -193,7 +197,7 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
 
 
 def _names(one: ObservationTable, network: Network) -> tuple[str, ...]:
-    """Return the names that the columns of a table are of."""
+    """Return the names of photographs or points that a table refers to."""
     return network.images if one.of.texts_of == PHOTOGRAPH else network.points
 
 
@@ -209,20 +213,20 @@ class Gross:
     """Observations of one kind from tables that contradict others."""
 
     kind: str  # name of the kind
-    names: tuple[str, ...]  # as `Kind.parts` names them
-    whole: bool  # whether more than MAX_WRONG contradict: nothing shows which ones are right, and all leave
-    mistake: str | None = None  # without which they agree, see `Kind.mistakes`
+    names: tuple[str, ...]  # as in `Kind.parts`
+    whole: bool  # if more than MAX_WRONG contradict, nothing shows which are right: all are removed
+    mistake: str | None = None  # correcting this mistake makes them agree, see `Kind.mistakes`
 
 
 def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> tuple[Gross, ...]:
     """Return the observations of tables that contradict all others, by kind.
 
-    Image points are not tested here: one wrong observation would have right ones rejected, which are weaker.
-    Kinds that a common mistake explains with all that contradicts leave whole. Else the observation with the
-    largest w leaves first, as long as more of its kind stay.
+    Image points are not tested here: they are weaker, and one wrong observation would make correct ones be
+    rejected. If one common mistake of a kind explains all contradictions, the whole kind is removed.
+    Otherwise the observation with the largest w is removed first, as long as others of its kind stay.
 
     Args:
-        network: image points that are accepted, and observations.
+        network: has the accepted image points and the observations.
         adjust_with: adjusts a network without rejecting anything.
     """
     given, wrong, whole = network.observations, dict[str, list[str]](), set[str]()
@@ -244,7 +248,7 @@ def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -
             whole |= {gross.kind} if gross.whole else set()
         if not explained:
             if total[kind.name] < 3:
-                break  # of two nothing shows which is wrong; the remark on residuals names the larger one
+                break  # of two, nothing shows which is wrong; the remark on residuals names the larger
             part = kind.parts(network, estimate)[kind.part_of(int(one.rows[row]), component)]
             wrong.setdefault(kind.name, []).append(part)
             if len(wrong[kind.name]) > MAX_WRONG * total[kind.name]:
@@ -260,7 +264,7 @@ def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -
 def _explained(
     network: Network, estimate: Estimate, worst: Kind, adjust_with: Callable[[Network], Adjustment]
 ) -> list[Gross]:
-    """Return what one common mistake each explains with all that contradicts; several leave it open which."""
+    """Return each kind whose common mistake explains all contradictions; several mean the cause is open."""
     found: list[Gross] = []
     kinds = dict.fromkeys(kind.name for kind in network.observations)
     for name, single in [(name, False) for name in kinds] + [(worst.name, True)]:
@@ -286,7 +290,7 @@ def _mistake(
     *,
     whole: bool,
 ) -> str | None:
-    """Return the mistake without which observations agree with a network that has them not; None if none."""
+    """Return the mistake whose correction makes removed observations agree with the others, or None."""
     for mistake in dict.fromkeys(mistake for kind in kinds for mistake in kind.mistakes()):
         mended: list[Kind] = []
         for kind in kinds:
@@ -303,7 +307,7 @@ def _mistake(
 
 
 def _same_group(kind: Kind, others: Sequence[Kind]) -> bool:
-    """Return whether observations are of a group that is among others."""
+    """Return whether observations belong to the same group as any of the others."""
     return isinstance(kind, Group) and any(
         type(kind) is type(other) and kind.group == other.group
         for other in others
@@ -312,25 +316,25 @@ def _same_group(kind: Kind, others: Sequence[Kind]) -> bool:
 
 
 def _worst(a: Adjustment, first: int) -> tuple[float, int, int, ObservedResiduals | None]:
-    """Return the largest |w| of the kinds from an index on, its row, its component and its residuals."""
+    """Return the largest |w| of the kinds from index `first` on, its row, component and residuals."""
     tests = [(*test, one) for one in a.observed if one.index >= first for test in _largest(one)]
     return max(tests, key=lambda test: test[0], default=(0.0, 0, 0, None))
 
 
 def _agrees(a: Adjustment, first: int) -> bool:
-    """Return whether the kinds from an index on are checked, and none contradicts."""
+    """Return whether the kinds from index `first` on are checked, and none contradicts."""
     w, _, _, one = _worst(a, first)
     return one is not None and w <= _critical(a, first)
 
 
 def _critical(a: Adjustment, first: int) -> float:
-    """Return the |w| that right observations of the kinds from an index on exceed at probability ALARM."""
+    """Return the critical |w|: the chance that any correct observation of these kinds exceeds it is ALARM."""
     count = sum(one.count for one in a.observed if one.index >= first)
     return -float(normal_ppf(ALARM / (2 * max(count, 1))))
 
 
 def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:
-    """Return the largest |w| of each observation that is checked, its row and its component."""
+    """Return the largest |w| of each checked observation, its row and its component."""
     w = np.where(one.redundancy_numbers > MIN_REDUNDANCY, np.abs(one.standardised), -np.inf)
     w = np.where(np.isnan(w), -np.inf, w)
     at = w.argmax(axis=1)
@@ -344,7 +348,7 @@ def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:
 def without_observations(
     network: Network, estimate: Estimate, wrong: Mapping[str, Collection[str]], whole: Collection[str]
 ) -> Network:
-    """Return the network without some observations, by kind, and without whole kinds of them."""
+    """Return the network without the `wrong` observations of each kind, and without the `whole` kinds."""
     kept = []
     for kind in network.observations:
         if kind.name in whole:

@@ -1,9 +1,11 @@
-"""The orientation of a survey, the distortion model it needs, and remarks where there is none.
+"""Orientation of a survey: approximate values of its network, and the distortion model of its cameras.
 
-The distortion model of cameras where the survey does not state it: central perspective or fisheye.
+The photographs are oriented on their control, if that fits, else without it. Lost photographs get a reason.
+If nothing works, other principal distances are tried.
 
-A fisheye lens shows equal angles about equally long. Where its photographs are wide, no polynomial on equal
-tangents describes it, and what a survey of them gives is bent: the image points decide.
+Where the survey does not state the distortion model, it is central perspective or fisheye. A fisheye lens
+images equal angles as nearly equal lengths. No polynomial of the tangents describes such a lens over a wide
+field, and with one the object is bent. The image points decide between the two models.
 """
 
 from __future__ import annotations
@@ -21,23 +23,10 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.network import (
-    Estimate,
-    ExteriorObservations,
-    Network,
-    ObjectPoints,
-    ScaleBars,
-    rows_of,
-)
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
-from sfm.orientation.incremental.sequence import (
-    FINAL_TOLERANCE_PX,
-    MIN_POINTS,
-    Judge,
-    Orientation,
-    orient,
-)
+from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, MIN_POINTS, Judge, Orientation, orient
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
@@ -54,39 +43,38 @@ from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.placing import (
-    place_on_observations,
-)
+from sfm.survey.placing import place_on_observations
 from sfm.survey.rigs import mount_cameras
 
 FISHEYE = "opencv_fisheye"
-# c over half the diagonal, of a central perspective, below which the corner is more than 45 degrees off the
-# axis: there equal angles and equal tangents are apart by more than a tenth of the half diagonal.
+# c of a central perspective over half the diagonal. Below it the corner is more than 45 degrees off the axis,
+# where
+# equal angles and equal tangents differ by more than a tenth of the half diagonal.
 WIDE_C = 1.0
-# Share of the image points with a central perspective from which nothing else is tried.
+# If at least this share of the image points fits a central perspective, no other model is tried.
 MIN_FITTING_FRACTION = 0.9
-ORIENTATION_POINTS = (
-    400  # of natural texture that take part in the orientation, those with the most rays, and
-)
+# Points of natural texture that take part in the orientation: those with the most rays, and at least so many
+# of
+# every photograph.
+ORIENTATION_POINTS, POINTS_PER_PHOTOGRAPH = 400, 100
 CONTROL_OF_CAMERA = 6  # control points in the datum with which two photographs determine their camera
-POINTS_PER_PHOTOGRAPH = 100  # of every photograph at least so many
 
 
 def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     """Return approximate values of a survey's network.
 
     Args:
-        survey: gives start values, if any; a failure names its settings.
-        measured: all image points that have a name.
+        survey: may give start values; error messages name its settings.
+        measured: all named image points.
 
     Raises:
-        GeometryError: no two photographs could be oriented, or what is connected could not be adjusted; the
-            photographs have no base.
+        GeometryError: no two photographs could be oriented, the connected photographs could not be adjusted,
+            or the photographs have no base.
     """
     refuse_too_large(measured.network)
     if survey.tie_points is not None:
         refuse_no_base(measured.network, measured.cameras)
-    # they are judged by the adjustment first
+    # left out here: the adjustment judges these first
     network = replace(
         measured.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=()
     )
@@ -146,13 +134,10 @@ def _orient(
 def _orient_on_control(
     network: Network, estimate: Estimate, *, given: bool, judge: Judge | None
 ) -> Orientation:
-    """Orient all photographs, on their control if that fits them, else without it.
+    """Orient all photographs, on their control if it fits them, else without it.
 
-    Args:
-        network: of the survey.
-        estimate: start values.
-        given: whether image points were given: they are adjusted as they are, and judged by the adjustment.
-        judge: as of `orient`.
+    given: whether the image points were given; the adjustment, not the orientation, then judges
+    contradictions.
     """
     found, failure = None, None
     try:
@@ -170,7 +155,7 @@ def _orient_on_control(
         return _known(found, failure)
     if found is not None and _fits(network, other).sum() <= _fits(network, found).sum():
         return found
-    with suppress(GeometryError):  # fewer than three, or on a line
+    with suppress(GeometryError):  # fewer than three control points, or on a line
         control = network.control.complete
         known = other.estimate.determined[control.point]
         placing = fit_similarity(other.estimate.points[control.point[known]], control.xyz[known])
@@ -179,26 +164,27 @@ def _orient_on_control(
 
 
 def _known(found: Orientation | None, failure: GeometryError | None) -> Orientation:
-    """Return an orientation, or raise the reason why there is none."""
+    """Return the orientation, or raise the reason why there is none."""
     if found is None:
         raise failure or GeometryError("orientation: none")
     return found
 
 
 def _fits(network: Network, found: Orientation) -> BoolArray:
-    """Return which image points fit an orientation as well as any network can be adjusted, (k,)."""
+    """Return which image points fit an orientation within the final tolerance, (k,)."""
     return np.asarray(residual_lengths(network, found.estimate) <= FINAL_TOLERANCE_PX)
 
 
 def _hold_cameras_of_two(
     survey: Survey, network: Network, found: Orientation
 ) -> tuple[Orientation, tuple[Remark, ...]]:
-    """Hold the free parameters of interior orientation where two photographs are all there is, and report it.
+    """Hold the free interior parameters if only two photographs are oriented, and report it.
 
     The image points of a pair determine seven parameters, five of them the relative orientation (Hartley and
-    Zisserman 2003, sec. 11.1): hardly c, and neither principal point nor distortion, which bend the object
-    instead. A control field in the datum determines them, and observed parameters have the stated precision.
-    So it is where the survey does not state what is free, as one that was drafted.
+    Zisserman 2003, sec. 11.1). They hardly determine c. They do not determine principal point or distortion,
+    which bend the object instead. A control field in the datum determines them, and observed parameters have
+    the stated precision. The parameters are also held where the survey does not state what is free, as in a
+    drafted survey.
     """
     estimate = found.estimate
     fixed = len(network.control) if survey.datum.kind == "control" else 0
@@ -219,7 +205,7 @@ def _hold_cameras_of_two(
 
 
 def _judge(measured: Measurements) -> Judge | None:
-    """Return how little the outlines of the targets are images of circles; None without such targets."""
+    """Return a function for the misfit of the outlines as circles; None without circular targets."""
     photographs, naming = measured.photographs, measured.naming
     if photographs is None or naming is None or naming.corners:
         return None
@@ -233,7 +219,7 @@ def _judge(measured: Measurements) -> Judge | None:
 def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     """Orient the photographs on the points with the most rays, then intersect all the others.
 
-    Thousands of points orient a survey no better than hundreds, and take their time in every trial.
+    Thousands of points orient a survey no better than hundreds do, and slow down every trial.
     """
     images = np.ones(len(network.images), dtype=bool)
     image_points = np.ones(len(network.image_points), dtype=bool)
@@ -249,7 +235,7 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
 
 
 def _strongest(network: Network) -> BoolArray:
-    """Choose the points with the most rays, and in every photograph at least some, (n,)."""
+    """Choose the points with the most rays, and at least POINTS_PER_PHOTOGRAPH of every photograph, (n,)."""
     seen = network.image_points
     order = np.argsort(-network.rays(), kind="stable")
     chosen = np.zeros(len(network.points), dtype=bool)
@@ -263,28 +249,29 @@ def _strongest(network: Network) -> BoolArray:
 
 
 def _most_in_common(network: Network) -> int:
-    """Return how many points the two photographs with most in common share."""
+    """Return the largest number of points that two photographs share."""
     every = np.ones(len(network.image_points), dtype=bool)
     return max(int(common.max(initial=0)) for _, _, common in network.common_points(every))
 
 
 def refine(network: Network, estimate: Estimate) -> Estimate:
-    """Adjust a growing network for its approximate values only; see `orientation.sequence.orient`."""
+    """Adjust a growing network for its approximate values only; see `incremental.sequence.orient`."""
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
 def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, Measurements, Orientation]:
-    """Orient a survey, with the fisheye model for cameras whose model is open if that is likelier.
+    """Orient a survey; cameras without a stated model get the fisheye model if it is likelier.
 
     Args:
-        survey: states the models of its cameras, or does not.
-        measured: all image points that have a name.
+        survey: may state the models of its cameras.
+        measured: all named image points.
 
     Returns:
-        The survey with the models that were taken, the start values of its cameras, and the orientation.
+        The survey with the chosen models, the measurements with start values of these cameras, and the
+        orientation.
 
     Raises:
-        GeometryError: as of `orient_survey`.
+        GeometryError: as in `orient_survey`.
     """
     found, failure = None, None
     texture = survey.tie_points is not None
@@ -331,21 +318,21 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
 
 
 def _is_wide(camera: Camera) -> bool:
-    """Return whether a central perspective with the camera's c reaches far off the axis."""
+    """Return whether the corner of a central perspective with this c is over 45 degrees off the axis."""
     return bool(camera.c_px < WIDE_C * np.hypot(*camera.size_px) / 2)
 
 
 def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
-    """Return start values of the fisheye model with the same c, the principal point in the middle."""
+    """Return start values of the fisheye model with the same c, and the principal point in the middle."""
     pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
     c_mm = camera.c_px * float(np.mean(pixel))
     return camera_from_values(camera.name, FISHEYE, camera.size_px, pixel, c_mm=c_mm, free=free)
 
 
 def _fit(measured: Measurements, found: Orientation) -> tuple[float, int]:
-    """Return ln of the likelihood of all image points, and how many of them fit.
+    """Return the log-likelihood of all image points, and how many of them fit.
 
-    Points that do not fit are spread evenly over the format.
+    Points that do not fit have a uniform distribution over the format.
     """
     length = residual_lengths(measured.network, found.estimate)
     fits = length <= FINAL_TOLERANCE_PX

@@ -1,11 +1,12 @@
-"""Place, attitude and scale of a network: by control, scale bars, observations, or the frame of its datum.
+"""Position, attitude and scale of a network: from control, scale bars, observations, or its datum's frame.
 
-Image points leave these seven open. Start values are brought into the frame of the adjustment, and adjusted
-free networks to the coordinates that their datum refers to, without a change of their shape. Heights,
-coordinate differences, antenna positions and distances determine a part of the seven: a robust adjustment
-finds them, from attitudes all round, so that the adjustment starts near.
+Image points do not determine these seven parameters. Start values are transformed into the frame of the
+adjustment. Adjusted free networks are transformed to the coordinates that their datum refers to, without a
+change of shape. Heights, coordinate differences, antenna positions and distances determine some of the seven.
+A robust adjustment finds these, starting from attitudes all round, so that the main adjustment starts close
+to its solution.
 
-Observed exterior orientation takes part in the datum `control` beside the control, and in no other.
+Observed exterior orientation takes part in the datum `control`, beside the control, and in no other datum.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 2.2.3 (spatial similarity).
 """
@@ -33,26 +34,26 @@ from sfm.similarity import Similarity, fit_similarity, nearest_rotation
 K = TypeVar("K", bound=Kind)
 Weighted = TableKind | ScaleBars  # with one standard deviation for each value
 
-ROUGH_ROUNDS, ROUNDS = 6, 20  # of Gauss-Newton from each attitude, and from the best of them
+ROUGH_ROUNDS, ROUNDS = 6, 20  # Gauss-Newton steps from each attitude, and from the best attitudes
 BEST = 3  # attitudes that are fitted to the end
-# Standard deviations from which on an observation is taken for wrong before anything is adjusted.
+# Residual in standard deviations beyond which an observation is taken as wrong before anything is adjusted.
 MIN_FAR_SIGMAS = 100.0
-MIN_FRACTION = 1e-9  # of the derivatives, below which what is left of a motion is rounding
-MAX_STEP = 0.5  # turn of one step, rad, and change of the scale
+MIN_FRACTION = 1e-9  # of the derivatives, below which the effect of a motion is only rounding
+MAX_STEP = 0.5  # largest rotation of one step, rad, and largest change of ln(scale)
 MIN_POINTS = 3  # that fix position, attitude and scale
-# Breadth over length of places below which their turn about the length is taken from angles.
+# Breadth over length of positions below which observed angles give their rotation about the length.
 MAX_BREADTH_RATIO = 0.05
-MIN_OFF_LINE_SIGMAS = 3.0  # standard deviations by which places must be off a line to give the turn about it
-MIN_OFF_LINE_FRACTION = 1e-6  # the same for places without error, over their extent
-START_TOLERANCE = 1e-3  # of the extent of the places: no start value needs to be better
+MIN_OFF_LINE_SIGMAS = 3.0  # breadth, in standard deviations, needed to give the rotation about a line
+MIN_OFF_LINE_FRACTION = 1e-6  # the same for positions without error, over their extent
+START_TOLERANCE = 1e-3  # of the extent of the positions: start values need not be better
 MIN_CONTROL = 3  # points that a control datum needs, and that place a free network
 
 
 def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
-    """Return the estimate in the scale and attitude that survey observations give; as it is without.
+    """Return the estimate in the scale and attitude that survey observations give; unchanged without them.
 
     Args:
-        network: with observations of points and photographs.
+        network: has observations of points and photographs.
         estimate: start values.
     """
     kinds = _of_motions(network, estimate)
@@ -61,7 +62,7 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     start, rows, rounding = _about_centre(kinds, estimate)
     scaled = not has_held_mounts(estimate)
     turns = np.abs(rows[:, 3:6]).max() > rounding
-    attitudes = _attitudes() if turns else [np.eye(3)]  # which distances and frames do not determine
+    attitudes = _attitudes() if turns else [np.eye(3)]  # undetermined by distances and frames
     turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
     tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
     best = sorted(tried, key=lambda one: one[1])[:BEST]
@@ -71,12 +72,12 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
 def loosen_far(network: Network, estimate: Estimate) -> Network:
     """Return the network with larger standard deviations of observations that are far from an estimate.
 
-    Within least squares one that is 1e5 of them off would bend the whole network. With the root of that in
-    place of it, it stays the one that is most off.
+    In least squares an observation that is off by 1e5 standard deviations would bend the whole network. The
+    square root of this ratio limits its effect, and it still has the largest residual.
 
     Args:
-        network: with observations of points and photographs.
-        estimate: on the observations, see `place_on_observations`.
+        network: has observations of points and photographs.
+        estimate: placed on the observations, see `place_on_observations`.
     """
     kinds: list[Kind] = []
     for kind in network.observations:
@@ -88,9 +89,9 @@ def loosen_far(network: Network, estimate: Estimate) -> Network:
 
 
 def scale_sigma(network: Network, estimate: Estimate) -> float:
-    """Return the relative standard deviation of the scale that observations of points and photographs give.
+    """Return the relative standard deviation of the scale from observations of points and photographs.
 
-    It is that of a network in which nothing else gives one; infinite where they do not either.
+    Nothing else is assumed to give a scale. The result is infinite if these observations do not either.
     """
     kinds = _of_motions(network, estimate)
     if not kinds:
@@ -103,11 +104,11 @@ def scale_sigma(network: Network, estimate: Estimate) -> float:
 
 
 def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, FloatArray, float]:
-    """Return an estimate about its centre, with derivatives by its motions and their rounding.
+    """Return an estimate about its centre, its observations' derivatives by motions, and their rounding.
 
     Returns:
-        The estimate; whitened derivatives by shift in units of its extent, turn and scale, (n, 7); below
-        which these are nothing but rounding of derivatives by points and photographs that cancel out.
+        The estimate; whitened derivatives by shift in units of its extent, rotation and scale, (n, 7); the
+        value below which these are only rounding errors, where derivatives by points and photographs cancel.
     """
     centre = np.nanmean(estimate.points, axis=0)
     start = Similarity(1.0, np.eye(3), -centre).apply_estimate(estimate)
@@ -121,7 +122,7 @@ def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, 
 
 
 def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
-    """Return scale bars and observations of tables whose points and photographs have start values."""
+    """Return scale bars and tabulated observations whose points and photographs have start values."""
     tables = (kind for kind in network.observations if isinstance(kind, TableKind))
     kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
     return [one for one in (_usable(kind, estimate) for kind in kinds) if len(one)]
@@ -132,7 +133,7 @@ def _usable(kind: K, estimate: Estimate) -> K:
     on = np.ones(len(kind), dtype=bool)
     for of, at in kind.blocks():
         if of not in (POINT, PHOTOGRAPH):
-            on[:] = False  # of mounts and cameras, which motions leave alone
+            on[:] = False  # of mounts and cameras, which motions do not change
         else:
             on &= (estimate.determined if of == POINT else estimate.oriented)[at]
     return kind.select(on)
@@ -141,10 +142,10 @@ def _usable(kind: K, estimate: Estimate) -> K:
 def _fitted(
     kinds: list[Weighted], estimate: Estimate, rounds: int, *, scaled: bool
 ) -> tuple[Estimate, float]:
-    """Return the estimate moved, and scaled, to the least sum of residuals over their sigmas, and it.
+    """Return the estimate, moved and scaled to the least sum of absolute residuals over sigma, and this sum.
 
-    The sum of squares would let one mistyped value decide; weights of 1 over the residual make it that of
-    absolute values (Foerstner and Wrobel 2016, sec. 4.7.4).
+    With a sum of squares one mistyped value would decide. Weights of 1 over the residual turn it into a sum
+    of absolute values (Foerstner and Wrobel 2016, sec. 4.7.4).
     """
     weighted = kinds
     for _ in range(rounds):
@@ -164,13 +165,13 @@ def _fitted(
 
 
 def _over_sigma(kind: Weighted, weighted: Weighted, estimate: Estimate) -> FloatArray:
-    """Return the residuals of observations over their sigmas, as of the same with other weights."""
+    """Return absolute residuals over sigma; `weighted` has the same observations with other weights."""
     difference = weighted.linearise(values_of(estimate)).difference
     return np.asarray(np.abs(difference.reshape(kind.sigma.shape)) / kind.sigma)
 
 
 def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Return whitened derivatives by shift, turn and scale, (n, 7), and differences, (n,)."""
+    """Return whitened derivatives by shift, rotation and scale, (n, 7), and differences, (n,)."""
     values, rows, differences = values_of(estimate), [], []
     for kind in kinds:
         linear = kind.linearise(values)
@@ -207,8 +208,8 @@ def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
     """Return start values in the frame of control and observed exterior orientation.
 
     Args:
-        network: all image points, control and observed exterior orientation.
-        estimate: after the orientation; photographs without start values are NaN.
+        network: has all image points, control and observed exterior orientation.
+        estimate: result of the orientation; photographs without start values are NaN.
 
     Raises:
         GeometryError: control and observed exterior orientation cannot place the network.
@@ -220,7 +221,7 @@ def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
     known = estimate.determined[control.point]
     length, breadth = _extents(control.xyz[known], np.ones(int(known.sum())))
     if known.sum() >= MIN_POINTS and breadth >= MAX_BREADTH_RATIO * length:
-        return estimate  # the orientation has brought it there
+        return estimate  # the orientation already used the control
     oriented = estimate.oriented[image]
     centres = oriented & np.isfinite(value[:, :3]).all(axis=1)
     source = np.concatenate([estimate.points[control.point[known]], estimate.position[image[centres]]])
@@ -288,7 +289,7 @@ def _by_angles(
 
 
 def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Return the first and second principal extent of weighted places, (n, 3) and (n,), as RMS."""
+    """Return the first and second principal RMS extent of positions, (n, 3), with weights, (n,)."""
     if len(places) < 2:
         return 0.0, 0.0
     w = weight / weight.sum()
@@ -297,12 +298,12 @@ def _extents(places: FloatArray, weight: FloatArray) -> tuple[float, float]:
 
 
 def _arrangement(length: float, breadth: float, noise: float) -> str:
-    """Say how places that do not place the network lie, by their extents and standard deviation."""
+    """Describe the arrangement of positions that do not determine the network's attitude."""
     if length == 0:
         return "all the same"
     if length > MIN_OFF_LINE_SIGMAS * noise and breadth <= max(
         noise, MIN_OFF_LINE_FRACTION * length
-    ):  # no broader than by their errors
+    ):  # no broader than their errors
         return "on a line"
     return (
         f"of RMS extents {length / noise:.1f} and {breadth / noise:.1f} standard deviations, needed "
@@ -311,7 +312,7 @@ def _arrangement(length: float, breadth: float, noise: float) -> str:
 
 
 def _too_few(places: int, turned: int, how: str = "") -> str:
-    """Say why observed exterior orientation and control do not place the network."""
+    """Explain why observed exterior orientation and control do not place the network."""
     return (
         f"datum 'control': the network has {counted(places, 'place')} of projection centres and control "
         f"points with X, Y and Z{how}, and the angles of {counted(turned, 'photograph')}; needed three "
@@ -320,7 +321,7 @@ def _too_few(places: int, turned: int, how: str = "") -> str:
 
 
 def object_scale(network: Network, estimate: Estimate) -> float:
-    """Return object units per unit of an estimate by its scale bars, else its control, else NaN."""
+    """Return the object units per unit of an estimate, from its scale bars, else its control, else NaN."""
     bars, control = network.scale_bars, network.control.complete
     length = np.linalg.norm(estimate.points[bars.end] - estimate.points[bars.start], axis=1)
     usable = np.isfinite(length) & (length > 0)
@@ -335,7 +336,7 @@ def object_scale(network: Network, estimate: Estimate) -> float:
 
 
 def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimate:
-    """Bring a network that control does not hold to the length of its scale bars, else of its control."""
+    """Scale a network whose datum is not its control to its scale bars, else to its control."""
     if datum.kind == "control" or has_held_mounts(estimate):
         return estimate
     scale = object_scale(network, estimate)
@@ -351,7 +352,7 @@ def is_scaled(network: Network, estimate: Estimate) -> bool:
 
 
 def has_held_mounts(estimate: Estimate) -> bool:
-    """Return whether the mount of a camera is held fixed, beside those of reference cameras."""
+    """Return whether a mount is held fixed, other than the mounts of reference cameras."""
     mounts = estimate.mounts
     if mounts is None:
         return False
@@ -359,13 +360,13 @@ def has_held_mounts(estimate: Estimate) -> bool:
 
 
 def mounts_give_scale(network: Network, estimate: Estimate) -> bool:
-    """Return whether mounts that were given, held fixed or observed, take part in the scale of a network."""
+    """Return whether given mounts, held fixed or observed, contribute to the scale of a network."""
     observed = any(isinstance(one, MountObservations) for one in network.observations)
     return observed or has_held_mounts(estimate)
 
 
 def place_on_control(network: Network, estimate: Estimate) -> tuple[Estimate, ControlCheck]:
-    """Place an adjusted network on its control; scale bars, where there are some, keep its scale."""
+    """Place an adjusted network on its control; if anything else gives its scale, it keeps this scale."""
     control = network.control.complete
     points = estimate.points[control.point]
     fitted = fit_similarity(points, control.xyz)
@@ -381,15 +382,15 @@ def place_on_frame(
 ) -> Estimate:
     """Place an adjusted free network on the coordinates that its inner constraints refer to.
 
-    The similarity of least squares over the datum points meets the inner constraints exactly, however
-    far the network moved in between: the sum of the differences and their turning and scaling moments are 0.
-    Scale bars keep the scale, and so do two control points.
+    The least-squares similarity over the datum points meets the inner constraints exactly, however far the
+    network moved: the sum of the differences and their moments of rotation and scale are 0. Scale bars keep
+    the scale, and so do two control points.
 
     Args:
-        network: what was adjusted, in a free datum.
-        estimate: adjusted.
-        frame: coordinates to refer to, NaN where there are none; with fewer than three points those of
-            the projection centres count.
+        network: adjusted in a free datum.
+        estimate: its adjusted values.
+        frame: coordinates to refer to, NaN where there are none; with fewer than three points the projection
+            centres are used.
         carriers: points that carry the datum, all if None, (n,).
     """
     on = frame.determined if carriers is None else frame.determined & carriers
@@ -402,5 +403,5 @@ def place_on_frame(
     scale = object_scale(network, estimate) if len(network.control) and not scaled else 1.0
     try:
         return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
-    except GeometryError:  # too few of them, or on a line: the adjustment has kept their values
+    except GeometryError:  # too few, or on a line: the adjustment has kept their values
         return estimate

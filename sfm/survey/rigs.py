@@ -1,8 +1,9 @@
-"""Rigs of a survey: which photographs are of one moment, and where their cameras are mounted.
+"""Rigs of a survey: which photographs were taken at the same moment, and where their cameras are mounted.
 
-The photographs are oriented one by one. Two of one moment then give the position of one camera in the axes of
-another, and all moments together its mount: the median of positions, and the rotation about which those of
-the moments scatter least. A photograph that could not be oriented alone is placed by its rig.
+Each photograph is first oriented by itself. Two photographs of one moment then give the pose of one camera in
+the axes of the other. All moments together give its mount: the median of the positions, and the rotation from
+which the rotations of the moments differ least. A photograph that could not be oriented by itself is placed
+by its rig.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.4.2 and 8.4; Hartley et al.
 (2013), Rotation averaging, Int. J. Comput. Vis. 103 (medians of rotations).
@@ -28,19 +29,19 @@ from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import Survey
 
 TINY = float(np.finfo(float).tiny)
-ROUNDS = 10  # of the mean of rotations; it moves by less than their scatter after two
+ROUNDS = 10  # iterations of the mean rotation; after two it moves by less than the scatter of the rotations
 
 
 def with_moments(survey: Survey, network: Network) -> Network:
-    """Return the network with the moments of photographs of rigs; as it is without rigs.
+    """Return the network with the moment of each photograph; unchanged if the survey has no rigs.
 
     Args:
-        survey: states which cameras make a rig and what gives the moment of a photograph.
-        network: with one camera for each of the survey's, in their order.
+        survey: states which cameras make a rig and how to find the moment of a photograph.
+        network: has one camera for each camera of the survey, in the same order.
 
     Raises:
-        SurveyFileError: no moment is given for a photograph of a rig, two photographs of one camera are of
-            one moment, or no moment has photographs of two cameras.
+        SurveyFileError: a photograph of a rig has no moment, two photographs of one camera have the same
+            moment, or no moment has photographs of two cameras.
     """
     if not survey.rigs:
         return network
@@ -72,10 +73,10 @@ def with_moments(survey: Survey, network: Network) -> Network:
 
 
 def planned_mounts(survey: Survey) -> Mounts:
-    """Return the mounts of the cameras of a planned survey as they are given, free unless held fixed.
+    """Return the given mounts of the cameras of a planned survey, free unless they are held fixed.
 
     Raises:
-        SurveyFileError: cameras that are on no rig, several rigs, or a camera without mount.
+        SurveyFileError: cameras on no rig, several rigs, or a camera without a mount.
     """
     names = [camera.name for camera in survey.cameras]
     if len(survey.rigs) != 1 or set(survey.rigs[0].cameras) != set(names):
@@ -96,7 +97,7 @@ def planned_mounts(survey: Survey) -> Mounts:
 
 
 def _with_given(mounts: Mounts, given: MountObservations) -> Mounts:
-    """Return mounts with given ones among them, those without standard deviations held fixed."""
+    """Return mounts with the given ones inserted; those without standard deviations are held fixed."""
     a = given.camera
     position, rotation, free = mounts.position.copy(), mounts.rotation.copy(), mounts.free.copy()
     position[a], free[a] = given.position, np.diagonal(given.covariance, axis1=1, axis2=2) > 0
@@ -112,7 +113,7 @@ def _moments(
     named: Mapping[str, str],
     where: str,
 ) -> dict[int, object]:
-    """Return the moment of each photograph of a rig, by its index."""
+    """Return the moment of each photograph of a rig, by photograph index."""
     of_photographs = [i for i in range(len(images)) if camera[i] in of_rig]
     if rig.named:
         for i in of_photographs:
@@ -140,19 +141,19 @@ def _moments(
 
 
 def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estimate:
-    """Return the estimate with the mounts of the cameras of rigs, and all photographs of oriented moments.
+    """Return the estimate with the mounts of the rigs' cameras, and with all photographs of oriented moments.
 
     Args:
         survey: names the rigs.
-        network: with moments, see `with_moments`.
-        estimate: with photographs oriented one by one.
+        network: has moments, see `with_moments`.
+        estimate: has photographs oriented one by one.
 
     Raises:
         GeometryError: a camera of a rig is oriented at no moment together with the others.
     """
     if network.moment is None:
         return estimate
-    if any(rig.blocks for rig in survey.rigs):  # the final adjustment has their mounts
+    if any(rig.blocks for rig in survey.rigs):  # the final adjustment determines their mounts
         placed = place_by_rigs(*split_blocks(survey, network, estimate))
         return replace(estimate, position=placed.position, rotation=placed.rotation)
     mounts = mounts_of(_rigs_of(survey), network, estimate)
@@ -160,12 +161,12 @@ def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estim
 
 
 def hold_mounts(estimate: Estimate, given: MountObservations, *, scaled: bool) -> Estimate:
-    """Return the estimate with given mounts, those without standard deviations held fixed.
+    """Return the estimate with the given mounts; those without standard deviations are held fixed.
 
     Args:
-        estimate: with mounts.
-        given: confirmed by its photographs but for their common scale.
-        scaled: whether something else gives its scale; else the given bases do.
+        estimate: has mounts.
+        given: mounts that its photographs confirm, except for their common scale.
+        scaled: whether something else gives the scale; otherwise the given bases do.
     """
     mounts, a = estimate.mounts, given.camera
     if mounts is None or not len(given):
@@ -174,30 +175,31 @@ def hold_mounts(estimate: Estimate, given: MountObservations, *, scaled: bool) -
         base = np.maximum(np.linalg.norm(mounts.position[a], axis=1), TINY)
         scale = float(np.median(np.linalg.norm(given.position, axis=1) / base))
         estimate = Similarity(scale, np.eye(3), np.zeros(3)).apply_estimate(estimate)
-        mounts = replace(mounts, position=scale * mounts.position)  # all of them free
+        mounts = replace(mounts, position=scale * mounts.position)  # all mounts are free
     return replace(estimate, mounts=_with_given(mounts, given))
 
 
 def _rigs_of(survey: Survey) -> dict[str, list[int]]:
-    """Return the cameras of each rig, the reference first, by their indices."""
+    """Return the camera indices of each rig, the reference camera first."""
     number = {camera.name: a for a, camera in enumerate(survey.cameras)}
     return {rig.name: [number[name] for name in rig.cameras] for rig in survey.rigs}
 
 
 def split_blocks(survey: Survey, network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
-    """Return the network and estimate with a rig for each block of time of rigs that have some.
+    """Return the network and estimate with a separate rig for each block of time.
 
-    Each block has cameras of its name, which share their interior orientation with those of the others.
+    Rigs without blocks stay as they are. The cameras of each block are named after it, and share their
+    interior orientation with the cameras of the other blocks.
 
     Args:
         survey: names the rigs.
-        network: with moments, and one camera for each of the survey's.
-        estimate: of the same.
+        network: has moments, and one camera for each camera of the survey.
+        estimate: of this network.
 
     Raises:
-        SurveyFileError: a photograph of such a rig is of no block or of several, a moment is of two, or a
-            block has no photographs.
-        GeometryError: as `mounts_of` does.
+        SurveyFileError: a photograph of a rig with blocks is in no block or in several, a moment is in two
+            blocks, or a block has no photographs.
+        GeometryError: as in `mounts_of`.
     """
     if network.moment is None or not any(rig.blocks for rig in survey.rigs):
         return network, estimate
@@ -221,7 +223,7 @@ def split_blocks(survey: Survey, network: Network, estimate: Estimate) -> tuple[
 
 
 def _blocks_of(rig: RigSettings, source: str, network: Network, of_rig: Sequence[int]) -> dict[int, int]:
-    """Return the block of each photograph of a rig, by its index."""
+    """Return the block index of each photograph of a rig, by photograph index."""
     assert network.moment is not None
     where, found, at = f"{source}: rig {rig.name}", dict[int, int](), dict[int, int]()
     for i in np.flatnonzero(np.isin(network.camera, of_rig)).tolist():
@@ -242,12 +244,12 @@ def _blocks_of(rig: RigSettings, source: str, network: Network, of_rig: Sequence
 
 
 def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Estimate) -> Mounts:
-    """Return the mounts that photographs oriented one by one give, those beside the reference cameras free.
+    """Return mounts from photographs oriented one by one, free except for the reference cameras.
 
     Args:
-        rigs: indices of the cameras of each, the reference first, by its name.
-        network: with moments.
-        estimate: with photographs oriented one by one.
+        rigs: camera indices of each rig by its name, the reference camera first.
+        network: has moments.
+        estimate: has photographs oriented one by one.
 
     Raises:
         GeometryError: a camera of a rig is oriented at no moment together with the others.
@@ -281,21 +283,24 @@ def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Est
 
 
 def _common(at: dict[tuple[int, int], int], a: int, b: int) -> list[tuple[int, int]]:
-    """Return the photographs of two cameras of the same moments."""
+    """Return the pairs of photographs that two cameras took at the same moment."""
     return [(i, at[when, b]) for (when, camera), i in at.items() if camera == a and (when, b) in at]
 
 
 def _relative(
     estimate: Estimate, X: FloatArray, R: FloatArray, i: int, j: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return position and rotation of the camera of photograph j in the axes of the rig of photograph i."""
+    """Return the pose of the camera of photograph j in the axes of the rig of photograph i.
+
+    X, R: mounted position and rotation of the camera of photograph i.
+    """
     of_rig = estimate.rotation[i] @ R.T
     origin = estimate.position[i] - of_rig @ X
     return np.asarray(of_rig.T @ (estimate.position[j] - origin)), of_rig.T @ estimate.rotation[j]
 
 
 def _middle(R: FloatArray) -> FloatArray:
-    """Return the rotation from which others differ least, by the mean of those near their median, (3, 3)."""
+    """Return the mean of the rotations nearest to their median rotation, (3, 3)."""
     angle = np.arccos(np.clip((np.einsum("iab,jab->ij", R, R) - 1) / 2, -1.0, 1.0))
     middle = R[int(np.argmin(np.median(angle, axis=1)))]
     for _ in range(ROUNDS):
@@ -305,7 +310,7 @@ def _middle(R: FloatArray) -> FloatArray:
 
 
 def place_by_rigs(network: Network, estimate: Estimate) -> Estimate:
-    """Return the estimate with all photographs of moments at which one at least is oriented."""
+    """Return the estimate with all photographs oriented of each moment that has an oriented photograph."""
     mounts = estimate.mounts
     if network.moment is None or mounts is None:
         return estimate

@@ -1,4 +1,8 @@
-"""From the targets of single photographs to the network: which target is which object point."""
+"""The network of a survey from the targets of its photographs: which target is which object point.
+
+Coded targets are named by their codes. Uncoded targets are named by matching them over all oriented
+photographs. Known distances on plates and tags become scale bars.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +28,11 @@ from sfm.targets.codes.tags import CORNERS, corner_name
 from sfm.targets.outlines import Flag
 
 UNNAMED = -1
-# Standard deviation of the size of tags where the survey states none, in parts of it: what desktop printers
-# and the setting "fit to page" by mistake are apart from true scale once the ruler was checked.
+# Relative standard deviation of the size of tags where the survey states none. Prints of desktop printers,
+# and
+# those made by mistake with the setting "fit to page", differ by this much once checked with a ruler.
 TAG_SIGMA = 0.002
-MAX_SEMI_AXES = 4.0  # semi-axes of a target: what is nearer to its point is not another target
+MAX_SEMI_AXES = 4.0  # a target nearer to its point than this many of its semi-axes is not another target
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other
 
 
@@ -39,9 +44,9 @@ def measure_targets(
     store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> Measurements:
-    """Return the network of the coded targets of a survey, and the uncoded ones still without a name.
+    """Measure a survey's targets and return the network of the coded ones; the others are unnamed.
 
-    Args, Raises: as `measure_photographs`.
+    Args, Raises: as in `measure_photographs`.
     """
     photographs = measure_photographs(survey, files, jobs=jobs, store=store, progress=progress)
     naming = name_coded(photographs)
@@ -64,7 +69,7 @@ def measure_targets(
 
 
 def min_rays(naming: Naming) -> IntArray:
-    """Return how many photographs each point needs: codes confirm themselves, uncoded points do not, (n,)."""
+    """Return how many photographs each point needs, (n,): codes confirm themselves, uncoded points do not."""
     return np.where(naming.code >= 0, 2, MIN_RAYS)
 
 
@@ -85,7 +90,7 @@ def name_coded(photographs: MeasuredPhotographs) -> Naming:
 
 
 def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Naming) -> Network:
-    """Return the network of all named targets, with control and scale bars among them."""
+    """Return the network of all named targets, with its control and scale bars."""
     named = [np.flatnonzero(point != UNNAMED) for point in naming.point]
     image = np.repeat(np.arange(len(named)), [len(rows) for rows in named])
     targets = list(zip(photographs.targets, named, strict=True))
@@ -103,7 +108,7 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
 
 
 def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
-    """Return two diagonals of what was seen of each plate but the first, which is control, as scale bars."""
+    """Return two diagonals of the seen part of each plate but the first, which is control."""
     bars = []
     for settings, plate in zip(survey.plates, plates_of(survey.family)[1:], strict=True):
         seen = naming.code[(naming.code >= plate.first_point) & (naming.code <= plate.last_point)]
@@ -113,7 +118,7 @@ def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
         for along in (xyz[:, 0] + xyz[:, 1], xyz[:, 0] - xyz[:, 1]):
             ends = along.argmin(), along.argmax()
             if along[ends[0]] == along[ends[1]]:
-                continue  # two points across the diagonal
+                continue  # two points at right angles to the diagonal
             length = float(np.linalg.norm(xyz[ends[1]] - xyz[ends[0]]))
             sigma = np.sqrt(2) * (settings.plate_sigma or 0.0)
             start, end = (str(seen[k]) for k in ends)
@@ -122,10 +127,10 @@ def plate_bars(survey: Survey, naming: Naming) -> list[ScaleBar]:
 
 
 def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:
-    """Return the diagonals of all tags as scale bars, none without the size of the tags.
+    """Return the diagonals of all tags as scale bars; none if the size of the tags is unknown.
 
-    The scale of a print is the same for all its tags, so that they together know the scale no better than
-    one of them: each of n bars has the standard deviation of one times the root of n.
+    All tags of a print have the same scale error, so together they give the scale no better than one tag
+    does. Therefore each of n bars has the standard deviation of one bar times the square root of n.
     """
     size, sigma = targets.tag_size, targets.tag_sigma
     if size is None or not naming.corners:
@@ -145,20 +150,20 @@ def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:
 def match_uncoded(
     photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, *, tolerance_px: float
 ) -> tuple[Naming, Estimate]:
-    """Name the uncoded targets anew by their agreement over all oriented photographs.
+    """Rename the uncoded targets by matching them over all oriented photographs.
 
-    Coded targets keep their names where they are seen within the tolerance of their point; those that are
-    not, and targets whose code was not read, take the name of the coded point they coincide with or else
-    join the uncoded ones.
+    A coded target keeps its name if it lies within the tolerance of its point. Other coded targets, and
+    targets whose code was not read, take the name of the coded point they coincide with. Without one they
+    join the uncoded targets.
 
     Args:
         photographs: m photographs with their targets.
-        naming: names so far; its uncoded points are forgotten.
+        naming: names so far; its uncoded points are dropped.
         estimate: orientation, and the points of `naming`.
-        tolerance_px: largest distance of a target from its projected point.
+        tolerance_px: largest distance of a target from its projected point, px.
 
     Returns:
-        The naming with uncoded points behind the coded ones, and the estimate with their coordinates.
+        The naming with uncoded points after the coded ones, and the estimate with their coordinates.
     """
     coded = np.flatnonzero(naming.code >= 0)
     known = estimate.points[coded]
@@ -212,11 +217,11 @@ def _nearest(
     tolerance_px: float,
     far_px: FloatArray,
 ) -> IntArray:
-    """Return the coded point that each target coincides with, or UNNAMED; one target a point.
+    """Return the coded point that each target coincides with, or UNNAMED; at most one target per point.
 
-    A target whose code reads another number is never renamed: one of the two is wrong. One with the code
-    of the point keeps its name also beyond the tolerance, for the adjustment to judge, unless it is so far
-    away that it is another target.
+    A target with another code is never given the name of the point, since one of the two is wrong. A target
+    with the code of the point keeps its name even beyond the tolerance, and the adjustment judges it. If it
+    is farther than `far_px`, it is another target.
     """
     named = np.full(len(xy), UNNAMED)
     if not len(xy):

@@ -1,1 +1,1 @@
-"""The adjustment of a survey: its datum, what is free, and what leaves until nothing leaves any more."""
+"""The adjustment of a survey: its datum, its free parameters, and repetition until nothing is removed."""

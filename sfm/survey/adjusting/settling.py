@@ -1,9 +1,14 @@
-"""Adjusting a survey until nothing leaves it any more: points, photographs, weights.
+"""Repeated adjustment of a survey, until no more points or photographs are removed.
 
-With long lenses all rays of a photograph are nearly parallel: principal distance, distance of the photographs
-and depth of the object can hardly be distinguished, Gauss-Newton creeps along a bent valley, and the object
-turned inside out in depth is another minimum. With the cameras held at their start values there is no
-such valley; from where that ends the cameras are freed.
+After each adjustment, points with too few accepted rays and photographs with too few accepted points are
+removed, and the rest is adjusted again. If other observations take part, the image points are weighted by
+their variance component.
+
+With long lenses all rays of a photograph are nearly parallel. Principal distance, distance of the photographs
+and depth of the object can then hardly be distinguished. Gauss-Newton moves slowly along a bent valley, and
+the object reversed in depth is another minimum. With the cameras held at their start values there is no such
+valley. If an adjustment does not converge, it is repeated with held cameras, and from that solution with free
+cameras.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 13.3.6 (affine cameras, reversal).
 """
@@ -40,36 +45,38 @@ from sfm.survey.inputs.survey import Survey
 
 MIN_DATUM_POINTS = 3  # that fix position, attitude and scale
 MAX_ITERATIONS = 50  # of an adjustment from the usual start values
-MANY_ITERATIONS = 300  # from nearer ones, where it has not converged: along a flat valley steps are short
-# what is held where it does not converge with all: x0, y0 look like a rotation, c like another distance
+MANY_ITERATIONS = 300  # of a second adjustment from nearer values: steps along a flat valley are short
+# Parameters that are held if it does not converge with all: x0, y0 look like a rotation, c like another
+# distance.
 HELD_ONE_AFTER_ANOTHER = ((), (Role.X0, Role.Y0), (Role.X0, Role.Y0, Role.FOCAL))
-CARRYING_DEG = 2.0  # largest angle between two rays of a point below which it carries no free datum
-DAMPED_ITERATIONS, UNDAMPED_ITERATIONS = 50, 300  # with the cameras held, where a step is cheap
-START_TOLERANCE = 1e-3  # |A dx| / |v| that is near enough for a start
+CARRYING_DEG = 2.0  # a point carries no free datum if the largest angle between its rays is smaller
+DAMPED_ITERATIONS, UNDAMPED_ITERATIONS = 50, 300  # with the cameras held; a step costs little
+START_TOLERANCE = 1e-3  # |A dx| / |v| that is close enough for start values
 MOTIONS = 7  # of a network whose position, attitude and scale the datum fixes
 
 
 @dataclass(frozen=True)
 class Task:
-    """An adjustment to be made, and its settings."""
+    """An adjustment to perform, with its settings."""
 
     survey: Survey
     network: Network
     needed: IntArray  # rays that each point needs to stay, (n,)
     least: IntArray  # image points that each photograph needs to stay, (m,)
-    suspected: tuple[str, ...] = ()  # photographs that could be matched with a per-photograph camera only
-    # On the stated standard deviations of the image points. Where these are far too large, control and bars
-    # bend the network by more than its noise, and their points seem to be gross errors.
+    suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
+    # Factor of the stated standard deviations of the image points. If these are far too large, control and
+    # bars
+    # bend the network by more than its noise, and their points look like gross errors.
     factor: float = 1.0
 
     @property
     def datum(self) -> Datum:
-        """The kind of datum that the survey asks for."""
+        """The kind of datum that the survey states."""
         return Datum(self.survey.datum.kind)
 
     @property
     def in_free_datum(self) -> Task:
-        """The task in a free datum, where it was that of control."""
+        """The task in a free datum if its datum is control, else unchanged."""
         if self.survey.datum.kind != "control":
             return self
         return replace(self, survey=replace(self.survey, datum=DatumSettings(kind="free")))
@@ -77,21 +84,21 @@ class Task:
 
 @dataclass(frozen=True)
 class StableAdjustment:
-    """An adjustment after which no point or photograph leaves."""
+    """An adjustment after which no point or photograph is removed."""
 
     task: Task
     adjustment: Adjustment  # without covariance
-    images: BoolArray  # photographs in it, (m,)
-    points: BoolArray  # points in it, (n,)
+    images: BoolArray  # photographs in the adjustment, (m,)
+    points: BoolArray  # points in the adjustment, (n,)
     accepted: BoolArray  # image points of the whole network, (k,)
-    iterations: int  # of all adjustments on the way
-    rays: IntArray  # accepted rays of each point, of those that left when they left, (n,)
+    iterations: int  # of all adjustments
+    rays: IntArray  # accepted rays of each point, for removed points at their removal, (n,)
     start_sigma0: float  # at the start values
-    held: tuple[Remark, ...]  # parameters that were held because it did not converge with them
-    per_photograph: PhotographCameras | None = None  # or left out; None without such
+    held: tuple[Remark, ...]  # on parameters that were held to make it converge
+    per_photograph: PhotographCameras | None = None  # or photographs left out; None without any
 
     def after(self, before: StableAdjustment) -> StableAdjustment:
-        """Return it as what followed an earlier one."""
+        """Return this adjustment as the continuation of an earlier one."""
         return replace(
             self,
             iterations=before.iterations + self.iterations,
@@ -121,12 +128,13 @@ class StableAdjustment:
 
 
 def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) -> StableAdjustment:
-    """Adjust until the points and photographs that are left stay.
+    """Adjust until no more points or photographs are removed.
 
     Args:
-        task: what to adjust.
+        task: the adjustment to perform.
         estimate: approximate values.
-        accepted: image points that an earlier adjustment accepted, (k,); the others return where they pass.
+        accepted: image points that an earlier adjustment accepted, (k,); the others return if they pass the
+            test.
     """
     network, iterations, start_sigma0 = task.network, 0, np.nan
     held: tuple[Remark, ...] = ()
@@ -147,7 +155,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
             iterations += adjustment.iterations
         estimate = merge_estimate(adjustment.estimate, images, points)
         accepted = _accepted(network, adjustment, images, points)
-        if wrong is None:  # once: each round would find more, as errors of windows are not quite normal
+        if wrong is None:  # once only: errors of windows are not quite normal, each round would find more
             wrong = np.zeros(len(points), dtype=bool)
             if task.survey.tie_points is not None and task.survey.reject != "none":
                 wrong[points] = _wrong_windows(adjustment)
@@ -163,11 +171,12 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
 
 
 def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
-    """Adjust, then again with per-photograph cameras where these fit, and without photographs that do not.
+    """Adjust, then again with per-photograph cameras where these fit, and without misfitting photographs.
 
     Args:
-        task: what to adjust; without tests nothing shows a photograph that does not fit.
-        estimate: approximate values, from which what has left the first adjustment starts again.
+        task: the adjustment to perform; without outlier tests there is only one adjustment.
+        estimate: approximate values; photographs and points removed from the first adjustment start from
+            these again.
     """
     settled = settle(task, estimate)
     if task.survey.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
@@ -193,10 +202,16 @@ def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
 
 
 def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:
-    """Return the last adjustment with its covariance; it begins without what was rejected, (k,).
+    """Return the final adjustment with its covariance.
 
-    Where other observations take part, the image points are weighted by their variance component, unless
-    the survey wants all weights as stated.
+    If other observations take part, the image points are weighted by their variance component, unless the
+    survey states that all weights are fixed.
+
+    Args:
+        task: the adjustment to perform.
+        part: the network to adjust.
+        estimate: start values.
+        rejected: image points that are rejected at the start, (k,).
     """
     part, estimate = without_idle_cameras(part, estimate, count=len(task.survey.cameras))
 
@@ -214,9 +229,9 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
 def _converged(
     task: Task, part: Network, start: Estimate, ended: Adjustment
 ) -> tuple[Adjustment, tuple[Remark, ...]]:
-    """Return the adjustment from nearer start values, and what had to be held for it to converge.
+    """Return the adjustment from nearer start values, and remarks on parameters held to make it converge.
 
-    As it ended, where it does not converge from there either.
+    If it does not converge from there either, the result is `ended`.
     """
     datum = on_points(task, part, start)
     nearer = nearer_start(part, start, ended.estimate, datum)
@@ -246,7 +261,7 @@ def _tested(
     method: str = "levenberg-marquardt",
     max_iterations: int = MAX_ITERATIONS,
 ) -> Adjustment:
-    """Adjust with data snooping, the level of the single test shared out among all image coordinates."""
+    """Adjust with data snooping; the level of the single test is divided among all image coordinates."""
     tests = 2 * len(network.image_points)
     return adjust(
         network,
@@ -264,10 +279,15 @@ def _tested(
 
 
 def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
-    """Return the datum on the points that the survey names, else on all but those at very small angles.
+    """Return the datum on the points that the survey names, else on all points without very small ray angles.
+
+    Args:
+        task: states the datum.
+        network: the network to adjust.
+        estimate: approximate values.
 
     Raises:
-        GeometryError: fewer than three of the named ones are in the network.
+        GeometryError: fewer than three of the named points are in the network.
     """
     datum, named = task.datum, task.survey.datum.points
     if not named and datum.kind == "control":
@@ -287,9 +307,9 @@ def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
 def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float) -> Adjustment:
     """Return the adjustment with the image points weighted by their variance component.
 
-    Lengths and control have the standard deviations that were stated for them; without this, sigma0 a
-    posteriori, which the image points decide, would scale these too. The component is that of the image
-    points that the last adjustment accepts.
+    Lengths and control keep their stated standard deviations. Without the component, sigma0 a posteriori,
+    which the image points determine, would scale these too. The component is estimated from the image points
+    that the last adjustment accepts.
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
@@ -302,16 +322,16 @@ def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start:
 
 
 def _wrong_windows(adjustment: Adjustment) -> BoolArray:
-    """Return which points of an adjustment have residuals that are together larger than chance, (n,).
+    """Return which points have residuals that are together larger than chance explains, (n,).
 
-    A window of texture that is a little wrong in several photographs passes the tests of its single rays.
-    Points that control or scale bars name stay, for people to look at.
+    A window of texture that is slightly wrong in several photographs passes the tests of its single rays.
+    Points of control or scale bars stay, so that people can examine them.
     """
     network, used = adjustment.network, ~adjustment.rejected
     seen, v, n = network.image_points.select(used), adjustment.residuals[used], len(network.points)
     P = np.linalg.inv(adjustment.image_covariance[used])
     vPv = np.bincount(seen.point, np.einsum("ka,kab,kb->k", v, P, v), minlength=n)
-    redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # cameras held: too cautious by a little
+    redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # with cameras held: slightly too cautious
     limit = chi2_isf(level_of_single(FALSE_ALARM, n), np.maximum(redundancy, 1))
     large = (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
     bars = network.scale_bars
@@ -320,7 +340,7 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
 
 
 def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
-    """Return which image points of the whole network the adjustment of a part of it accepted."""
+    """Return which image points of the whole network the adjustment of its part accepted, (k,)."""
     seen = network.image_points
     part = images[seen.image] & points[seen.point]
     accepted = part.copy()
@@ -329,16 +349,16 @@ def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, point
 
 
 def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datum) -> Estimate | None:
-    """Return start values by an adjustment with all cameras held, of the smaller v'Pv of both depths.
+    """Return start values from an adjustment with all cameras held; of both depths, that with smaller v'Pv.
 
     Args:
-        network: what is adjusted.
+        network: the network to adjust.
         start: start values from which its adjustment did not converge.
-        ended: where that adjustment ended.
-        datum: of the adjustment.
+        ended: values at which that adjustment ended.
+        datum: datum of the adjustment.
 
     Returns:
-        The cameras as in the start values; None where nothing converges.
+        The start values, with the cameras as in `start`; None if no adjustment converges.
     """
     found = [one for one in (_held(network, one, datum) for one in _candidates(start, ended, datum)) if one]
     if not found:
@@ -348,7 +368,7 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
 
 
 def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[Remark, ...]:
-    """Return a remark for each camera of which parameters were held that were free before."""
+    """Return a remark for each camera with parameters that were free before and are held now."""
     names: dict[str, tuple[str, ...]] = {}
     for one, held in zip(before, after, strict=True):
         lost = np.flatnonzero(one.free & ~held.free)
@@ -361,7 +381,7 @@ def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> t
 
 
 def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
-    """Yield where the adjustment ended, brought back to c of the start, and the start; each reflected too."""
+    """Yield the ended adjustment scaled to c of the start, and the start; each also reversed in depth."""
     factor = start.cameras[0].c_px / ended.cameras[0].c_px
     back = replace(scaled(ended, factor), cameras=start.cameras) if factor > 0 else start
     for one in (back, start):
@@ -371,7 +391,7 @@ def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Esti
 
 
 def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
-    """Return the adjustment with all cameras held, at first damped; None if it does not converge."""
+    """Return the adjustment with all cameras held, damped at first; None if it does not converge."""
     values = replace(
         start, cameras=tuple(replace(one, free=np.zeros_like(one.free)) for one in start.cameras)
     )
@@ -398,12 +418,12 @@ def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
 
 
 def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str) -> None:
-    """Raise GeometryError if a network has no redundancy, so that nothing could be checked or judged.
+    """Raise GeometryError if a network has no redundancy, since nothing could be checked.
 
     Args:
-        network: the part that is to be adjusted.
-        estimate: its cameras state what is free.
-        datum: kind of datum; control and observed exterior orientation count in that of control.
+        network: the part to adjust.
+        estimate: its cameras state the free parameters.
+        datum: kind of datum; control and observed exterior orientation only count if it is `control`.
     """
     m, n, k = len(network.images), len(network.points), len(network.image_points)
     interior = len(
@@ -438,14 +458,14 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
 
 
 def datum_carriers(angles_deg: np.ndarray, least_deg: float) -> BoolArray | None:
-    """Return the points that carry a free datum, None for all.
+    """Return the points that carry a free datum, (n,), or None for all.
 
-    A point far away at a small angle is a long and soft lever on which position, attitude and scale of
-    all the others would hang.
+    A distant point with a small ray angle would be a long and soft lever on the position, attitude and scale
+    of all other points.
 
     Args:
-        angles_deg: largest angle between two rays of each point, NaN with fewer than two, deg, (n,).
-        least_deg: smallest of a point that carries the datum, deg.
+        angles_deg: largest angle between two rays of each point, NaN with fewer than two rays, deg, (n,).
+        least_deg: smallest angle of a point that carries the datum, deg.
     """
     weak = angles_deg < least_deg
     return None if not weak.any() or 2 * weak.sum() > len(weak) else np.asarray(~weak)

@@ -1,4 +1,9 @@
-"""The solution of a survey: matching and adjusting in turn, then the final adjustment in its datum."""
+"""The solution of a survey: its adjustment in the datum, with the given values that image points confirm.
+
+The image points are adjusted alone first. This free network judges control, scale bars, mounts and other
+given values. Then all observations are adjusted together, from the best of several solutions. Finally the
+assumptions are tested.
+"""
 
 from __future__ import annotations
 
@@ -71,42 +76,44 @@ from sfm.survey.rigs import hold_mounts, split_blocks
 from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
-# Ratio of principal distances up to which photographs may differ by focusing, from far to about 15 c. Such a
-# difference is reported. Free in each photograph it costs more than it cures where one of them determines it
-# badly: halves of a video whose c differs by 2 % then differ by 4 % of the distance, before by 0.04 %.
+# Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
+# reported.
+# With c free in each photograph, photographs that determine it badly do more harm than good: two halves of a
+# video
+# whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
 MAX_FOCUS_CHANGE = 1.03
-PAIR_TOLERANCE = 10.0  # standard deviations within which pairs of accepted image points fit an orientation
-GIVEN_IMAGE_POINTS = 3  # of one whose given orientation decides which of the four solutions is meant
+PAIR_TOLERANCE = 10.0  # standard deviations within which image points fit another orientation of a pair
+GIVEN_IMAGE_POINTS = 3  # of a photograph with given orientation, which selects one of the four solutions
 
 
 @dataclass(frozen=True)
 class SolvedSurvey:
-    """The final adjustment, and what happened on the way to it."""
+    """The final adjustment of a survey, with its tests and everything that was left out."""
 
     adjustment: Adjustment
-    control_check: ControlCheck | None  # None without control or where the datum is control
+    control_check: ControlCheck | None  # None without control, or if the datum is control
     dropped_images: tuple[tuple[str, Remark], ...]  # photographs that lost their points, with the reason
     remarks: tuple[Remark, ...]
-    left_out: tuple[LeftOutPoint, ...]  # measured points that are not in it
-    unused_image_points: int  # of points and photographs that are not in it
+    left_out: tuple[LeftOutPoint, ...]  # measured points that are not in the adjustment
+    unused_image_points: int  # of points and photographs that are not in the adjustment
     given_tests: tuple[GivenTest, ...]  # of control, bars and observed orientation against the image points
-    others: tuple[OtherSolution, ...]  # that the image points allow as well
+    others: tuple[OtherSolution, ...]  # other solutions that the image points allow
 
 
 def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
 
-    Points that keep too few rays and photographs that keep too few points leave the network, and the rest
-    is adjusted again. A free network is placed on the scale bars and the control, where there are some,
-    without changing its shape. Where the survey leaves to the photographs what is free, and texture shows
-    that they were zoomed, c is adjusted per photograph.
+    Points with too few accepted rays and photographs with too few accepted points are removed, and the rest
+    is adjusted again. A free network is placed on the scale bars and the control, if there are any, without a
+    change of shape. If the survey does not state the free parameters, and texture shows that photographs were
+    zoomed, c is adjusted per photograph.
 
     Args:
-        survey: gives the datum, the a priori sigma and observed exterior orientation.
-        matched: all image points, and approximate values of all that is to be adjusted.
+        survey: states the datum, the a priori sigma and observed exterior orientation.
+        matched: all image points, and approximate values of all unknowns.
 
     Raises:
-        GeometryError: too little is left to adjust, or control is asked for and not seen.
+        GeometryError: too little is left to adjust, or the datum is control but no control is seen.
     """
     found = _solution(survey, matched)
     varying = _varying(survey, found)
@@ -125,7 +132,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
 
 
 def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
-    """Return the cameras of which texture shows that c differs among their photographs."""
+    """Return the cameras whose c, as texture shows, differs among their photographs."""
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     if survey.tie_points is None or survey.rigs or not differs:
         return frozenset()
@@ -135,7 +142,7 @@ def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
 def _solution(
     survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()
 ) -> SolvedSurvey:
-    """Return the solution of a survey, with c of each photograph of some cameras."""
+    """Return the solution of a survey; the cameras `varying` have c per photograph."""
     start = _prepared(survey, matched, varying)
     free = _free_network(start)
     mounts, of_mounts = _judged_mounts(start, free)
@@ -156,7 +163,7 @@ def _solution(
         needed=matched.min_rays,
     )
     known = set(np.array(whole.points, dtype=object)[start.estimate.determined])
-    # natural texture has points in plenty, of which only those that were lost on the way are worth a line
+    # Natural texture has very many points; only those that had approximate values are worth a line.
     listed = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     report_step("testing the assumptions")
@@ -195,7 +202,7 @@ def _solution(
 
 
 def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:
-    """Return the names of the points of each plate; none without plates."""
+    """Return the names of the points of each plate; empty without plates."""
     if naming is None:
         return ()
     plates = points_of_plates(survey.family, naming.codes(network))
@@ -204,36 +211,33 @@ def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tu
 
 @dataclass(frozen=True)
 class _Prepared:
-    """The network before its adjustment, with its cameras and what is known of its datum."""
+    """The network before its adjustment, with its cameras and datum."""
 
-    task: Task  # with all that was given, which is not judged yet
+    task: Task  # with all given values, which are not judged yet
     estimate: Estimate
-    frame: Estimate | None  # given coordinates, which carry a free datum; None without
-    remarks: tuple[Remark, ...]  # on observed exterior orientation, and which parameters were freed
+    frame: Estimate | None  # given coordinates that carry a free datum; None without any
+    remarks: tuple[Remark, ...]  # on observed exterior orientation and on freed parameters
 
 
 @dataclass(frozen=True)
 class _Final:
-    """A last adjustment and what it was settled from."""
+    """A final adjustment, and the repeated adjustment before it."""
 
     settled: StableAdjustment
-    adjustment: Adjustment  # with the iterations of all adjustments on the way
+    adjustment: Adjustment  # with the iterations of all adjustments before it
     check: ControlCheck | None
-    c_held: tuple[str, ...]  # cameras whose c was to be free and had to be held
+    c_held: tuple[str, ...]  # cameras whose c should be free but had to be held
     others: tuple[OtherSolution, ...]
 
 
 def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
-    """Bring network and approximate values into the frame and cameras that the survey asks for.
+    """Bring network and approximate values into the frame and cameras of the survey.
 
-    Args:
-        survey: asks for them.
-        matched: network and approximate values.
-        varying: names of the cameras of which every photograph has c by itself, where it is adjusted.
+    varying: names of the cameras with c per photograph, if c is adjusted.
     """
     network, estimate = matched.network, matched.estimate
     tables = tuple(one for one in network.observations if not isinstance(one, MountObservations))
-    network = replace(network, observations=tables)  # mounts take part as far as photographs confirm them
+    network = replace(network, observations=tables)  # mounts only take part if photographs confirm them
     datum = survey.datum.kind
     unused: tuple[Remark, ...] = ()
     if survey.exterior is not None and datum == "control":
@@ -243,7 +247,7 @@ def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str])
     report_step("choosing the free parameters of the cameras")
     if datum == "control" and len(network.control) == len(network.exterior) == 0:
         raise GeometryError("datum 'control', but no control point was measured")
-    if datum == "minimal" and matched.given:  # it holds the given coordinates fixed
+    if datum == "minimal" and matched.given:  # this datum holds the given coordinates fixed
         given = given_values(survey, network)
         held = np.where(given.determined[:, None], given.points, estimate.points)
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
@@ -277,14 +281,15 @@ def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
 
 
 def _free_network(start: _Prepared) -> StableAdjustment | None:
-    """Adjust the image points alone: nothing that was given bends their network, or costs one of them.
+    """Adjust the image points alone, so that no given value bends their network or causes a rejection.
 
     Returns:
-        The network; None for a plate that looks alike turned, whose points have no identity without it, and
-        for image points that control may connect and calibrate, as they do not by themselves.
+        The adjustment. None for a plate that looks alike when turned, since its points have no identity
+        without the plate. None also if the image points by themselves form no network, but control may
+        connect and calibrate it.
 
     Raises:
-        GeometryError: they do not make a network by themselves, and there is no control.
+        GeometryError: the image points by themselves form no network, and there is no control.
     """
     task, estimate = start.task, start.estimate
     if _has_no_identity(task.survey):
@@ -300,7 +305,7 @@ def _free_network(start: _Prepared) -> StableAdjustment | None:
 
 
 def _has_no_identity(survey: Survey) -> bool:
-    """Return whether points are on a plate that looks alike turned: they are no points without it."""
+    """Return whether the points are on a plate that looks alike when turned: it alone identifies them."""
     plate = plate_family(survey.targets)
     return plate is not None and plate.is_ambiguous
 
@@ -323,10 +328,10 @@ def _judged(
     *,
     checks_scale: bool,
 ) -> tuple[Task, JudgedGiven]:
-    """Return the task with what was given, as on plates, as far as the image points confirm it."""
+    """Return the task with the given values that the image points confirm, and their judgement."""
     task = start.task
     network = task.network
-    if free is not None:  # with per-photograph cameras, if there are
+    if free is not None:  # with its per-photograph cameras, if any
         network = replace(
             free.task.network,
             control=network.control,
@@ -337,7 +342,7 @@ def _judged(
     if _has_no_identity(task.survey):
         return task, JudgedGiven(network, task.datum)
     report_step("testing the given values")
-    # a camera that had to be held, at whatever value it started from, gives the network a wrong shape
+    # a camera that had to be held at its start value gives the network a wrong shape
     adjustment = None if free is None or free.held else free.adjustment
     given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
     if adjustment is not None and task.survey.tie_points is not None and given_any:
@@ -367,25 +372,19 @@ def _settled(
     given: JudgedGiven,
     mounts: MountObservations,
 ) -> tuple[StableAdjustment, tuple[Remark, ...]]:
-    """Adjust the image points and what was given together.
-
-    Args:
-        start: network and approximate values.
-        free: the image points adjusted alone.
-        task: with what was given, as far as the image points confirm it.
-        given: judged.
-        mounts: given ones that the image points confirm.
+    """Adjust the image points together with the given values that they confirm.
 
     Returns:
-        The adjustment, and remarks on observations of tables and mounts that were left out.
+        The adjustment, and remarks on tabulated observations and mounts that were left out.
     """
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.adjustment
-        if alone.redundancy > 0:  # else there is only what was stated
+        if alone.redundancy > 0:  # without redundancy there is only the stated sigma
             factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
-        free = None  # what they give alone is no start either, nor are the cameras that it gave photographs
+        # the free network is no start either, nor are its per-photograph cameras
+        free = None
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate = start.estimate
     if free is not None:
@@ -412,7 +411,7 @@ def _settled(
 def _with_mounts(
     task: Task, estimate: Estimate, free: StableAdjustment | None, mounts: MountObservations
 ) -> tuple[Task, Estimate, tuple[Remark, ...]]:
-    """Return the task and start values with given mounts, if their scale agrees with that of all else."""
+    """Return the task and start values with the given mounts, if their scale agrees with all other scales."""
     kinds = (("bars", task.network.scale_bars), ("control", task.network.control))
     others = [name for name, some in kinds if len(some) and (name == "bars" or task.datum.kind == name)]
     others += [one.name for one in task.network.observations]
@@ -420,7 +419,7 @@ def _with_mounts(
     if free is not None and not free.held:
         without = free.adjustment
         if others:
-            with suppress(GeometryError):  # nothing else gives a scale that these others need
+            with suppress(GeometryError):  # the other values may need a scale that nothing else gives
                 without = settle(task, estimate, free.accepted).adjustment
         mounts, said = judge_mount_scales(mounts, without, others)
     scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
@@ -432,31 +431,28 @@ def _with_mounts(
 
 
 def _best(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:
-    """Return the last adjustment, and a remark where it starts from a solution of smaller v'Pv."""
+    """Return the final adjustment, and a remark if it starts from another solution of smaller v'Pv."""
     found = _final(start, settled)
     if not found.others or not found.others[0].converges:
         return found, ()
     other = found.others[0]
     estimate = merge_estimate(other.estimate, settled.images, settled.points)
     again = _final(start, settle(settled.task, estimate).after(settled), before=found.adjustment)
-    if not again.adjustment.converged:  # what seemed better is no solution
+    if not again.adjustment.converged:  # the better start leads to no solution
         return found, ()
     return again, (_better_taken(found.adjustment, other),)
 
 
 def _final(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:
-    """Return the last adjustment of a settled network, and the other solutions that its image points allow.
+    """Return the final adjustment of a settled network, and other solutions that its image points allow.
 
-    Args:
-        start: network, frame and approximate values.
-        settled: adjusted so that nothing leaves it any more.
-        before: solution that was left for this one.
+    before: the solution that this one replaces.
     """
     final, check = _placed(start, settled)
     final = replace(
         final, iterations=settled.iterations + final.iterations, start_sigma0=settled.start_sigma0
     )
-    # c that had to be held was not estimated: what its other values give is another solution
+    # c that had to be held was not estimated: other values of c give other solutions
     asked = {one.name for one in start.estimate.cameras if one.free[0]}
     c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
     report_step("looking for other solutions")
@@ -469,11 +465,11 @@ def _final(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | 
 def _without_gross(
     task: Task, settled: StableAdjustment, estimate: Estimate
 ) -> tuple[Task, tuple[Remark, ...]]:
-    """Return the task without observations of tables that contradict all others, by the settled network."""
+    """Return the task without tabulated observations that contradict all others in the settled network."""
 
     def adjusted(part: Network) -> Adjustment:
         free = task.datum.kind != "control"
-        placed = place_on_observations(part, start) if free else start  # wrong observations turn it
+        placed = place_on_observations(part, start) if free else start  # wrong observations would turn it
         datum = on_points(task, part, placed)
         loose = loosen_far(part, placed)
         return adjust(loose, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
@@ -491,18 +487,18 @@ def _without_gross(
 
 
 def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
-    """Return the free network in the frame of what was given, with what it had to leave out where it was."""
+    """Return the free network in the frame of the given values; single-ray control keeps its start values."""
     if given.placing is not None and task.datum.kind == "control":
         found = given.placing.apply_estimate(found)
     elif task.datum.kind == "control":
-        return replace(before, cameras=found.cameras)  # with per-photograph cameras, if there are
-    lost = task.needed == 1  # control that one photograph sees is determined by its coordinates
+        return replace(before, cameras=found.cameras)  # with per-photograph cameras, if any
+    lost = task.needed == 1  # control seen by one photograph: its given coordinates determine it
     points = np.where((lost & ~found.determined)[:, None], before.points, found.points)
     return replace(found, points=points)
 
 
 def _with_given(settled: StableAdjustment) -> StableAdjustment:
-    """Return an adjustment with the network of its task, which has what was given beside the image points."""
+    """Return the adjustment with the network of its task, which also has the given values."""
     network = settled.task.network
     every = np.ones(len(network.image_points), dtype=bool)
     part, _ = reduce_network(network, settled.whole, settled.images, settled.points, every)
@@ -510,7 +506,7 @@ def _with_given(settled: StableAdjustment) -> StableAdjustment:
 
 
 def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
-    """Return the solutions that the image points of two photographs allow; control decides by itself."""
+    """Return the solutions that the image points of a pair allow; empty with control, which decides."""
     if len(final.network.images) > 2 or final.datum == "control":
         return ()
     accepted = replace(final.network, image_points=final.network.image_points.select(~final.rejected))
@@ -520,7 +516,7 @@ def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
 
 
 def _placed(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, ControlCheck | None]:
-    """Return the final adjustment of a settled network, placed on control or on the frame of its datum."""
+    """Return the final adjustment of a settled network, placed on its control or the frame of its datum."""
     task, last, check = settled.task, settled.estimate, None
     if task.datum.kind != "control" and len(settled.part.control.complete) >= MIN_CONTROL:
         last, check = place_on_control(settled.part, last)
@@ -536,7 +532,7 @@ def _placed(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, Co
 
 
 def _dropped(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Remark], ...]:
-    """Return the photographs that had an orientation and are not in the result, with the reason."""
+    """Return the oriented photographs that are not in the result, with the reason."""
     reasons = {} if settled.per_photograph is None else dict(settled.per_photograph.left_out)
     task = start.task
     return tuple(
@@ -549,7 +545,7 @@ def _dropped(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Re
 
 
 def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
-    """Return the remark that the network was adjusted anew from a solution of smaller v'Pv."""
+    """Return the remark that the network was adjusted again from a solution of smaller v'Pv."""
     first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
     return remark(
         "better_solution_taken",
@@ -561,7 +557,7 @@ def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
 
 
 def _c_per_photograph(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:
-    """Yield the name of each camera of which every photograph has c by itself, these c, and their unit."""
+    """Yield the name of each camera with c per photograph, the values of c, and their unit."""
     for name in sorted(varying):
         cameras = [
             one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name

@@ -1,7 +1,7 @@
-"""Remarks on the solution of a survey: its datum, the points that it lacks, its cameras and its scale.
+"""Remarks on the solution of a survey: on its datum, missing points, cameras and scale.
 
-Few photographs of a flat object let the principal distance run away along with the distance from it, to a
-false minimum with a small standard deviation; only its start value shows it.
+With few photographs of a flat object, the principal distance may run away together with the object distance,
+to a false minimum with a small standard deviation. Only a comparison with its start value shows this.
 """
 
 from __future__ import annotations
@@ -17,25 +17,32 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
-from sfm.result import (
-    LeftOutPoint,
-)
+from sfm.result import LeftOutPoint
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import unused_observations
 from sfm.survey.placing import mounts_give_scale, scale_sigma
 
-WEAK_SCALE = 0.01  # relative standard deviation of a scale from which it is reported
-# Relative change of c, as focusing from infinity to 1 : 5 makes it: c = f (1 + 1/5), thin lens.
+WEAK_SCALE = 0.01  # a scale with a larger relative standard deviation is reported
+# Relative change of c by focusing from infinity to 1 : 5: c = f (1 + 1/5), thin lens.
 MAX_C_CHANGE = 0.2
-MIN_SIDE_DIFFERENCE = 0.005  # relative difference of the sides of a pixel; no sensor of a camera has it
+MIN_SIDE_DIFFERENCE = (
+    0.005  # relative difference of the sides of a pixel; no camera sensor has such a difference
+)
 
 
 def remarks_on_solution(
     survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
-    """Return what a person must know beyond the numbers."""
+    """Return the remarks on a solution that a person must know beside the numbers.
+
+    Args:
+        survey: settings of the survey.
+        left_out: measured points that are not in the result.
+        measured: number of measured points.
+        adjustment: the final adjustment.
+    """
     sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     return (
@@ -51,7 +58,7 @@ def remarks_on_solution(
 
 
 def windows_elsewhere(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
-    """Return remarks in which points of texture did not move, but are seen at other places."""
+    """Return the remarks; points of texture did not move, but are seen at other positions."""
     if survey.tie_points is None:
         return tuple(remarks)
     return tuple(
@@ -60,9 +67,13 @@ def windows_elsewhere(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark
 
 
 def handedness_unchecked(survey: Survey, *, checked: bool) -> tuple[Remark, ...]:
-    """Return the note on image points of a file that fit as well turned over.
+    """Return the note that given image points would also fit the mirror image of the object.
 
-    The mirror image of an object, seen in mirrored photographs, has the residuals of the object.
+    The mirror image of an object in mirrored photographs has the same residuals as the object.
+
+    Args:
+        survey: settings of the survey.
+        checked: whether given values exclude the mirror image.
     """
     if survey.observations is None or checked:
         return ()
@@ -70,7 +81,7 @@ def handedness_unchecked(survey: Survey, *, checked: bool) -> tuple[Remark, ...]
 
 
 def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the remark on a scale that only survey observations give, and badly."""
+    """Return the remark on a scale that only survey observations give, with low precision."""
     network = a.network
     given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
     if given or mounts_give_scale(network, a.estimate) or not network.observations or not a.has_scale:
@@ -83,7 +94,12 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
 def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
 
-    Points of a plate may be out of view: not all of them are expected in the result.
+    Points of a plate may be out of view, so not all of them are expected in the result.
+
+    Args:
+        survey: states control, scale bars and targets.
+        network: network of the result.
+        has_scale: whether anything gives the network a scale.
     """
     remarks, known = [], set(network.points)
     plate = is_plate_control(survey.control, plate_control(survey.targets))
@@ -108,13 +124,13 @@ def left_out_points(
     accepted_rays: IntArray,
     needed: IntArray,
 ) -> tuple[LeftOutPoint, ...]:
-    """Return the measured points of a network that a result lacks, each with the reason.
+    """Return the measured points that are not in a result, each with the reason.
 
     Args:
-        whole: everything that was measured.
+        whole: network of all measured points.
         in_result: names of the points of the result.
         reasons: (name, reason) of points for which the orientation found no coordinates.
-        accepted_rays: accepted rays of each point when it left, (n,).
+        accepted_rays: accepted rays of each point at its removal, (n,).
         needed: rays that each point needs, (n,).
     """
     known, rays = dict(reasons), whole.rays()
@@ -141,13 +157,18 @@ def left_out_points(
 
 
 def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) -> int:
-    """Return how many image points are of photographs (m,) or points (n,) that are not in the result."""
+    """Return the number of image points outside the photographs, (m,), and points, (n,), of the result."""
     seen = whole.image_points
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
 def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tuple[Remark, ...]:
-    """Return which of so many measured points are not in the result: contradicted, or just not determined."""
+    """Return the remarks on points that are not in the result: contradicted, or only not determined.
+
+    Args:
+        left_out: measured points that are not in the result, with the reason.
+        measured: number of measured points.
+    """
     groups = {
         "points_contradicted": [one.point for one in left_out if one.reason.severity != "note"],
         "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
@@ -156,15 +177,15 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tu
 
 
 def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
-    """Return a remark for each principal distance that lies far from the one that the survey gives.
+    """Return a remark for each principal distance that is far from the one that the survey states.
 
-    One that was held there has been found by trial, and nothing has tested it.
+    A principal distance held at such a value was found by trial, and nothing has tested it.
 
     Args:
-        survey: whose cameras state `c_mm`; those by EXIF data are not looked at, nor those that photograph a
-            plate of known coordinates: no distance runs away from it.
-        estimate: adjusted cameras.
-        sigma: standard deviation of the principal distance of each, in its unit.
+        survey: its cameras state `c_mm`. Cameras with c from EXIF data are not judged, nor cameras that
+            photograph a plate of known coordinates, since the plate fixes the distance.
+        estimate: has the adjusted cameras.
+        sigma: standard deviation of the principal distance of each camera, in its unit.
     """
     if _calibrates(survey):
         return ()
@@ -195,18 +216,24 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
 
 
 def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
-    """Return a remark where the residuals have a cause and c was held at a value that was not measured."""
+    """Return a remark if the residuals have a cause and c was held at a value that was not measured.
+
+    Args:
+        held: names of the cameras whose c was held.
+        causes: remarks on causes of the residuals.
+    """
     if not held or not causes:
         return ()
     return (remark("c_held_contradicted", cameras=held),)
 
 
 def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
-    """Return a remark for each camera that photographs of a plate should calibrate, with c held after all.
+    """Return a remark for each camera that a plate should calibrate, but whose c was held in the end.
 
     Args:
-        survey: states what is free of its cameras, or leaves it to the photographs.
-        estimate: adjusted cameras; those of single photographs are named by these behind that of the survey.
+        survey: may state the free parameters of its cameras.
+        estimate: has the adjusted cameras; a per-photograph camera has the name of its camera followed by
+            that of the photograph.
     """
     if not _calibrates(survey):
         return ()
@@ -222,17 +249,18 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
 
 
 def _calibrates(survey: Survey) -> bool:
-    """Return whether the points of a survey are those of a plate of known coordinates."""
+    """Return whether the points of a survey are on a plate of known coordinates."""
     return plate_family(survey.targets) is not None and survey.datum.kind == "control"
 
 
 def unlike_squares(settings: Sequence[CameraSettings], cameras: Sequence[Camera]) -> tuple[Remark, ...]:
-    """Return a remark on each camera whose nominal sensor size makes pixels that are not square.
+    """Return a remark on each camera whose nominal sensor size implies pixels that are not square.
 
     Args:
-        settings: of the cameras in the survey. A pixel size that is stated is not judged; nor is one
-            with b1, or fx and fy, among the free parameters: the photographs determine the ratio.
-        cameras: of its solution; those of single photographs are named by these behind that of the survey.
+        settings: cameras of the survey. A stated pixel size is not judged, nor a camera with b1, or fx and
+            fy, among its free parameters: there the photographs determine the ratio.
+        cameras: cameras of the solution; a per-photograph camera has the name of its camera followed by that
+            of the photograph.
     """
     names = [one.name for one in settings]
     first = {base_name(camera.name, names): camera for camera in reversed(cameras)}

@@ -1,1 +1,1 @@
-"""Diagnosis of a survey: lost photographs and points, wrong scales, cameras that do not fit."""
+"""Diagnosis of a survey: lost photographs, codes not found or contradicting, cameras that do not fit."""

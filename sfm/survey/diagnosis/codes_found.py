@@ -1,7 +1,8 @@
-"""Codes and calibration plates that photographs do not show, or only in part.
+"""Codes and calibration plates that photographs do not show, or show only in part.
 
-Too few codes were read: candidates that were found, and settings that read more. A plate was not found, a
-side of it is in no photograph, or none of its points is in the result.
+If too few codes were read, this module lists the candidates found and settings that read more codes. It
+reports plates that were not found, sides of a plate that no photograph shows, and plates without points in
+the result.
 """
 
 from __future__ import annotations
@@ -28,25 +29,28 @@ from sfm.targets.codes.tags import CORNERS, DICTIONARIES, find_tags, tag_family
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.outlines import Flag, scale_of
 
-MIN_VIEWS = 2  # photographs that show the place of a side of a plate that none of them has
-NOT_FOUND = {  # kinds of remarks by the codes of a board; that on dots of any grid is another
+MIN_VIEWS = 2  # photographs that show where a missing side of a plate should be
+NOT_FOUND = {  # kinds of remarks by the codes of a board; plates of dots have their own kinds
     "checkerboard": "checkerboard_not_found",
     "charuco": "charuco_not_found",
     "aprilgrid": "aprilgrid_not_found",
 }
-MIN_TAGS = 2  # of a family in a photograph that are no chance; a dictionary may be part of a larger one
-# Least diameter of the dot of a ring that is read, px and standard deviations of its edges (rendered rings of
-# 12 to 20 cells: all of 49 are read from 6 px on at 0.75 px, from 8 or 9 px on at 1.25 px).
+MIN_TAGS = (
+    2  # of a family in a photograph that are not read by chance; a dictionary may be part of a larger one
+)
+# Smallest readable diameter of the dot of a ring, in px and in standard deviations of its edges. Of rendered
+# rings
+# with 12 to 20 cells, all 49 are read from 6 px on at 0.75 px, and from 8 or 9 px on at 1.25 px.
 MIN_DOT_PX, MIN_DOT_SIGMAS = 6.0, 7.0
 POLARITIES = ("dark", "bright")
 
 
 def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs) -> tuple[Remark, ...]:
-    """Return the remarks on photographs in which a plate was not found; none where it is in all.
+    """Return the remarks on photographs in which a plate was not found; none if all photographs show it.
 
     Args:
         family: codes of the survey.
-        photographs: with the points of the plate as their codes.
+        photographs: have the points of the plate as their codes.
     """
     remarks, plates = [], plates_of(family)
     found = list(zip(photographs.names, photographs.targets, strict=True))
@@ -56,7 +60,7 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
             ((targets.code >= plate.first_point) & (targets.code <= plate.last_point)).any()
             for _, targets in found
         )
-        # photographs in which no plate is found are named with the first; a plate that none shows, with all
+        # photographs without any plate are listed with the first plate; a plate in none of them lists all
         without = (nothing if plate is plates[0] else []) if is_seen else found
         dots = {
             name: int((targets.rejected_flag == Flag.NOT_ON_PLATE.value).sum()) for name, targets in without
@@ -76,12 +80,12 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
 def sides_not_found(family: TargetFamily | None, photographs: MeasuredPhotographs) -> tuple[Remark, ...]:
     """Return the remarks on outer rows and columns of plates that no photograph shows where they should be.
 
-    They are not on the plate, as with tags that are numbered from another one, or hidden. The place is that
-    by the homography from the points of the plate that are seen.
+    They are either hidden or not on the plate, for example if the numbers of its tags start at another tag. A
+    homography from the seen points of the plate predicts their position.
 
     Args:
         family: codes of the survey.
-        photographs: with the points of the plate as their codes.
+        photographs: have the points of the plate as their codes.
     """
     remarks = []
     for plate in plates_of(family):
@@ -107,15 +111,15 @@ def sides_not_found(family: TargetFamily | None, photographs: MeasuredPhotograph
 
 
 class _Line(NamedTuple):
-    """A row or column of a plate that is not seen, beside one that is."""
+    """A row or column of a plate that is not seen, and its neighbour that is seen."""
 
-    outer: IntArray  # its points
-    beside: IntArray  # those of the one that is seen
+    outer: IntArray  # points of the missing line
+    beside: IntArray  # points of its neighbour
 
 
 def _missing_sides(plate: PlateFamily, seen: BoolArray) -> dict[str, _Line]:
-    """Return the outer rows and columns of which no point is seen, (n,), the innermost of each side."""
-    step = 2 if plate.name == "aprilgrid" else 1  # lines of corners that a tag has
+    """Return the innermost of the outer rows and columns of each side without any seen point."""
+    step = 2 if plate.name == "aprilgrid" else 1  # rows of corners of a tag
     number = np.arange(plate.count).reshape(plate.rows, plate.columns)
     found = {}
     for name, lines in (("row", number), ("column", number.T)):
@@ -130,7 +134,7 @@ def _missing_sides(plate: PlateFamily, seen: BoolArray) -> dict[str, _Line]:
 def _in_view(
     plate: PlateFamily, sides: Mapping[str, _Line], code: IntArray, xy: FloatArray, size_px: tuple[int, int]
 ) -> Iterator[str]:
-    """Yield the sides whose place is in a photograph, and half of whose neighbours were found in it."""
+    """Yield the sides whose position is inside a photograph that shows half of their neighbours."""
     if len(code) < PLANAR_POINTS or not sides:
         return
     plane = plate.plane(1.0)[:, :2]
@@ -139,7 +143,7 @@ def _in_view(
         return
     for side, (outer, beside) in sides.items():
         found = np.isin(beside, code)
-        beyond = 2 * plane[outer] - plane[beside]  # with the margin of the plate
+        beyond = 2 * plane[outer] - plane[beside]  # the margin of the plate
         at = cv2.perspectiveTransform(np.concatenate([plane[outer], beyond])[None], H)[0]
         inside = ((at >= 0) & (at < size_px)).all(axis=1).reshape(2, -1).all(axis=0)
         if 2 * (found & inside).sum() >= len(outer):
@@ -147,11 +151,11 @@ def _in_view(
 
 
 def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[Remark, ...]:
-    """Return the remarks on plates beside another one of which the result has no point.
+    """Return the remarks on plates without any point in the result.
 
     Args:
         family: codes of the survey.
-        code: of each point of the result, -1 without one, (n,).
+        code: code of each point of the result, -1 without a code, (n,).
     """
     return tuple(
         remark("plate_not_in_result", codes=plate.name, size=f"{plate.rows} x {plate.columns}")
@@ -161,7 +165,7 @@ def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[R
 
 
 def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Say how many targets and codes were found where more codes were needed, and what decides on that."""
+    """Describe the targets and codes found where more are needed, and the settings that matter."""
     if plates := missing_plates(survey.family, photographs):
         return _in_error(*plates)
     targets = [len(found) for found in photographs.targets]
@@ -180,12 +184,10 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
 
 
 def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
-    """Return the remark that codes are too small to read, with the size that would do.
-
-    None where enough are read.
+    """Return a remark that codes are too small to read, with the size needed; none if enough are read.
 
     Args:
-        targets: of each photograph.
+        targets: targets of each photograph.
     """
     every = [found for found in targets if len(found)]
     if not every:
@@ -211,12 +213,12 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
 
 
 def _in_error(one: Remark) -> str:
-    """Return a remark as a part of the message of an error."""
+    """Return a remark as part of an error message."""
     return f"{one.text.rstrip('.')}: {one.remedy.rstrip('.')}"
 
 
 def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Say that codes are too small to read, or that candidates are below the least diameter, if so."""
+    """Report codes too small to read, else candidates below the least diameter, if there are any."""
     if small := small_codes(photographs.targets):
         return f"; {_in_error(*small)}"
     count = sum(int((found.rejected_flag == Flag.TOO_SMALL).sum()) for found in photographs.targets)
@@ -230,7 +232,7 @@ def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
 
 
 def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
-    """Say how many codes were read in each of the first photographs, if any were."""
+    """List how many codes were read in each of the first photographs, if any were."""
     if not any(codes):
         return ""
     shown = (f"{name}: {count}" for name, count in zip(photographs.names, codes, strict=True))
@@ -238,9 +240,9 @@ def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
 
 
 def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
-    """Say which other rings or arcs, or which polarity, read more codes, if any do.
+    """Name the other rings or the polarity that read more codes, if any do.
 
-    In the photograph with most codes, or, where none has any, with most targets.
+    They are tried on the photograph with most codes, or if none has codes, with most targets.
     """
     settings = survey.targets
     read = [len(np.unique(found.code[found.code >= 0])) for found in photographs.targets]
@@ -279,7 +281,7 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
 
 
 def _tags(photograph: AnyArray, name: str, codes: str) -> str:
-    """Say which family of square tags a photograph shows, if any."""
+    """Name the family of square tags that a photograph shows, if any."""
     best, words = MIN_TAGS - 1, ""
     for family in DICTIONARIES:
         if family == codes:

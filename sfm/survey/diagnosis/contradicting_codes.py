@@ -1,8 +1,9 @@
-"""Codes that are read at several places of the object: photographs of another object, or single targets.
+"""Codes read at several positions of the object: photographs of another object, or single moved targets.
 
-A sheet of codes that two objects carry orients the photographs of both alike, and every other code that the
-two have in common is at two places. Photographs are put together by the places at which they show such codes;
-those that do not agree with the largest group leave, and what is contested after that is reported.
+If two objects carry the same sheet of codes, it orients the photographs of both. Every other code that the
+two have in common is then at two positions. Photographs are grouped by the positions at which they show these
+contested codes. Photographs that disagree with the largest group are removed. Codes that are still contested
+are reported.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from sfm.survey.target_network import UNNAMED
 from sfm.targets.codes.plates import PlateFamily, TargetFamily, plates_of
 from sfm.targets.codes.tags import CORNERS
 
-MIN_ELSEWHERE = 3  # contradicting codes of a photograph of another object: one or two are moved or misread
-SHARE_ELSEWHERE = 0.1  # of the codes that a photograph shows of the object, at least so many contradict it
+MIN_ELSEWHERE = 3  # contradicting codes that show another object; one or two are moved or misread
+SHARE_ELSEWHERE = 0.1  # the same as a share of the codes that the photograph shows
 
 
 @dataclass(frozen=True)
 class ContestedCodes:
-    """Codes that photographs show at different places."""
+    """Codes that photographs show at different positions."""
 
     places: dict[int, dict[int, frozenset[int]]]
-    """of each such code, by photograph, the points that it is read at; none where its ray meets no others"""
+    """points at which each contested code is read, by code and photograph; UNNAMED if no ray meets its ray"""
     left_out: dict[int, Remark]
     """photographs that show another object, with the reason"""
     main: dict[int, int]
-    """point that is the place of a code in the largest group, where it has one"""
+    """point at which the largest group shows a code, by code; missing if the group does not show it"""
     elsewhere: dict[int, frozenset[int]]
-    """of each photograph outside this group, the codes that it shows elsewhere"""
+    """codes that a photograph shows at other points than the largest group, by photograph"""
 
 
 def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> ContestedCodes:
-    """Return the codes that are read at several places, and which photographs show another object.
+    """Return the codes that are read at several positions, and the photographs that show another object.
 
     Args:
         photographs: all measured targets.
-        naming: which point each of them is in the adjusted network.
+        naming: point of each target in the adjusted network.
     """
     whole, shown = _places(photographs, naming)
     contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
@@ -72,12 +73,12 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
 def plates_elsewhere(
     found: ContestedCodes, photographs: MeasuredPhotographs, family: TargetFamily | None
 ) -> dict[PlateFamily, frozenset[int]]:
-    """Return plates that were moved against the others, with the photographs that show them elsewhere.
+    """Return plates that were moved relative to the others, with the photographs that show them elsewhere.
 
-    A photograph shows a plate elsewhere if it shows most of its points there.
+    A photograph shows a plate elsewhere if it shows most of the plate's points elsewhere.
 
     Args:
-        found: codes that are read at several places.
+        found: codes that are read at several positions.
         photographs: all measured targets.
         family: codes of the survey.
     """
@@ -102,7 +103,7 @@ def remarks_on_contested(
     naming: Naming,
     moved: Mapping[PlateFamily, frozenset[int]],
 ) -> tuple[Remark, ...]:
-    """Return the remarks on plates that moved against the others, and where each other code was read."""
+    """Return the remarks on plates that moved, and on every other code read at several positions."""
     remarks = [
         remark(
             "plate_elsewhere",
@@ -138,7 +139,7 @@ def remarks_on_contested(
 def _places(
     photographs: MeasuredPhotographs, naming: Naming
 ) -> tuple[dict[int, dict[int, frozenset[int]]], Counter[int]]:
-    """Return at which points each code is read, by code and photograph, and the codes of each photograph."""
+    """Return the points of each code, by code and photograph, and the number of codes of each photograph."""
     found: dict[int, dict[int, frozenset[int]]] = {}
     shown: Counter[int] = Counter()
     for image, (targets, point) in enumerate(zip(photographs.targets, naming.point, strict=True)):
@@ -154,16 +155,16 @@ def _places(
 
 
 def _is_contested(code: int, places: dict[int, frozenset[int]], naming: Naming) -> bool:
-    """Return whether photographs show a code at more than one place, or at none that has its name."""
+    """Return whether several photographs show a code, but not all at the point of its name."""
     every = frozenset[int]().union(*places.values())
     return len(places) > 1 and {int(naming.code[k]) if k != UNNAMED else UNNAMED for k in every} != {code}
 
 
 def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[int]]:
-    """Return photographs in groups that agree on the places of the contested codes, the largest first.
+    """Group the photographs that agree on the positions of the contested codes, the largest group first.
 
-    Within a group a code may have several places, as two targets of one number that a photograph shows
-    together; a photograph joins that agrees on more codes than it contradicts.
+    Within a group a code may have several positions, for example if a photograph shows two targets of one
+    number. A photograph joins a group if it agrees on more codes than it contradicts.
     """
     of_image: dict[int, dict[int, frozenset[int]]] = {}
     for code, places in contested.items():
@@ -195,7 +196,7 @@ def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[i
 def _accepted(
     contested: dict[int, dict[int, frozenset[int]]], group: frozenset[int]
 ) -> dict[int, frozenset[int]]:
-    """Return the places at which the photographs of a group show each contested code."""
+    """Return the points at which the photographs of a group show each contested code."""
     return {
         code: frozenset[int]().union(*(at for image, at in places.items() if image in group)) - {UNNAMED}
         for code, places in contested.items()
@@ -203,7 +204,7 @@ def _accepted(
 
 
 def _most(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
-    """Return the place at which most photographs of a group show a code, UNNAMED without one."""
+    """Return the point at which most photographs of a group show a code, UNNAMED without one."""
     counted = Counter(k for image, at in places.items() if image in group for k in at if k != UNNAMED)
     return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
 

@@ -1,20 +1,22 @@
-"""Photographs without orientation: not connected, turned at one place, or of a second object.
+"""Diagnosis of photographs without orientation: not connected, without a base, or of a second object.
 
-Where a camera turned at one place, rotations alone fit, and no point has a depth. An adjustment of such
-photographs has no minimum: it goes along a valley in which the base is as small as the
-errors, takes wherever that ends for a solution, and with a wrong principal distance it even converges. The
-parallax is what rotations leave between conjugate rays, with the principal distance and the first radial
-distortion that make it least. A wall photographed from the front looks like a rotation with a lens without
-end; where the least parallax is at the end of what is tried, nothing is refused.
+Photographs from a camera that only rotated at one position have no base. Rotations alone fit them, and no
+point has a depth. An adjustment of such photographs has no minimum. It moves along a valley in which the base
+is as small as the errors, and accepts the point where it stops as the solution. With a wrong principal
+distance it even converges. Parallax is the angle between conjugate rays after the best rotation. It is
+computed with the principal distance and the first radial distortion that minimise it. A wall photographed
+from the front looks like a rotation with an infinite principal distance. Therefore nothing is refused if the
+minimum lies at the limit of the search.
 
-Parts of a survey that do not fit the rest are a second object of the same codes, a mirror image, or a motion.
-Photographs without orientation are oriented by themselves, both parts are adjusted, and the points that they
-have in common are compared as those of any two results (`sfm.comparison`): what a camera explains, that bends
-the whole, is no other object, nor is what agrees but for single points.
+Parts of a survey that do not fit the rest show a second object with the same codes, a mirror image, or a
+motion. The photographs without orientation are oriented by themselves, and both parts are adjusted. The
+points that they have in common are compared like those of any two results (`sfm.comparison`). If a camera
+error that bends the whole explains the difference, there is no second object. The same holds if all but
+single points agree.
 
-The orientation of tie points is that of the larger part of them. Where walkers or vehicles hide the most of
-an object, it is theirs, and as precise as any other. Tie points that it does not explain are oriented by
-themselves; errors by chance have no orientation, another rigid body has one.
+The orientation of tie points is that of the majority of them. If walkers or vehicles hide most of an object,
+the orientation is theirs, and nothing in its precision shows it. Tie points that it does not explain are
+oriented by themselves. Random errors have no orientation, but another rigid body has one.
 
 Source: Hartley (1997), Self-calibration of stationary cameras, IJCV 22(1); Foerstner and Wrobel (2016),
 Photogrammetric Computer Vision, sec. 13.3.6 (critical configurations); Torr (1998), Geometric motion
@@ -50,21 +52,22 @@ from sfm.solution import Solution
 from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
 MIN_RAYS = 2
-MOTION_RAYS = 3  # of a point that shows a motion: two meet by chance
-MOTION_POINTS = 20  # in three photographs and more: with fewer an orientation may fit what moves at random
-MIN_PARALLAX = 10.0  # standard deviations of image points, below which a depth is known to a tenth at best
-# Part of the points of a pair that may have no depth, as distant hills behind a near object;
-# a smaller rest may be wrong matches.
+MOTION_RAYS = 3  # of a point that shows a motion; two rays can intersect by chance
+MOTION_POINTS = 20  # in three photographs or more; with fewer an orientation may fit random motion
+MIN_PARALLAX = 10.0  # standard deviations of image points; below it a depth is known to a tenth at best
+# Fraction of the points of a pair that may have no depth, such as distant hills behind a near object;
+# the remaining fraction may be wrong matches.
 MAX_DISTANT_FRACTION = 0.9
-MIN_COMMON = 20  # points of a pair of photographs: rotation and camera take five coordinates of them
-SCALES = np.geomspace(0.5, 2.0, 15)  # of c that are tried, 10 % apart; the best is improved
+MIN_COMMON = 20  # points of a pair of photographs; rotation and camera use up five of their coordinates
+SCALES = np.geomspace(0.5, 2.0, 15)  # factors of c that are tried, 10 % apart; the best is refined
 TRIMMINGS = 3  # rotations without the half of the pairs of rays that fits worst
-MAX_RADIAL = 0.2  # first radial distortion that is tried, of the squared tangent: that of telephones is
-# a few hundredths
-STEP = 0.02  # of it
-EVALUATIONS = 80  # of the parallax by the simplex method of Nelder and Mead
-C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # on the given principal distance: a crop factor, an extender, a zoom
-MISFIT = 3.0  # standard deviations of image points, of residuals that another minimum may explain
+# Largest first radial distortion that is tried, on the squared tangent; that of telephones is a few
+# hundredths.
+MAX_RADIAL = 0.2
+STEP = 0.02  # first step of the radial distortion
+EVALUATIONS = 80  # of the parallax, by the simplex method of Nelder and Mead
+C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # of the given principal distance: a crop factor, an extender, a zoom
+MISFIT = 3.0  # RMS residual, in standard deviations of image points, that suggests another minimum
 
 
 @dataclass(frozen=True)
@@ -72,19 +75,19 @@ class Lost:
     """Photographs without orientation that belong together."""
 
     images: IntArray  # indices of the photographs
-    shared: IntArray  # points of theirs that oriented photographs determine
-    connected: bool  # whether one of them shows enough of these to be oriented
+    shared: IntArray  # their points that oriented photographs determine
+    connected: bool  # whether one of them shows enough of these points to be oriented
 
 
 def explain_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
-    """Return the orientation with what is missing between the groups of photographs that are not connected.
+    """Return the orientation with remarks on groups of photographs that are not connected to the others.
 
-    A photograph with fewer points than any orientation needs is no group: its reason states it.
+    Photographs with fewer points than any orientation needs get no remark: their failure reason states it.
 
     Args:
-        network: image points that have names.
-        found: its orientation.
-        named: whether a person knows the points by these names.
+        network: has the named image points.
+        found: orientation of this network.
+        named: whether people know the points by these names.
     """
     groups = [
         one
@@ -110,7 +113,9 @@ def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
     oriented, seen = estimate.oriented, network.image_points
     lost = np.flatnonzero(~oriented)
     rays = np.bincount(seen.point[oriented[seen.image]], minlength=len(network.points))
-    in_network = (rays >= 2) | ((rays == 1) & estimate.determined)  # one ray and no coordinates: no place
+    in_network = (rays >= 2) | (
+        (rays == 1) & estimate.determined
+    )  # one ray without coordinates gives no position
     label = np.arange(len(network.images))  # the group of each photograph
     for first, second, common in network.common_points(~oriented[seen.image]):
         linked = label[first[common >= MIN_POINTS]], label[second[common >= MIN_POINTS]]
@@ -130,30 +135,31 @@ def try_other_principal_distances(
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
-    Tried where photographs are lost that show enough points of the others and are no mirrored pictures, which
-    no principal distance turns over. It must orient most of them, and be likelier for all image points: more
-    photographs at residuals many times as large are no better.
+    Other principal distances are tried if photographs are lost although they show enough points of the
+    others. Mirrored pictures do not count, since no principal distance corrects them. The new orientation
+    must include most lost photographs and be likelier for all image points: more photographs with much larger
+    residuals are no improvement.
 
-    Tried with the cameras held, too, where c is adjusted and all is oriented with residuals far larger than
-    the image points have: a network that learns its camera while it grows may have run along the valley of c
-    and distance into a false minimum.
+    If c is adjusted and all photographs are oriented, but with residuals far larger than the image points
+    have, they are tried with the cameras held. A network that estimates its camera while it grows may have
+    moved along the valley of c and distance into a false minimum.
 
     Args:
-        network: image points that have names.
+        network: has the named image points.
         estimate: start values.
         found: the orientation with the given principal distance; None if there was none.
         orient: returns the orientation from start values.
 
     Returns:
-        The better orientation where the survey adjusts c; else that which was given. No remarks where no
-        other principal distance orients more.
+        The better orientation if the survey adjusts c, else the given one. There are no remarks if no other
+        principal distance orients more photographs.
     """
     m = len(network.images)
     lost = m if found is None else _unexplained(network, found)
     if not len(network.image_points):
         return found, ()
     free = all(camera.free[0] for camera in estimate.cameras)
-    if lost < 2:  # one alone has another cause
+    if lost < 2:  # a single lost photograph has another cause
         misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
         held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
         best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))
@@ -187,16 +193,9 @@ def _likeliest(
     *,
     least: int,
 ) -> Orientation | None:
-    """Return the likeliest orientation from other start values, None if that found is likelier.
+    """Return the likeliest orientation from other start values; None if `found` is likelier.
 
-    Args:
-        network: image points that have names.
-        estimate: start values of that found.
-        found: an orientation; None if there was none.
-        starts: the other start values.
-        orient: returns the orientation from start values.
-        least: photographs that it must orient; once all are with residuals as they should be, no more is
-            tried.
+    It must orient at least `least` photographs. The search ends once all are oriented with normal residuals.
     """
     search = math.log(2 * len(network.image_points)) / 2 + math.log(len(C_FACTORS) / ALPHA)
     likeliest = _log_likelihood(network, estimate, found) + search
@@ -218,12 +217,12 @@ def _likeliest(
 
 
 def _oriented(found: Orientation | None) -> int:
-    """Return how many photographs are oriented."""
+    """Return the number of oriented photographs."""
     return 0 if found is None else int(found.estimate.oriented.sum())
 
 
 def _restored(found: Orientation, estimate: Estimate) -> Orientation:
-    """Return an orientation with the parameters free that the start values have free."""
+    """Return the orientation with the same free parameters as the start values."""
     cameras = tuple(
         replace(new, free=old.free) for new, old in zip(found.estimate.cameras, estimate.cameras, strict=True)
     )
@@ -231,14 +230,14 @@ def _restored(found: Orientation, estimate: Estimate) -> Orientation:
 
 
 def _unexplained(network: Network, found: Orientation) -> int:
-    """Return how many photographs are lost though they show enough points, and are no mirrored pictures."""
+    """Return how many photographs are lost although they show enough points and are not mirrored."""
     mirrored = [image for image, reason in found.failures if reason.kind == "photograph_mirrored"]
     lost = [i for one in lost_groups(network, found.estimate) if one.connected for i in one.images.tolist()]
     return sum(network.images[i] not in mirrored for i in lost)
 
 
 def _log_likelihood(network: Network, estimate: Estimate, found: Orientation | None) -> float:
-    """Return ln of the likelihood of all image points, what does not fit spread evenly over the format."""
+    """Return the log-likelihood of all image points; misfits have a uniform distribution over the format."""
     camera = estimate.cameras[0]
     count, fitting = len(network.image_points), 0 if found is None else int(found.fits.sum())
     outlier = -math.log(float(np.prod(camera.size_px)))
@@ -249,7 +248,7 @@ def _log_likelihood(network: Network, estimate: Estimate, found: Orientation | N
 
 
 def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
-    """Return start values with another principal distance, which is free, or with all of the cameras held."""
+    """Return start values with another principal distance; c is free, or all camera parameters are held."""
     cameras = []
     for camera in estimate.cameras:
         p, focal = camera.parameters.copy(), camera.parts[0]
@@ -260,7 +259,7 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
 
 
 def _not_connected(network: Network, oriented: BoolArray, group: Lost, *, named: bool) -> Remark:
-    """Return the remark on photographs that are not connected, with points to connect them."""
+    """Return the remark on a group of photographs that is not connected, with points to connect it."""
     theirs = _often_seen(network, group.images) if named else []
     return remark(
         "not_connected",
@@ -274,7 +273,7 @@ def _not_connected(network: Network, oriented: BoolArray, group: Lost, *, named:
 
 
 def _often_seen(network: Network, images: IntArray) -> list[str]:
-    """Return the names of the points that photographs show most often."""
+    """Return the names of the points that these photographs show most often."""
     seen = network.image_points
     rays = np.bincount(seen.point[np.isin(seen.image, images)], minlength=len(network.points))
     order = np.argsort(-rays, kind="stable")[: MIN_POINTS + 2]
@@ -282,20 +281,20 @@ def _often_seen(network: Network, images: IntArray) -> list[str]:
 
 
 def _points_of(network: Network, images: IntArray | list[int]) -> IntArray:
-    """Return the points that photographs show."""
+    """Return the points that these photographs show."""
     seen = network.image_points
     return np.unique(seen.point[np.isin(seen.image, images)])
 
 
 def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
-    """Refuse photographs whose conjugate rays fit rotations alone, but for gross errors.
+    """Refuse photographs whose conjugate rays fit rotations alone, except for gross errors.
 
     Args:
-        network: image points with their standard deviations.
+        network: has image points with their standard deviations.
         cameras: start values.
 
     Raises:
-        GeometryError: the parallax of every pair of photographs that hold the network together is below
+        GeometryError: the parallax of every pair of photographs that connects the network is below
             MIN_PARALLAX standard deviations of its image points.
     """
     pairs = _conjugate_points(network)
@@ -313,7 +312,7 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
 
 
 def _conjugate_points(network: Network) -> list[tuple[IntArray, IntArray]]:
-    """Return the image points, by twos, of the pairs of photographs with most in common that connect all."""
+    """Return the conjugate image points of the pairs of photographs in the strongest connecting tree."""
     seen, m = network.image_points, len(network.images)
     every = np.ones(len(seen), dtype=bool)
     found = [
@@ -335,10 +334,7 @@ def _conjugate_points(network: Network) -> list[tuple[IntArray, IntArray]]:
 def _least_parallax(
     network: Network, cameras: tuple[Camera, ...], pairs: list[tuple[IntArray, IntArray]]
 ) -> FloatArray | None:
-    """Return the parallax of each pair with c and radial distortion that make it least, px.
-
-    None where these are at the end of what is tried.
-    """
+    """Return the parallax of each pair, px, minimised over c and distortion; None at the search limit."""
     seen = network.image_points
     given = image_tangents(seen, network.camera, cameras)
     c_px = np.array([one.c_px for one in cameras])[network.camera[seen.image]]
@@ -362,13 +358,8 @@ def _least_parallax(
 
 
 def _parallax(first: FloatArray, second: FloatArray) -> float:
-    """Return the angle that most conjugate rays do not exceed after the rotation that fits most, rad.
-
-    Args:
-        first: rays of one photograph, (k, 3).
-        second: those of the other, (k, 3).
-    """
-    known = np.isfinite(first + second).all(axis=1)  # of wide angles some have no ray
+    """Return the parallax that most conjugate rays, (k, 3), do not exceed after the best rotation, rad."""
+    known = np.isfinite(first + second).all(axis=1)  # some image points at wide angles have no ray
     if known.sum() < MIN_COMMON:
         return np.inf
     first = first[known] / np.linalg.norm(first[known], axis=1, keepdims=True)
@@ -384,12 +375,12 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
 def find_second_objects(
     network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
 ) -> dict[str, Remark]:
-    """Return why photographs fail that orient one another on points of the others, by their names.
+    """Return the failure reasons, by name, of lost photographs that can be oriented among themselves.
 
     Args:
-        network: image points that have names.
+        network: has the named image points.
         found: its orientation, in which some photographs are missing.
-        orient: returns the orientation of a network from start values; GeometryError where there is none.
+        orient: returns the orientation of a network from start values; raises GeometryError if there is none.
     """
     seen, names = network.image_points, np.array(network.images, dtype=object)
     left = ~found.estimate.oriented
@@ -417,7 +408,7 @@ def find_second_objects(
 
 
 def _adjusted(network: Network, found: Orientation) -> Solution | None:
-    """Return the image points that fit in an orientation adjusted by themselves; None without a solution."""
+    """Adjust the image points that fit an orientation by themselves; None without a solution."""
     alone = Network(network.images, network.camera, network.points, network.image_points)
     images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
     part, start = reduce_network(alone, found.estimate, images, points, found.fits)
@@ -428,7 +419,7 @@ def _adjusted(network: Network, found: Orientation) -> Solution | None:
 
 
 def _reason(others: Solution | None, group: Solution | None, images: tuple[str, ...]) -> Remark | None:
-    """Return why photographs do not fit the others; None where they show the same object or too little."""
+    """Return why photographs do not fit the others; None if they show the same object or too little of it."""
     if others is None or group is None:
         return None
     both = compare_results(others, group)
@@ -446,12 +437,12 @@ def _reason(others: Solution | None, group: Solution | None, images: tuple[str, 
 def find_second_motion(
     network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
 ) -> tuple[Remark, ...]:
-    """Return the remark on tie points that have another orientation than the others, if there are such.
+    """Return the remark on tie points whose orientation differs from that of the others, if there are any.
 
     Args:
-        network: tie points.
+        network: has the tie points.
         found: its orientation.
-        orient: returns the orientation of a network from start values; GeometryError where there is none.
+        orient: returns the orientation of a network from start values; raises GeometryError if there is none.
     """
     images = found.estimate.oriented
     on = images[network.image_points.image]
@@ -484,5 +475,5 @@ def find_second_motion(
 
 
 def _rays(network: Network, rows: BoolArray) -> IntArray:
-    """Return how many of some image points each object point has, (n,)."""
+    """Return the number of rays of each object point among the selected image points, (n,)."""
     return np.bincount(network.image_points.point[rows], minlength=len(network.points))

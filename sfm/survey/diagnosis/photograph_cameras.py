@@ -1,18 +1,18 @@
-"""Photographs that lose many of their points: whether a per-photograph interior orientation explains them.
+"""Per-photograph interior orientation, for photographs that lose many of their points.
 
-A zoom that slipped, a lens that was focused anew or a picture that was resampled shows the points of the
-others at another scale. Its exterior orientation takes up a part of that, and the rejection of image points
-the rest, so that a photograph with a few accepted points would be among the oriented ones.
+If a zoom slipped, a lens was refocused or a picture was resampled, the photograph shows the common points at
+another scale. Its exterior orientation absorbs part of the difference, and the rejection of image points the
+rest. Without this test, a photograph with only a few accepted points would count as oriented.
 
-The photographs are tried that lose more points to the test than chance makes. Each is adjusted alone on
-the points of the others, with the camera that it shares and with per-photograph parameters. The likelihood
-must pay for these and for the search, as in `sfm.adjustment.hypotheses`, and exceed that of the
-alternatives there: a wrong parameter that all photographs share makes some of them look zoomed. A
-photograph that loses the larger part of its points with either is left out.
+Photographs that lose more points to the outlier test than chance explains are examined. Each is adjusted
+alone on the points of the others: with the camera that it shares, and with per-photograph parameters. The
+gain in likelihood must pay for these parameters and for the search, as in `sfm.adjustment.hypotheses`. It
+must also exceed that of the alternatives there, because a wrong parameter that all photographs share makes
+some of them look zoomed. A photograph that loses more than half of its points with either camera is left out.
 
-Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2, for the larger part,
-the breakdown point of any estimate; Rissanen (1978), Automatica 14, for the likelihood of rejected points;
-Fischler and Bolles (1981), sec. II, for the triples that are tried.
+Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2 (half of the points as
+the breakdown point of any estimate); Rissanen (1978), Automatica 14 (likelihood of rejected points); Fischler
+and Bolles (1981), sec. II (triples of points).
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 
-MAJORITY_FRACTION = 0.5  # of image points or photographs; the others are then what does not fit
-SCALES = np.geomspace(0.5, 2.0, 29)  # of c that are tried, 5 % apart
-TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of what fits with c to 2.5 %
-PAIR = 2  # photographs of a camera, of which it is not known which one changed
-FREED_ROLES = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simple one first
+MAJORITY_FRACTION = 0.5  # of image points or photographs; the minority then does not fit
+SCALES = np.geomspace(0.5, 2.0, 29)  # factors of c that are tried, 5 % apart
+TOLERANCE = 1.5e-3  # of the longer side of the format: largest residual of good points if c is within 2.5 %
+PAIR = 2  # photographs of a camera: nothing shows which of the two changed
+FREED_ROLES = ((Role.FOCAL,), (Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL))  # the simpler choice first
 
 
 @dataclass(frozen=True)
 class PhotographCameras:
-    """A network whose photographs that did not fit have per-photograph cameras, or are left out."""
+    """A network in which misfitting photographs have per-photograph cameras, or are left out."""
 
     network: Network
     estimate: Estimate
     left_out: tuple[tuple[str, Remark], ...]  # (name of the photograph, reason)
-    remarks: tuple[Remark, ...]  # on those with per-photograph cameras
-    photographs: tuple[str, ...]  # names of these
+    remarks: tuple[Remark, ...]  # on photographs with per-photograph cameras
+    photographs: tuple[str, ...]  # names of the photographs with per-photograph cameras
     without: BoolArray  # photographs that are left out, (m,)
 
 
@@ -67,18 +67,18 @@ def find_photograph_cameras(
     oriented: BoolArray,
     suspected: tuple[str, ...] = (),
 ) -> PhotographCameras | None:
-    """Give photographs that lost most of their points a per-photograph camera, or leave them out.
+    """Give photographs that lost many of their points a per-photograph camera, or leave them out.
 
     Args:
-        network: all image points, a camera each for what shares one.
-        estimate: adjusted; NaN for photographs and points that left it.
+        network: has all image points, and one camera for all photographs that share it.
+        estimate: adjusted; NaN for photographs and points that were removed.
         accepted: image points that the adjustment accepted, (k,).
         oriented: photographs that had an exterior orientation before the adjustment, (m,).
-        suspected: names of photographs that fitted with per-photograph cameras before; all their points
-            together may bend the others so much that none of them looks wrong.
+        suspected: names of photographs that fitted with per-photograph cameras before; their points may bend
+            the network so much that none of them looks wrong.
 
     Returns:
-        The network, and the estimate with start values of the new cameras; None where nothing is to be done.
+        The network, and the estimate with start values of the new cameras; None if nothing changes.
     """
     seen, m = network.image_points, len(network.images)
     known = estimate.determined[seen.point]
@@ -154,15 +154,9 @@ def _explained_otherwise(
     accepted: BoolArray,
     kept: BoolArray,
 ) -> bool:
-    """Return whether another cause makes the image points likelier than cameras of some photographs.
+    """Return whether another cause makes the image points likelier than per-photograph cameras do.
 
-    Args:
-        network: all image points.
-        estimate: adjusted.
-        own_network: the same where some photographs have a camera by themselves.
-        own_estimate: its start values.
-        accepted: image points that the adjustment accepted, (k,).
-        kept: photographs that are not left out, (m,).
+    own_network and own_estimate have the per-photograph cameras; kept photographs, (m,), are not left out.
     """
     seen, images, points = network.image_points, kept & estimate.oriented, estimate.determined
     rows = images[seen.image] & points[seen.point]
@@ -180,7 +174,7 @@ def _explained_otherwise(
     plain, separate = found
     other = None if plain is None else best_explanation(plain)
     if plain is None or other is None or other.alternative.kind in ("other_camera", "two_cameras"):
-        return False  # which photographs they are is seen best by what was rejected
+        return False  # the rejected points show best which photographs these are
     if separate is None:
         return True
     camera_of_row = separate.network.camera[separate.network.image_points.image]
@@ -197,7 +191,7 @@ def _explained_otherwise(
 def _photograph_camera(
     network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float
 ) -> tuple[Camera, Adjustment] | None:
-    """Return the per-photograph camera with which a photograph fits the points of the others, if one does."""
+    """Return the per-photograph camera with which a photograph fits the points of the others, or None."""
     camera = estimate.cameras[network.camera[image]]
     if any(not group for group in camera.shared):
         return None  # has per-photograph parameters already
@@ -224,7 +218,7 @@ def _photograph_camera(
         if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
             continue
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
-            continue  # no picture of these points, as where their names are wrong
+            continue  # not a picture of these points: their names may be wrong
         sigma = max(sigma_px, found.sigma0_px)
         gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
         q = int(freed.sum())
@@ -249,7 +243,7 @@ def _photograph_camera(
 def _alone(
     alone: Network, start: tuple[Camera, FloatArray, FloatArray] | None, points: FloatArray, free: BoolArray
 ) -> Adjustment | None:
-    """Adjust one photograph on known points, with some parameters free; None where there is no solution."""
+    """Adjust one photograph on known points, with some parameters free; None if there is no solution."""
     if start is None or 2 * len(points) <= 6 + free.sum():
         return None
     camera, position, rotation = start
@@ -262,7 +256,7 @@ def _alone(
 
 
 def _log_likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
-    """Return ln of the likelihood of a photograph, what does not fit spread evenly over its format."""
+    """Return the log-likelihood of a photograph; misfits have a uniform distribution over its format."""
     outlier = -np.log(float(np.prod(camera.size_px)))
     if found is None:
         return float(count * outlier)
@@ -274,10 +268,10 @@ def _log_likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_
 def _scaled_resection(
     camera: Camera, xy: FloatArray, points: FloatArray, scales: FloatArray
 ) -> tuple[Camera, FloatArray, FloatArray] | None:
-    """Return the camera with c multiplied by the factor that fits best, and the exterior orientation."""
+    """Return the camera with c times the best of the scales, and the exterior orientation."""
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
     tolerance_px = TOLERANCE * max(camera.size_px)
-    # one triple of points that fit, but for a probability of ALPHA in all
+    # trials that find a triple of good points, except with probability ALPHA over all scales
     trials = math.ceil(math.log(ALPHA / len(SCALES)) / math.log1p(-((1 - MAJORITY_FRACTION) ** 3)))
     for scale in scales:
         p = camera.parameters.copy()
@@ -296,6 +290,6 @@ def _scaled_resection(
 
 
 def _sharing(camera: Camera) -> Camera:
-    """Return a camera that shares its parameters, in groups, with those that were split off it."""
+    """Return the camera with its parameters in groups, which it shares with cameras split off from it."""
     shared = tuple(camera.owner_of(s) for s in range(len(camera.names)))
     return camera if camera.shared else replace(camera, shared=shared)

@@ -1,4 +1,8 @@
-"""Which photographs of a folder were taken with one camera, and the data of it in their files."""
+"""Groups of photographs of a folder that one camera took, with the camera data from their EXIF tags.
+
+Photographs with the same make, model, serial number, lens, focal length and size form a group. Missing pixel
+sizes and focal lengths are assumed, and the draft states so.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +16,11 @@ from glob import escape
 from sfm.photographs.exif import Metadata
 from sfm.remarks.remark import Remark, remark
 
-FOCAL_PER_SIDE = 1.2  # focal length over the longer side of the photograph, where nothing states it
-FULL_FRAME_MM = 36.0  # longer side of the sensor, where nothing states it
-# Names that makers give such lenses: "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D", "7.5mm
-# Fish-eye"
+FOCAL_PER_SIDE = 1.2  # assumed focal length over the longer side of the photograph
+FULL_FRAME_MM = 36.0  # assumed longer side of the sensor
+# Makers name fisheye lenses "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D" or "7.5mm Fish-eye".
 FISHEYE_NAME = re.compile("fish-?eye", re.IGNORECASE)
-MIN_IN_GROUP = 2  # photographs that a camera is kept with if another has more
+MIN_IN_GROUP = 2  # photographs of a camera; one with fewer is left out if another camera has so many
 
 SensorWidth = Callable[[str, str], float | None]
 """width of the sensor (mm) of a camera by make and model; None where it is unknown"""
@@ -25,40 +28,40 @@ SensorWidth = Callable[[str, str], float | None]
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Photographs of one camera in one setting, and what is known of it."""
+    """Photographs of one camera in one setting, and the data of this camera."""
 
     name: str
     photographs: tuple[str, ...]  # file names
-    globs: tuple[str, ...]  # that name them and no other photograph of the folder
+    globs: tuple[str, ...]  # match these and no other photograph of the folder
     size_px: tuple[int, int]
     pixel_mm: tuple[float, float]
-    pixel_source: str  # where it comes from, for people
+    pixel_source: str  # source of the pixel size, for people
     c_mm: float
     c_source: str
-    assumed: bool  # whether pixel or principal distance is known from nowhere
-    fisheye: str  # lens or camera whose name shows that it is one; "" where none does
-    remarks: tuple[Remark, ...]  # what a person should know of the photographs
+    assumed: bool  # whether pixel size or principal distance is only assumed
+    fisheye: str  # name of the lens or camera if it shows a fisheye lens, else ""
+    remarks: tuple[Remark, ...]  # on the photographs
 
 
 @dataclass(frozen=True)
 class Grouping:
-    """The cameras of a folder, and photographs that are of no use to a survey of them."""
+    """The cameras of a folder, and photographs that a survey cannot use."""
 
-    cameras: tuple[CameraGroup, ...]  # the one with most photographs first
+    cameras: tuple[CameraGroup, ...]  # the camera with most photographs first
     left_out: tuple[tuple[str, str], ...]  # name, reason
 
 
 def group_photographs(
     metadata: dict[str, Metadata], sensor_width: SensorWidth = lambda make, model: None
 ) -> Grouping:
-    """Return the cameras that photographs were taken with.
+    """Return the cameras that took the photographs.
 
-    Photographs belong together that agree in make, model, serial number, lens, focal length and size. Where
-    no file names the maker, the part of the names before their last number names the camera.
+    Photographs with the same make, model, serial number, lens, focal length and size belong together. If no
+    file states the maker, the part of the file name before its last number identifies the camera.
 
     Args:
-        metadata: of every readable photograph, by its file name.
-        sensor_width: a list of cameras, asked where EXIF data do not give the pixel size.
+        metadata: metadata of every readable photograph, by its file name.
+        sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     by_name = not any(one.make for one in metadata.values())
@@ -117,7 +120,7 @@ def _group(
 
 
 def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]:
-    """Side of a pixel, mm, and where it comes from."""
+    """Return the side of a pixel, mm, and its source."""
     if one.pixel_mm is not None:
         return sum(one.pixel_mm) / 2, "EXIF data"
     width = sensor_width(one.make, one.model) if one.make and one.model else None
@@ -127,7 +130,7 @@ def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]
 
 
 def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...]:
-    """Return what the files of the photographs of a camera state that a survey should know."""
+    """Return remarks on photographs of a camera that were resampled or are marked as turned."""
     remarks = []
     resampled = {
         name: one.taken_px
@@ -153,7 +156,7 @@ def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...
 
 
 def _alone(one: Metadata, main: Metadata) -> str:
-    """Why a single photograph of a camera is left out."""
+    """Return why the only photograph of a camera is left out."""
     if one.size_px == main.size_px[::-1] and (one.make, one.model) == (main.make, main.model):
         return "the only one stored upright; a photograph turned by a program has lost its camera"
     if one.size_px != main.size_px:
@@ -171,14 +174,14 @@ def _rounded(focal: float | None) -> float | None:
 
 
 def _series(name: str) -> str:
-    """The part of a name before its last number, where that is no date."""
+    """Return the part of a name before its last number; "" if it contains a date."""
     found = re.fullmatch(r"(.*?)\d+(\D*)", name)
     prefix = found[1] if found else ""
     return "" if re.search(r"(19|20)\d{6}", prefix) else prefix
 
 
 def _labels(firsts: list[Metadata]) -> list[str]:
-    """Names of cameras, each once."""
+    """Return unique names of the cameras."""
     words = [re.sub(r"[^A-Za-z0-9]+", "-", one.model or "").strip("-").lower() for one in firsts]
     plain = [word or "unnamed" for word in words]
     total, seen = Counter(plain), Counter[str]()
@@ -190,7 +193,7 @@ def _labels(firsts: list[Metadata]) -> list[str]:
 
 
 def _globs(names: tuple[str, ...], everything: tuple[str, ...]) -> tuple[str, ...]:
-    """A glob of just these photographs, or their names."""
+    """Return a glob that matches only these photographs, else their names."""
     first, last = min(names), max(names)
     start = 0
     while start < min(len(first), len(last)) and first[start] == last[start]:

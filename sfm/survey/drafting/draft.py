@@ -1,4 +1,7 @@
-"""A survey file drafted from a folder of photographs: every value with where it comes from."""
+"""Draft of a survey file from a folder of photographs; comments state the source of every value.
+
+The cameras come from EXIF data, and the targets from a trial on a few photographs.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +29,15 @@ from sfm.survey.orientation import FISHEYE
 from sfm.targets.codes.plates import BOARDS, FAMILIES, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
-COMMENT_WIDTH = 100  # letters
+COMMENT_WIDTH = 100  # characters
 FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
 FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
-SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles, and of corners, crossings and natural points
-PITCH = 25.0  # of a plate, UNIT, where none is given: that of many printed boards
+SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings and natural points
+PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
-MAX_SHOWN = 8  # names that a line lists
+MAX_SHOWN = 8  # names listed on a line
 
 
 @dataclass(frozen=True)
@@ -42,10 +45,10 @@ class Draft:
     """A drafted survey."""
 
     name: str
-    text: str  # of the survey file
-    found: tuple[tuple[str, str], ...]  # what was found, for the terminal: subject, finding
-    remarks: tuple[Remark, ...]  # what a person should look at
-    left_out: tuple[tuple[str, str], ...]  # photographs and why
+    text: str  # text of the survey file
+    found: tuple[tuple[str, str], ...]  # (subject, finding), for the terminal
+    remarks: tuple[Remark, ...]  # points for a person to check
+    left_out: tuple[tuple[str, str], ...]  # (photograph, reason)
 
 
 def draft_survey(
@@ -59,14 +62,14 @@ def draft_survey(
     """Draft a survey file for the photographs in a folder.
 
     Args:
-        folder: the photographs, directly in it.
-        sensor_width: a list of cameras, asked where EXIF data do not give the pixel size.
-        pitch: distance of neighbouring dots or crossings, should they be on a plate, mm; else assumed.
-        store: keeps the targets measured on trial.
-        progress: informed of what is tried.
+        folder: contains the photographs; subfolders are not searched.
+        sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
+        pitch: distance of neighbouring dots or crossings if there is a plate, mm; assumed if not given.
+        store: stores the targets that the trial measures.
+        progress: receives the steps of the trial.
 
     Raises:
-        SurveyFileError: no folder, or one without photographs.
+        SurveyFileError: the folder does not exist or has no photographs.
         GeometryError: fewer than two readable photographs.
     """
     metadata, unreadable = _metadata(folder)
@@ -91,7 +94,7 @@ def draft_survey(
 
 
 def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
-    """Size and EXIF data of the photographs of a folder, and which cannot be read."""
+    """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
     every = sorted(folder.iterdir())
@@ -123,7 +126,7 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
 
 
 def _has_photographs(folder: Path) -> bool:
-    """Return whether photographs lie directly in a folder."""
+    """Return whether a folder itself contains photographs."""
     try:
         return folder.is_dir() and any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())
     except OSError:
@@ -176,7 +179,7 @@ def _text(
 
 
 def _free(trial: TargetTrial) -> tuple[str, ...]:
-    """Return what is free of the cameras; for texture nothing is stated, and the adjustment chooses."""
+    """Return the free parameters of the cameras; empty for texture, where the adjustment chooses them."""
     if trial.plate is not None:
         return FREE_BY_PLATES
     return FREE_BY_TARGETS if trial.codes != "none" else ()
@@ -197,7 +200,7 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
 
 
 def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
-    """Return the lines of model and free parameters; of texture the adjustment chooses what is not known."""
+    """Return the lines of model and free parameters; as comments for texture, where they are chosen."""
     lines = (
         ['model = "brown"'] if free else ['# model = "brown"  # without it: what the photographs determine']
     )
@@ -224,7 +227,7 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
 
 
 def _kinds_of_codes() -> str:
-    """Return a comment that names the kinds of codes, with … for many of one kind, and the plates."""
+    """Return a comment that lists the kinds of codes and plates; an ellipsis stands for more of one kind."""
     kinds: dict[str, list[str]] = {}
     for name in FAMILIES:
         kinds.setdefault(re.split(r"[\d_]", name)[0], []).append(name)
@@ -290,7 +293,7 @@ def _example_lines(trial: TargetTrial) -> list[str]:
 
 
 def _position_lines(positions: int) -> list[str]:
-    """Return how positions in EXIF data are asked for, of so many photographs."""
+    """Return commented lines that show how to use the EXIF positions of so many photographs."""
     east, _, up = USUAL_SIGMAS_M
     state = agreeing(positions, "states|state")
     return [
@@ -303,7 +306,7 @@ def _position_lines(positions: int) -> list[str]:
 
 
 def _found(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
-    """Findings, for the terminal."""
+    """Return the findings for the terminal."""
     found = [
         (
             f"camera {camera.name}",
@@ -332,7 +335,7 @@ def _found(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tupl
 
 
 def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tuple[Remark, ...]:
-    """Return what a person should know of the photographs and targets."""
+    """Return the remarks on photographs, cameras and targets."""
     remarks = [one for camera in grouping.cameras for one in camera.remarks]
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
@@ -350,5 +353,5 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
 
 
 def _quoted(text: str) -> str:
-    """A TOML basic string; JSON writes a subset of them."""
+    """Return a TOML basic string; JSON strings are a subset of these."""
     return json.dumps(text, ensure_ascii=False)

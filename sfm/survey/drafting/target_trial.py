@@ -1,4 +1,7 @@
-"""Which targets photographs show: rings, tags, boards, plates of dots, concentric tags, in this order."""
+"""Trial for the kind of targets: rings, tags, boards, plates of dots and concentric tags, in this order.
+
+A few photographs of the folder are measured with each family of codes.
+"""
 
 from __future__ import annotations
 
@@ -48,30 +51,30 @@ from sfm.targets.detect import Targets, find_targets
 from sfm.targets.measure import shape_from_axes
 from sfm.targets.outlines import as_bytes, scale_of
 
-TRIED, PLATES_TRIED = 3, 8  # photographs, spread over the folder
+TRIED, PLATES_TRIED = 3, 8  # photographs that are tried, spread over the folder
 MIN_READABLE = 2  # photographs
-MIN_CODES = 2  # of a family in one picture, which chance seldom reads
+MIN_CODES = 2  # of a family in one picture; chance seldom reads so many
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
-LOOK_PX = 900  # longer side of the pictures of a first look
-# Pixels of a photograph over those of such a picture beyond which a first look saves time.
+LOOK_PX = 900  # longer side of the pictures for a first look
+# Pixels of a photograph over pixels of such a picture beyond which a first look saves time.
 MIN_PIXEL_RATIO = 3.0
-MIN_TARGETS = 12  # circles in a photograph that are no chance finds
+MIN_TARGETS = 12  # circles in a photograph; chance seldom finds so many
 
 
 @dataclass(frozen=True)
 class TargetTrial:
     """Targets that a few photographs show."""
 
-    codes: str  # family of codes, "none" without
+    codes: str  # family of codes, "none" without codes
     polarity: str  # dark, bright or auto
-    repeated: tuple[str, ...]  # names of coded targets that two photographs have, the most frequent first
-    counts: tuple[tuple[str, int], ...]  # family and codes that two photographs had in common, best first
+    repeated: tuple[str, ...]  # names of coded targets in two photographs or more, the most frequent first
+    counts: tuple[tuple[str, int], ...]  # (family, codes in two photographs or more), the best first
     circles: float  # median number of circular targets in a photograph
-    blur_px: float  # median standard deviation of their edges, px; NaN without
-    photographs: tuple[str, ...]  # that were tried
-    plates: tuple[PlateFamily, ...] = ()  # calibration plates; those after the first are seen with it
-    left_out: tuple[tuple[PlateFamily, str], ...] = ()  # plates that have no place beside the first, and why
-    unreadable: tuple[tuple[str, str], ...] = ()  # photographs that could not be decoded, and why
+    blur_px: float  # median standard deviation of their edges, px; NaN without targets
+    photographs: tuple[str, ...]  # photographs that were tried
+    plates: tuple[PlateFamily, ...] = ()  # calibration plates; the others are seen with the first
+    left_out: tuple[tuple[PlateFamily, str], ...] = ()  # (plate that cannot be used with the first, reason)
+    unreadable: tuple[tuple[str, str], ...] = ()  # (photograph that could not be decoded, reason)
 
     @property
     def plate(self) -> PlateFamily | None:
@@ -82,15 +85,15 @@ class TargetTrial:
 def try_targets(
     paths: Sequence[Path], *, store: MeasuredStore | None = None, progress: Progress = SILENT
 ) -> TargetTrial:
-    """Return which targets photographs show.
+    """Return the targets that photographs show.
 
-    A family is believed for codes that two photographs have in common: a wrong family reads a code now and
-    then, but not the same one twice. A plate is believed if two photographs show it whole.
+    A family is accepted if two photographs have codes of it in common: a wrong family reads a code now and
+    then, but not the same one twice. A plate is accepted if two photographs show it whole.
 
     Args:
-        paths: photographs in their order; those that cannot be decoded are passed over.
-        store: keeps what is measured, so that the survey need not measure it again.
-        progress: informed of every photograph and family.
+        paths: photographs in their order; those that cannot be decoded are skipped.
+        store: stores the measurements, so that the survey need not repeat them.
+        progress: receives every photograph and family.
 
     Raises:
         GeometryError: fewer than two of them can be decoded.
@@ -107,7 +110,7 @@ def try_targets(
             return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
     plain = [_measure(path, "none", store) for path in tried]
     counts: dict[str, tuple[int, ...]] = {}
-    for families in (RINGS, NECKLACES):  # which have no parity, and so read the rings of others too
+    for families in (RINGS, NECKLACES):  # necklaces have no parity, and also read rings of other families
         if all(len(codes) < MIN_REPEATED for codes in counts.values()):
             for family in families:
                 codes = list(map(partial(_ring_codes, family), photographs, plain))
@@ -169,7 +172,10 @@ def _shows_both(grey: AnyArray, targets: Targets, board: PlateFamily, dots: Plat
 def _side_by_side(
     plates: tuple[PlateFamily, ...],
 ) -> tuple[tuple[PlateFamily, ...], tuple[tuple[PlateFamily, str], ...]]:
-    """Return the plates that one survey can use, and the others and why; one with a place is the first."""
+    """Return the plates that one survey can use together, and the others with the reason.
+
+    A plate that does not look alike when turned comes first.
+    """
     used, left_out = list[PlateFamily](), list[tuple[PlateFamily, str]]()
     for plate in sorted(plates, key=lambda one: one.is_ambiguous):
         try:
@@ -182,7 +188,7 @@ def _side_by_side(
 
 
 def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray:
-    """Return the codes that measured targets have in a family of rings, negative where none, (k,)."""
+    """Return the codes of measured targets in a family of rings, negative without a code, (k,)."""
     rings = code_family(family)
     assert isinstance(rings, CodeFamily)
     levels = np.column_stack([targets.background, targets.contrast])
@@ -193,13 +199,13 @@ def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray
 def _tags_and_boards(
     read_already: Mapping[Path, AnyArray], more: Sequence[Path], progress: Progress
 ) -> tuple[str, tuple[PlateFamily, ...]]:
-    """Return the dictionary of tags that photographs have in common, "" without, and their boards.
+    """Return the dictionary of tags that photographs have in common, "" if none, and their boards.
 
-    A checkerboard may be a ChArUco board, which its tags show.
+    Tags on a checkerboard show that it is a ChArUco board.
     """
     none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
     others = [_as_bytes(read_photograph(path)) for path in more if path not in read_already]
-    grids = search_april_grids(tried, others)  # first, since modules of tags may pass for squares
+    grids = search_april_grids(tried, others)  # first, since modules of tags may look like squares
     if grids:
         return "", grids
     plate = search_checkerboard([*tried, *others])
@@ -222,7 +228,7 @@ def _tags_and_boards(
 
 
 def _shared(photographs: Sequence[IntArray]) -> IntArray:
-    """Return the numbers that two photographs have; none in one photograph."""
+    """Return the numbers that at least two photographs have."""
     number, times = np.unique(np.concatenate([np.unique(one) for one in photographs]), return_counts=True)
     return np.asarray(number[times > 1])
 
@@ -230,7 +236,7 @@ def _shared(photographs: Sequence[IntArray]) -> IntArray:
 def _dots(
     plain: Sequence[Targets], others: Sequence[Path], store: MeasuredStore | None
 ) -> PlateFamily | None:
-    """Return the plate of dots that photographs show; others are measured where one has a lattice."""
+    """Return the plate of dots that photographs show; `others` are measured if one has a lattice."""
 
     def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
         return targets.xy, np.sqrt(targets.semi_axes.prod(axis=1)), targets.polarity
@@ -247,24 +253,24 @@ def _as_bytes(photograph: AnyArray) -> AnyArray:
 
 
 def _spread(count: int, tried: int) -> list[int]:
-    """Return places spread over so many."""
+    """Return `tried` indices spread evenly over `count`."""
     return sorted({round(i * (count - 1) / max(tried - 1, 1)) for i in range(tried)})
 
 
 @dataclass(frozen=True)
 class _Look:
-    """A photograph at first sight."""
+    """Result of the first look at a photograph."""
 
     shows_targets: bool  # codes, plates, or many circles
     circles: int
-    board: Part | None = None  # part of a checkerboard, not looked for where there are targets
+    board: Part | None = None  # part of a checkerboard; not searched for if there are targets
 
 
 def _look(grey: AnyArray) -> _Look:
-    """Look for targets where they are fast to find: in the whole at low resolution, in the middle in full.
+    """Look for targets where they are found fast: in the whole reduced picture, and in its full-size middle.
 
-    Targets of a photograph are of about one size. Large ones are seen in the whole, and of small ones, which
-    are many, some are in the middle.
+    The targets of a photograph have about the same size. The reduced picture shows large targets. Small
+    targets are many, so the middle shows some of them.
     """
     height, width = grey.shape
     top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
@@ -289,7 +295,7 @@ def _look(grey: AnyArray) -> _Look:
 def _readable(
     paths: Sequence[Path], progress: Progress
 ) -> tuple[list[Path], list[AnyArray], tuple[tuple[str, str], ...]]:
-    """Return photographs spread over the folder and what they hold, and which cannot be decoded and why."""
+    """Return photographs spread over the folder, their pixels, and the undecodable ones with the reason."""
     tried: dict[int, AnyArray] = {}
     refused: dict[int, tuple[str, str]] = {}
     for place in _spread(len(paths), TRIED):
@@ -316,7 +322,7 @@ def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:
 
 
 def _repeated(photographs: Sequence[IntArray]) -> tuple[int, ...]:
-    """Codes that two photographs have, each once in both, the most frequent first."""
+    """Return the codes that occur exactly once in each of at least two photographs, most frequent first."""
     seen = Counter[int]()
     for read in photographs:
         codes, times = np.unique(read[read >= 0], return_counts=True)
@@ -325,7 +331,7 @@ def _repeated(photographs: Sequence[IntArray]) -> tuple[int, ...]:
 
 
 def _polarity(photographs: Sequence[Targets]) -> str:
-    """Polarity of the coded targets, auto where there are both."""
+    """Return the polarity of the coded targets, "auto" if there are both."""
     found = {int(p) for targets in photographs for p in targets.polarity[targets.code >= 0]}
     return {-1: "dark", 1: "bright"}[found.pop()] if len(found) == 1 else "auto"
 

@@ -1,1 +1,1 @@
-"""Which given values of a survey are wrong, by the image points alone."""
+"""Tests of the given values of a survey against the image points alone."""

@@ -1,12 +1,12 @@
-"""Given values and mounts, judged by the image points before they are used.
+"""Tests of given values and mounts against the image points, before they are used.
 
-A contradicting value is left out and named where the others identify it; where they do not, nothing that it
-touches is believed. The rest takes part in the adjustment.
+If the other values identify a contradicting value, it is left out and reported. If they do not, no value that
+may be wrong is used. The rest takes part in the adjustment.
 
-Mounts of the cameras of a rig are judged by the photographs: a network without them has the mounts that its
-photographs give, with their covariance. Rotation and direction of the base are compared with those of the
-image points alone, which leave the length of the base open; the length with those of the other mounts, and of
-all else that gives a scale.
+Given mounts of the cameras of a rig are judged by the photographs. A network without given mounts estimates
+the mounts with their covariance. Rotation and direction of the base are compared with those from the image
+points alone, which do not determine the length of the base. The length is compared with those of the other
+mounts, and with everything else that gives a scale.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests).
 """
@@ -42,19 +42,19 @@ from sfm.survey.hypotheses.given_scales import (
 )
 
 TINY = float(np.finfo(float).tiny)
-MAX_PLACES = 1000  # given points whose joint covariance is formed, 72 MB; of more, so many are judged
+MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged
 
 
 @dataclass(frozen=True)
 class JudgedGiven:
-    """Given values that may take part in the adjustment, and findings on the rest."""
+    """Given values that may take part in the adjustment, and remarks on the rest."""
 
     network: Network
     datum: Datum
     remarks: tuple[Remark, ...] = ()
     tests: tuple[GivenTest, ...] = ()
     placing: Similarity | None = None
-    """object frame from that of the free network; None where nothing gives it"""
+    """transformation from the free network to the object frame; None if nothing gives it"""
     checks_handedness: bool = False  # whether a mirrored network does not fit
 
 
@@ -68,17 +68,17 @@ def judge_given(
     plates: Sequence[Collection[str]] = (),
     checks_scale: bool = False,
 ) -> JudgedGiven:
-    """Return which given values may take part in an adjustment, and remarks on the others.
+    """Return the given values that may take part in an adjustment, and remarks on the others.
 
     Args:
-        network: with all that was given.
-        free: adjustment of its image points alone, or of a part of them, in a free datum; None if none.
-        datum: that was asked for.
+        network: has all given values.
+        free: adjustment of its image points alone, or of some of them, in a free datum; None without one.
+        datum: datum of the survey.
         unit: object unit.
         rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
-        plates: names of the points of each plate where control is the first of them: fixed coordinates of a
-            grid are not rounded to decimals, and the scale is that of the plate, as asked for; bars between
-            points of another plate are its size.
+        plates: names of the points of each plate, if control is the first plate. Fixed coordinates of a grid
+            are not rounded to decimals. The scale is that of the plate, as the survey states. Bars between
+            points of another plate are the size of that plate.
         checks_scale: whether given mounts check the scale.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
@@ -96,7 +96,7 @@ def judge_given(
 
 
 def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
-    """Return where the given points are in the free network; None where that does not determine them."""
+    """Return the given points in the free network with their covariance; None if undetermined."""
     if not free.converged or free.undetermined or free.defect != free.expected_defect:
         return None
     bars, control = network.scale_bars, network.control
@@ -130,7 +130,7 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
 
 
 def _judged(task: Task) -> JudgedGiven:
-    """Judge points, then the scales of bars and points."""
+    """Judge the given points, then the scales of bars and points."""
     network, datum = task.network, task.datum
     control, seen = network.control, network.exterior
     names = [network.points[j] for j in control.point], [network.images[i] for i in seen.image]
@@ -164,7 +164,7 @@ def _judged(task: Task) -> JudgedGiven:
 
 
 def _as_judged(network: Network, group: Group, *, rescale: bool, used: bool) -> Network:
-    """Return the network with the given points of a kind that fit; with none of them where not used."""
+    """Return the network with the fitting points of a group; without any of its points if not used."""
     if group.of == "control":
         control = network.control
         order, keep, covariance = group.as_judged(control.covariance, rescale=rescale)
@@ -186,7 +186,7 @@ def _group(
     xyz: FloatArray,
     covariance: FloatArray,
 ) -> Group | None:
-    """Judge points of a kind against the free network; None without such."""
+    """Judge the given points of a kind against the free network; None without any."""
     given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
     placed_there = np.array([name in place_of for name in names], dtype=bool)
     rows = np.flatnonzero(placed_there & np.isfinite(given).any(axis=1))
@@ -220,7 +220,7 @@ def _group(
 
 
 def _rounded(group: Group, start: Similarity | None, level: float) -> Group:
-    """Judge fixed coordinates again, as precise as their decimals, where these explain the misfit."""
+    """Judge fixed coordinates with the precision of their decimals, if this explains the misfit."""
     points = group.points.rounded()
     placed = judge_points(points, level, start=start) if points.stated.any() else None
     if placed is None or placed.judgement.factor != 1.0 or placed.judgement.doubtful:
@@ -229,7 +229,7 @@ def _rounded(group: Group, start: Similarity | None, level: float) -> Group:
 
 
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
-    """Yield what does not fit of points, and what nothing checks."""
+    """Yield the remarks on given points that do not fit, and on those that nothing checks."""
     found, of = group.found, group.of
     exchanged = [group.names[k] for k in group.placed.exchangeable] or None
     if group.placed.mirrored:
@@ -294,7 +294,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
     shift = np.inf
     if found.one_wrong:
         shift = float(_shifts(model)[list(found.doubtful)].max())
-        # they take part with the standard deviations that their differences show, if these are believed
+        # they take part with standard deviations from their differences, if these may be replaced
         if task.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
             shift /= model.factor()[0]
     return remark(
@@ -309,7 +309,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
 
 
 def _shifts(model: GivenModel) -> FloatArray:
-    """Return the largest shift of what given values determine without each, in its standard deviations."""
+    """Return the largest effect of each given value on the parameters, in their standard deviations."""
     reach = model.external()
     found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / NONCENTRALITY
     return np.where(np.isfinite(reach), found, np.inf)
@@ -318,8 +318,8 @@ def _shifts(model: GivenModel) -> FloatArray:
 def shift_of_fixed(model: GivenModel, sigma: float) -> float:
     """Return the shift of coordinates by errors of points that are held fixed, in standard deviations.
 
-    It is the standard deviation of the shift by the datum over that of the coordinate, the largest of points
-    at the places of the given ones.
+    It is the standard deviation of the shift by the datum over that of the coordinate, at the given point
+    where this ratio is largest.
 
     Args:
         model: differences of the fixed points.
@@ -333,17 +333,17 @@ def shift_of_fixed(model: GivenModel, sigma: float) -> float:
 
 @dataclass(frozen=True)
 class _Found:
-    """The mounts of the same cameras in a network without the given ones."""
+    """Mounts of the same cameras, estimated in a network without the given mounts."""
 
     position: FloatArray  # (c, 3)
     angles: FloatArray  # rad, (c, 3)
-    covariance: FloatArray  # of X, Y, Z, omega, phi, kappa of all, (6 c, 6 c)
-    motions: FloatArray  # derivatives by what the network leaves open, (6 c, d)
+    covariance: FloatArray  # of X, Y, Z, omega, phi, kappa of all mounts, (6 c, 6 c)
+    motions: FloatArray  # derivatives by the motions that the network leaves open, (6 c, d)
     redundancy: int
 
 
 def judge_mounts(given: MountObservations, free: Adjustment) -> tuple[MountObservations, tuple[Remark, ...]]:
-    """Return the mounts whose rotation and direction the photographs confirm, and remarks on the others.
+    """Return the mounts whose rotation and base direction the photographs confirm, and remarks on the others.
 
     Args:
         given: mounts, held fixed or observed.
@@ -378,12 +378,12 @@ def judge_mounts(given: MountObservations, free: Adjustment) -> tuple[MountObser
 def judge_mount_scales(
     given: MountObservations, without: Adjustment, others: Sequence[str]
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
-    """Return the mounts if their scales agree, else none of them and the remark that they contradict.
+    """Return the mounts if their scales agree; otherwise no mounts, and the remark that they contradict.
 
     Args:
         given: mounts whose rotation and direction the photographs confirm.
-        without: adjustment of all but the mounts.
-        others: kinds of given values in it that give a scale.
+        without: adjustment of everything but the mounts.
+        others: kinds of given values in this adjustment that give a scale.
     """
     found = _found(given, without)
     if found is None or not len(given) or not given.position.any(axis=1).all():  # a base of 0 has no scale
@@ -420,7 +420,7 @@ def judge_mount_scales(
 
 
 def _found(given: MountObservations, a: Adjustment) -> _Found | None:
-    """Return the mounts of an adjustment without given ones; None where it does not determine them."""
+    """Return the mounts of an adjustment without given mounts; None if it does not determine them."""
     mounts = a.estimate.mounts
     if mounts is None or not a.converged or a.redundancy < 1:
         return None
@@ -444,11 +444,11 @@ def _found(given: MountObservations, a: Adjustment) -> _Found | None:
 
 
 def _shape(one: MountObservations, found: _Found, k: int) -> GivenModel:
-    """Return the differences of one mount from that of the photographs, the length of the base left open."""
+    """Return the differences of one mount from that of the photographs; the length of the base is free."""
     X, P = found.position[k], one.position[0]
     scale = float(np.linalg.norm(P)) / max(float(np.linalg.norm(X)), TINY) or 1.0
     turned = one.angles[0] - found.angles[k]
-    open_scale = P @ X > 0  # no positive scale turns a base round
+    open_scale = P @ X > 0  # no positive scale reverses a base
     D, own = np.diag([scale] * 3 + [1.0] * 3), slice(6 * k, 6 * k + 6)
     return GivenModel(
         np.concatenate([P - scale * X, (turned + np.pi) % (2 * np.pi) - np.pi]),
@@ -461,7 +461,7 @@ def _shape(one: MountObservations, found: _Found, k: int) -> GivenModel:
 
 
 def _mistaken(one: MountObservations) -> Iterator[tuple[str, MountObservations]]:
-    """Yield the mount that was meant, if the given one is the result of a common mistake, with its name."""
+    """Yield (name of a common mistake, mount without this mistake)."""
     R, X, S = rotation_from_angles(*one.angles[0]), one.position[0], one.covariance[0]
     turned = S.copy()
     turned[:3, :3] = R.T @ S[:3, :3] @ R + float(X @ X) * S[3:, 3:].max() * np.eye(3)

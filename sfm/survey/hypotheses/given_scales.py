@@ -1,4 +1,8 @@
-"""Scales by bars, control and projection centres, judged against one another."""
+"""Tests of the scales given by bars, control and projection centres against one another.
+
+Every scale bar, and every group of given points, gives the ratio of an object length to its length in the
+free network. The logarithms of these scales are tested with their joint covariance.
+"""
 
 from __future__ import annotations
 
@@ -31,22 +35,27 @@ from sfm.remarks.kind import WRONG_SIGMAS, significant
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import extended_axes
 
-MIN_IN_SPACE = 4  # points that do not lie in a plane, whose mirror image is another figure
-MAX_PERCENT = 2.0  # factor of lengths beyond which it is reported as such, and not in per cent
+MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
+MAX_PERCENT = 2.0  # a larger ratio of lengths is reported as a factor, a smaller one in per cent
 
 
 @dataclass(frozen=True)
 class JudgedScales:
-    """Scale bars as judged, and what was found of them and of the scale of given points."""
+    """The judged scale bars, and remarks on them and on the scale of given points."""
 
-    bars: ScaleBars  # that take part
+    bars: ScaleBars  # bars that take part
     remarks: tuple[Remark, ...] = ()
     tests: tuple[GivenTest, ...] = ()
     left_out: frozenset[str] = frozenset()  # kinds of given points that do not take part
 
 
 def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
-    """Judge the scales of bars and of dependable points against one another."""
+    """Judge the scales of bars and of dependable groups of points against one another.
+
+    Args:
+        task: values to judge.
+        groups: dependable groups of given points.
+    """
     bars, places = task.network.scale_bars, task.places
     found: dict[str, list[tuple[_Length, GivenScale]]] = {}
     for one in _lengths(bars):
@@ -95,7 +104,7 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
 
 
 def _scale_of(task: Task, group: Group) -> GivenScale | None:
-    """Return the scale by given points; by their distance where there are two."""
+    """Return the scale from given points; from their distance if there are two."""
     points, complete, places = group.points, group.points.complete, task.places
     if len(complete) == 2 and points.known.sum() == 6:
         apart = points.given[complete[1]] - points.given[complete[0]]
@@ -124,15 +133,11 @@ def _contradicting_scales(
     on_points: bool,
     plates: Collection[str] = (),
 ) -> tuple[tuple[int, ...], tuple[Remark, ...]]:
-    """Return which scales the others identify as wrong, or all where nothing shows which are, and remarks.
+    """Return the scales that the others identify as wrong, or all doubtful ones if they do not, with remarks.
 
-    Args:
-        model: differences of the scales, those of bars first.
-        judgement: what is wrong of them.
-        names: of the bars and plates, and kinds of the given points.
-        bars: how many of them are lengths of bars.
-        on_points: whether given points hold the datum. Bars, which may share their unit, do not replace them.
-        plates: names of those that are plates.
+    names: bars and plates, of which the first `bars` are lengths, then kinds of given points.
+    on_points: whether given points carry the datum; bars, which may share a wrong unit, do not replace them.
+    plates: the names that are plates.
     """
     wrong, every = judgement.wrong, range(model.items)
     if wrong and not (on_points and max(wrong) >= bars and {*every[bars:]} <= {*wrong}):
@@ -160,7 +165,7 @@ def _contradicting_scales(
 def _left_out(
     model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, bars: int, plates: Collection[str]
 ) -> Remark:
-    """Return the remark that a bar, a plate, or given points by their scale, were left out."""
+    """Return the remark that a bar, a plate or given points were left out because of their scale."""
     off, sigma = _difference(model, wrong, k)
     kind = "bar_left_out" if k < bars else "scale_left_out"
     kind = "plate_size_left_out" if names[k] in plates else kind
@@ -168,23 +173,23 @@ def _left_out(
 
 
 def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
-    """Return the logarithm of a wrong scale over that of those that are not wrong, and its sigma."""
+    """Return the logarithm of a wrong scale over the scale of the correct ones, and its sigma."""
     (off,), ((variance,),) = model.kept(tuple(j for j in wrong if j != k)).difference(k)
     return float(off), float(np.sqrt(variance))
 
 
 @dataclass(frozen=True)
 class _Length:
-    """A length between two points, given once or several times alike."""
+    """A length between two points, given once or several times."""
 
     bars: tuple[int, ...]
-    length: float  # mean by weights
-    sigma: float  # of the best: to give it twice makes it no better
-    contradicted: bool  # whether another length is given between the same points
+    length: float  # weighted mean
+    sigma: float  # of the best bar: giving a length twice does not improve it
+    contradicted: bool  # whether a different length is given between the same points
 
 
 def _lengths(bars: ScaleBars) -> list[_Length]:
-    """Return the lengths that scale bars give, those between the same points once where they agree."""
+    """Return the lengths of scale bars; agreeing lengths between the same points are merged."""
     same: dict[frozenset[int], list[list[int]]] = {}
     for b in np.argsort(bars.length, kind="stable").tolist():
         alike = same.setdefault(frozenset((int(bars.start[b]), int(bars.end[b]))), [])
@@ -212,7 +217,12 @@ def _agree(bars: ScaleBars, a: int, b: int) -> bool:
 
 
 def numbers_of_scale(log: float, sigma: float) -> dict[str, Any]:
-    """Return the numbers of a difference of scale, and the units whose factor it is, if it is one."""
+    """Return the numbers for a remark on a difference of scale, with the two units if it is a unit factor.
+
+    Args:
+        log: logarithm of the ratio of scales.
+        sigma: standard deviation of the logarithm.
+    """
     unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(LEVEL, 1))) * sigma)
     found: dict[str, Any] = {"sigmas": abs(log) / sigma}
     if abs(log) > np.log(MAX_PERCENT):
@@ -227,15 +237,23 @@ def numbers_of_scale(log: float, sigma: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class GivenScale:
-    """Object units per unit of the free network, by one bar or by all given points together."""
+    """Object units per unit of the free network, from one bar or from all given points of a kind."""
 
     scale: float
-    rows: FloatArray  # derivative of its logarithm by the points of the free network, (3 n,)
-    sigma: float  # of the scale, by what was stated
+    rows: FloatArray  # derivatives of its logarithm by the points of the free network, (3 n,)
+    sigma: float  # of the scale, from the stated standard deviations
 
 
 def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, end: int) -> GivenScale:
-    """Return the scale by a length between two points of the free network, (n, 3)."""
+    """Return the scale from a length between two points of the free network.
+
+    Args:
+        length: given length, object unit.
+        sigma: standard deviation of the length, object unit.
+        free: points of the free network, (n, 3).
+        start: index of the first point.
+        end: index of the second point.
+    """
     apart = free[end] - free[start]
     found = float(np.linalg.norm(apart))
     rows = np.zeros(free.shape)
@@ -244,7 +262,7 @@ def scale_of_length(length: float, sigma: float, free: FloatArray, start: int, e
 
 
 def mean_scale(scales: Sequence[GivenScale]) -> GivenScale:
-    """Return the geometric mean of scales by independent lengths."""
+    """Return the geometric mean of scales from independent lengths."""
     scale = float(np.exp(np.mean([np.log(one.scale) for one in scales])))
     relative = np.array([one.sigma / one.scale for one in scales])
     rows = np.mean([one.rows for one in scales], axis=0)
@@ -254,14 +272,14 @@ def mean_scale(scales: Sequence[GivenScale]) -> GivenScale:
 def scale_of_points(
     points: GivenPoints, placed: PlacedPoints, without: tuple[int, ...], at: IntArray, count: int
 ) -> GivenScale:
-    """Return the scale by given points, some left out.
+    """Return the scale from given points, without some of them.
 
     Args:
-        points: given, and of the free network.
-        placed: the same, judged.
-        without: those left out.
-        at: which points of the free network they are, (k,).
-        count: how many points the free network has, n.
+        points: given coordinates, and coordinates in the free network.
+        placed: the judged points.
+        without: indices of the points that are left out.
+        at: index of each point in the free network, (k,).
+        count: number of points of the free network, n.
     """
     model, placing = placed.model, placed.placing
     kept = ~np.isin(model.item, without)
@@ -274,10 +292,16 @@ def scale_of_points(
 
 
 def scale_model(scales: tuple[GivenScale, ...], joint: FloatArray, redundancy: int) -> GivenModel:
-    """Return the differences of scales, with the covariance of the points of the free network, (3 n, 3 n).
+    """Return the differences of scales as a model of given values.
 
-    A standard deviation of a length is that of its logarithm over the logarithmic mean of the length and of
-    what the median of the scales predicts: a difference has as many of them in both, however large it is.
+    The sigma of the logarithm of a length is the sigma of the length over a logarithmic mean: the mean of the
+    length and of the length that the median scale predicts. A difference of any size is then the same number
+    of standard deviations in lengths and in logarithms.
+
+    Args:
+        scales: scales from bars and given points.
+        joint: covariance of the points of the free network, (3 n, 3 n).
+        redundancy: redundancy of the free network.
 
     Source: Stolarsky (1975), Generalizations of the logarithmic mean, Math. Mag. 48(2), 87-92.
     """
@@ -303,25 +327,25 @@ class Places:
     xyz: FloatArray  # (p, 3)
     joint: FloatArray  # (3 p, 3 p)
     redundancy: int
-    of_point: dict[str, int]  # place of a point
-    of_image: dict[str, int]  # place of a photograph
+    of_point: dict[str, int]  # row of a point by name
+    of_image: dict[str, int]  # row of a photograph by name
 
     def at(self, places: Sequence[int]) -> tuple[IntArray, IntArray]:
-        """Return indices of places, and of their coordinates."""
+        """Return the indices of places as an array, and the indices of their coordinates."""
         index = np.asarray(places, dtype=np.int64)
         return index, (3 * index[:, None] + np.arange(3)).ravel()
 
 
 @dataclass(frozen=True)
 class Task:
-    """The values to be judged, and the test."""
+    """The values to judge, and the settings of the tests."""
 
-    network: Network  # with all that was given
+    network: Network  # has all given values
     places: Places
-    datum: Datum  # that was asked for
+    datum: Datum  # of the survey
     unit: str
     rescale: bool
-    plates: tuple[frozenset[str], ...] = ()  # points of each, the first of which is control; none without
+    plates: tuple[frozenset[str], ...] = ()  # points of each plate; the first plate is control
     checks_scale: bool = False  # whether given mounts check the scale of the others
 
     @property
@@ -330,56 +354,56 @@ class Task:
         return bool(self.plates)
 
     def plate_at(self, points: Collection[str]) -> str | None:
-        """Return the name of the plate that has all these points, None without one."""
+        """Return the name of the plate that has all these points, or None."""
         on = (plate_name(k) for k, plate in enumerate(self.plates) if plate.issuperset(points))
         return next(on, None)
 
     @property
     def level(self) -> float:
-        """Probability with which one kind of right given values is reported as wrong."""
+        """Probability of reporting one kind of correct given values as wrong."""
         kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
         return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Given points of a kind, judged."""
+    """Judged given points of one kind."""
 
     of: str  # control or centres
-    rows: IntArray  # of the kind in the network, (n,)
+    rows: IntArray  # rows of the points in their table of the network, (n,)
     names: tuple[str, ...]
     points: GivenPoints
-    places: IntArray  # (n,)
+    places: IntArray  # rows of the points in `Places`, (n,)
     placed: PlacedPoints
-    rounded: bool = False  # whether the standard deviations are those of the rounding
+    rounded: bool = False  # whether the standard deviations are those of rounding
 
     @property
     def found(self) -> Judgement:
-        """The group of values found wrong."""
+        """The judgement of the group."""
         return self.placed.judgement
 
     @property
     def out(self) -> tuple[int, ...]:
-        """Those that were left out."""
+        """Points that were left out."""
         return self.found.wrong
 
     @property
     def dependable(self) -> bool:
-        """Whether a scale may rest on them."""
+        """Whether the points may give a scale."""
         return not (self.placed.mirrored or self.found.doubtful)
 
     @property
     def checks_handedness(self) -> bool:
-        """Whether they fit the network or its mirror image, and not both."""
+        """Whether the points fit either the network or its mirror image, but not both."""
         return self.placed.mirrored or excludes_mirror(self.points, self.placed)
 
     @property
     def test(self) -> GivenTest:
-        """Test of all of them."""
+        """Test of all points."""
         return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
 
     def taking_part(self, *, rescale: bool) -> tuple[GivenPoints, IntArray]:
-        """Return those that take part, with the covariance with which they do, and their places."""
+        """Return the points that take part, with their covariance in the adjustment, and their places."""
         kept = np.setdiff1d(np.arange(len(self.names)), self.out)
         order = np.array(self.placed.order or range(len(self.names)), dtype=np.int64)
         points = self.points.reordered(tuple(order.tolist())).select(kept)
@@ -388,7 +412,10 @@ class Group:
         return points, self.places[kept]
 
     def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
-        """Return whose coordinates each given point has, which take part, and their covariance, (n, 3, 3)."""
+        """Return the order of the given points, which points take part, and their covariance, (n, 3, 3).
+
+        The order corrects names that were exchanged.
+        """
         order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
         if self.placed.order:
             order[self.rows] = self.rows[list(self.placed.order)]
@@ -398,7 +425,7 @@ class Group:
         return order, keep, changed
 
     def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
-        """Return the covariance of the points with which they fit."""
+        """Return the covariance with which the points fit."""
         known = np.isfinite(covariance)
         if self.rounded:
             return np.where(known, self.points.stated, covariance)
@@ -411,15 +438,19 @@ class Group:
 
 
 def plate_name(k: int) -> str:
-    """Return the name of a plate by its place in the survey file, that of the targets being the first."""
+    """Return the name of plate k in the survey file; the plate of the targets is the first, k = 0."""
     return f"plate {k + 1}"
 
 
 def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
-    """Return the remark that control and projection centres place the network differently; None if not.
+    """Return the remark that control and projection centres place the network differently, or None.
 
-    Each by itself fits the network with a similarity. Both have the errors of one network, and with their
-    joint covariance one similarity is tested against two: what seven parameters more explain.
+    Each by itself fits the network with a similarity. Both have the errors of the same network. With their
+    joint covariance, one similarity is tested against two, which have seven more parameters.
+
+    Args:
+        task: settings of the test.
+        groups: control and projection centres.
     """
     if len(groups) < 2:
         return None
@@ -451,14 +482,21 @@ def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
 
 
 def are_in_space(xyz: FloatArray) -> bool:
-    """Return whether the mirror image of points is another figure."""
+    """Return whether the mirror image of points, (n, 3), is another figure."""
     return len(xyz) >= MIN_IN_SPACE and len(extended_axes(xyz)[0]) == 3
 
 
 def remarks_on_unchecked(
     of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
 ) -> Iterator[Remark]:
-    """Yield remarks on given values of which nothing, or hardly anything, would find an error."""
+    """Yield remarks on given values whose errors nothing, or hardly anything, would reveal.
+
+    Args:
+        of: kind of the given values.
+        names: names of the given values.
+        model: differences of the given values.
+        without: indices of values that are left out.
+    """
     reach, rank = model.external(without), model.kept(without).decreases()[1]
     for kind, some in (
         ("given_unchecked", np.isinf(reach) & (rank == 0)),

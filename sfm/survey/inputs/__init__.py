@@ -1,4 +1,5 @@
-"""Input of a survey: its file or Python's settings, its tables and its photographs, each read once.
+"""Input of a survey: its file or settings from Python, its tables and its photographs, each read once.
 
-Begin with `survey` (`Survey`, `read_survey`); `settings` are the words of the file, `given` its tables.
+Begin with `survey` (`Survey`, `read_survey`). `settings` declares the keys of the file, and `given` reads its
+tables.
 """

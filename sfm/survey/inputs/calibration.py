@@ -1,11 +1,15 @@
-"""Interior orientation of an earlier result, and the calibration plate of a survey.
+"""Interior orientation from an earlier result, and the calibration plate of a survey.
+
+The interior orientation is read from these files of the result:
 
     summary.json                model, size and pixel of each camera
     cameras.csv                 camera,parameter,value,sigma of each parameter; without sigma it was held
-    interior_correlations.csv   camera,first,second,correlation of those that were adjusted
+    interior_correlations.csv   camera,first,second,correlation of the adjusted parameters
 
-As an observation it counts with the full covariance of its parameters, so that a calibration and a survey
-adjusted one after the other give what both give adjusted together, as far as they share nothing else.
+As an observation it has the full covariance of its parameters. A calibration and a survey adjusted one after
+the other then give the same result as both adjusted together, provided that they share nothing else.
+
+The points of a calibration plate are the control of a survey. Contradicting or incomplete plates are refused.
 
 Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 5.6 (a priori parameter constraints).
 """
@@ -55,12 +59,12 @@ class Calibration:
     size_px: tuple[int, int]
     pixel_mm: tuple[float, float]
     values: dict[str, float]  # of all parameters of the model, in its units
-    sigma: dict[str, float] = field(default_factory=dict)  # of those that were adjusted
-    correlations: tuple[tuple[str, str, float], ...] = ()  # of pairs of these
+    sigma: dict[str, float] = field(default_factory=dict)  # of the adjusted parameters
+    correlations: tuple[tuple[str, str, float], ...] = ()  # of pairs of adjusted parameters
 
     @classmethod
     def of_camera(cls, camera: Camera) -> Calibration:
-        """Return that of a camera, as far as a camera has one: without standard deviations."""
+        """Return the interior orientation of a camera, without standard deviations."""
         sides = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
         values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         return cls(camera.name, camera.model, camera.size_px, sides, values)
@@ -82,10 +86,10 @@ class _Summary(Content):
 
 
 def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
-    """Read the interior orientations of the folder of a result.
+    """Read the interior orientations from the folder of a result.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line number.
+        SurveyFileError: something is missing or wrong; the message has file and line number.
     """
     summary = read_json(folder / "summary.json", _Summary, "the summary of a result")
     table = read_table(
@@ -137,20 +141,21 @@ def calibrated(
     *,
     weighted: bool = False,
 ) -> CameraSettings:
-    """Return the settings of one camera, held at a calibration or with it as an observation.
+    """Return the settings of one camera, held at a calibration or with the calibration as an observation.
 
-    The camera takes that of its name; if the calibration has one camera only, it takes that one.
+    The camera takes the calibration of its name, or the only calibration if there is just one.
 
     Args:
-        settings: of the camera; besides name and photographs nothing of them is used.
-        calibrations: of an earlier result.
-        where: what messages call the survey.
-        source: what they call that result.
-        weighted: adjusted, with the calibration and its covariance as an observation; else held.
+        settings: settings of the camera; only its name, photographs and size are used.
+        calibrations: cameras of an earlier result.
+        where: name of the survey in error messages.
+        source: name of the earlier result in error messages.
+        weighted: whether the camera is adjusted, with the calibration and its covariance as an observation;
+            else it is held.
 
     Raises:
-        SurveyFileError: no camera of that name among several, photographs of another size, or no standard
-            deviations to weight by.
+        SurveyFileError: several calibrations but none of the camera's name, photographs of another size, or
+            no standard deviations for an observation.
     """
     named = [one for one in calibrations if one.name == settings.name]
     if not named and len(calibrations) > 1:
@@ -184,7 +189,7 @@ def calibrated(
 
 
 def plate_family(targets: PlateSettings) -> PlateFamily | None:
-    """Return the plate that the targets are on; None where they are on none."""
+    """Return the plate of the targets; None if they are not on a plate."""
     if targets.codes not in PLATES or targets.rows is None or targets.columns is None:
         return None
     share = 0.0
@@ -202,9 +207,9 @@ def plate_family(targets: PlateSettings) -> PlateFamily | None:
 
 
 def plate_control(targets: TargetSettings) -> KnownPoints | None:
-    """Return the points of the plate, flat and in their grid, as control; None without a plate.
+    """Return the points of the plate as control, on a plane grid; None without a plate.
 
-    The origin is the first point, X along the rows, Y up the columns, Z towards the camera.
+    The origin is the first point. X runs along the rows, Y up the columns, and Z towards the camera.
     """
     plate = plate_family(targets)
     if plate is None or targets.pitch is None:
@@ -215,7 +220,7 @@ def plate_control(targets: TargetSettings) -> KnownPoints | None:
 
 
 def plate_group(targets: TargetSettings, others: Sequence[PlateSettings]) -> PlateGroup:
-    """Return the plates of a survey, that of the targets first.
+    """Return the plates of a survey, the plate of the targets first.
 
     Raises:
         GeometryError: they cannot be used side by side, see `group_plates`.
@@ -225,7 +230,7 @@ def plate_group(targets: TargetSettings, others: Sequence[PlateSettings]) -> Pla
 
 
 def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateSettings], where: str) -> None:
-    """Raise SurveyFileError where plates beside another are incomplete, or cannot be distinguished."""
+    """Raise SurveyFileError if further plates are incomplete, or if plates cannot be distinguished."""
     if not others:
         return
     if targets.codes not in PLATES:
@@ -245,14 +250,14 @@ def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateS
 
 
 def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> bool:
-    """Return whether the control is that of the plate."""
+    """Return whether the control consists of the points of the plate."""
     if control is None or plate is None or control.names != plate.names:
         return False
     return bool(np.array_equal(control.xyz, plate.xyz) and np.array_equal(control.sigma, plate.sigma))
 
 
 def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
-    """Raise SurveyFileError where the description of a plate is incomplete, or belongs to none."""
+    """Raise SurveyFileError if the settings of a plate are incomplete, or are given without a plate."""
     given = [name for name in OF_PLATES if name in targets.model_fields_set]
     if targets.codes not in PLATES:
         if given:
@@ -306,7 +311,7 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
 
 
 def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:
-    """Raise SurveyFileError where each point has separate coordinates, and its identity cannot be known."""
+    """Raise SurveyFileError if the points of a plate have free coordinates but no unique identity."""
     plate = plate_family(targets)
     if plate is None or datum == "control" or not plate.is_ambiguous:
         return

@@ -1,9 +1,9 @@
-"""The cameras of a survey: start values and interior orientation as asked for.
+"""The cameras of a survey: their start values, and their interior orientation in the final adjustment.
 
-Interior orientation as the survey asks for it: of all photographs, of groups, or of each; observed or not.
-
-Approximate values are found with one interior orientation for each camera of the survey file, in which
-observed parameters keep their observed values. Only the final adjustment has the image-variant one.
+Approximate values are found with one interior orientation for each camera of the survey file. In it, observed
+parameters keep their observed values. The final adjustment may have a common interior orientation for all
+photographs of a camera, or one for groups of photographs, or one for each photograph (image-variant). Its
+parameters may be observed.
 
 Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 4.4.2 (image-variant
 interior orientation).
@@ -28,23 +28,26 @@ from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
-MIN_EIGENVALUE = 1e-12  # smallest eigenvalue of a matrix of correlations below which it is none
-MAX_PIXEL_MM = 1000.0  # side of a pixel; of models without a size it is 1 mm
-MIN_VIEW_DEG, MAX_VIEW_DEG = 0.5, 170.0  # diagonal, of a central projection; lenses have 1 to 140
-COMMON_VIEW_DEG = 10.0, 120.0  # of nearly all cameras: by which the unit is guessed
-MAX_PIXEL_RATIO = 10.0  # of its sides; anamorphic lenses and line scanners stay below 3
+MIN_EIGENVALUE = 1e-12  # a matrix with a smaller eigenvalue is no correlation matrix
+MAX_PIXEL_MM = 1000.0  # side of a pixel; it is 1 mm in models without a pixel size
+MIN_VIEW_DEG, MAX_VIEW_DEG = (
+    0.5,
+    170.0,
+)  # diagonal field of view of a central projection; lenses have 1 to 140
+COMMON_VIEW_DEG = 10.0, 120.0  # of nearly all cameras, used to guess a wrong unit
+MAX_PIXEL_RATIO = 10.0  # of the sides of a pixel; anamorphic lenses and line scanners stay below 3
 
 
 def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) -> int:
-    """Return the index of the camera whose glob an image name matches.
+    """Return the index of the camera whose glob matches the name of a photograph.
 
     Args:
-        cameras: of the survey.
-        image: the name.
-        source: what messages call the survey.
+        cameras: cameras of the survey.
+        image: name of the photograph.
+        source: name of the survey in error messages.
 
     Raises:
-        SurveyFileError: no camera, or more than one.
+        SurveyFileError: the globs of no camera match, or those of several cameras.
     """
     if len(cameras) == 1 and cameras[0].images is None:
         return 0
@@ -71,17 +74,17 @@ def start_cameras(
     """Return the cameras with their start values, in the order of the survey file.
 
     Args:
-        settings: of the cameras in the survey; what they leave out is taken from the photographs.
-        source: what messages call the survey.
-        metadata: size and EXIF data of the readable photographs, (m,); none with [observations].
-        camera: index of the camera of each photograph, (m,).
+        settings: cameras of the survey; the photographs give missing values.
+        source: name of the survey in error messages.
+        metadata: size and EXIF data of the readable photographs, (m,); empty with [observations].
+        camera: camera index of each photograph, (m,).
         names: names of the photographs, (m,).
-        given: start values of [approximate] for parameters that are adjusted freely, before all others.
+        given: start values of [approximate] for free parameters, which replace all others.
 
     Raises:
         PhotographError: photographs of one camera differ in size from one another or from size_px.
-        SurveyFileError: size, pixel size or principal distance is not known from anywhere, or they make a
-            field of view that no lens has.
+        SurveyFileError: size, pixel size or principal distance is unknown, or they give a field of view that
+            no lens has.
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
@@ -137,7 +140,7 @@ def start_cameras(
 def _refuse_implausible_view(
     where: str, size: tuple[int, int], pixel: tuple[float, float], focal: float
 ) -> None:
-    """Raise SurveyFileError if no lens has such a field of view: a length is in another unit."""
+    """Raise SurveyFileError if no lens has such a field of view, since a length has a wrong unit."""
     diagonal = float(np.hypot(size[0] * pixel[0], size[1] * pixel[1]))
 
     def view_deg(pixel_factor: float, focal_factor: float) -> float:
@@ -160,21 +163,25 @@ def _refuse_implausible_view(
 
 
 def free_start_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:
-    """Return the start values of [approximate] for what is free of a camera, by parameter.
+    """Return the start values of [approximate] for the free parameters of a camera, by parameter.
 
     Args:
-        settings: state what is free.
-        name: of the camera in the table, or of one of its photographs or groups with separate values.
-        given: the table, None without.
+        settings: states the free parameters.
+        name: name of the camera in the table, or of its photograph or group with separate values.
+        given: the table, or None.
     """
     values = given.of(name) if given is not None else {}
     return {parameter: value for parameter, value in values.items() if parameter in settings.may_be_free}
 
 
 def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:
-    """Raise SurveyFileError if start values are of a camera that is not in the survey.
+    """Raise SurveyFileError if start values refer to a camera that is not in the survey.
 
-    Values of a photograph or group begin with the name of its camera.
+    The names of photographs or groups begin with the name of their camera.
+
+    Args:
+        settings: cameras of the survey.
+        given: start values of [approximate], or None.
     """
     for row, name in enumerate(given.camera if given is not None else ()):
         if given is not None and not base_name(name, (one.name for one in settings)):
@@ -187,7 +194,7 @@ def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCamer
 def _common_size(
     settings: CameraSettings, sizes: list[tuple[str, tuple[int, int]]]
 ) -> tuple[int, int] | None:
-    """Return the size of all photographs of one camera, None if nothing determines it."""
+    """Return the size of all photographs of one camera, px, None if nothing determines it."""
     size, source = settings.size_px, "size_px"
     for name, found in sizes:
         if size is None:
@@ -206,21 +213,22 @@ def split_cameras(
     estimate: Estimate,
     given: StartCameras | None = None,
 ) -> tuple[Network, Estimate]:
-    """Return the network and estimate with the interior orientations that the final adjustment has.
+    """Return the network and estimate with the interior orientations of the final adjustment.
 
     Args:
-        cameras: of the survey; they state which parameters are observed, of each photograph, or of each
-            group.
-        network: with one camera for each of the survey's, in their order.
-        estimate: of the same.
+        cameras: cameras of the survey; they state which parameters are observed, and which are per photograph
+            or per group.
+        network: has one camera for each camera of the survey, in the same order.
+        estimate: of this network.
         given: start values of single photographs or groups.
 
     Returns:
-        The same with a camera for each photograph or group where parameters vary between these; the others
-        it shares. Observed parameters are free, and their values are among the observations.
+        Network and estimate with a camera for each photograph or group whose parameters vary; other
+        parameters are shared. Observed parameters are free, and their values are among the observations.
 
     Raises:
-        SurveyFileError: a photograph is in no group, or in more than one.
+        SurveyFileError: a photograph is in no group or in several, or the correlations belong to no
+            covariance matrix.
     """
     if not any(camera.weighted or camera.per_photograph or camera.per_group for camera in cameras):
         return network, estimate
@@ -258,7 +266,11 @@ def split_cameras(
 def _correlation(
     observed: list[tuple[int, int, float, float]], rho: dict[tuple[int, int, int], float]
 ) -> FloatArray:
-    """Return the correlations of the observed parameters, by camera and index of both, (p, p).
+    """Return the correlation matrix of the observed parameters, (p, p).
+
+    Args:
+        observed: (camera, parameter, value, sigma) of p parameters.
+        rho: correlations by camera and both parameters.
 
     Raises:
         SurveyFileError: they belong to no covariance matrix.
@@ -276,9 +288,9 @@ def _correlation(
 
 
 def _started(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
-    """Return the camera of a photograph or group with the start values given for it.
+    """Return the camera of a photograph or group with its given start values.
 
-    A parameter that several cameras share starts from one value, that of the camera of the survey file.
+    A parameter that several cameras share starts from the value of the survey file's camera.
     """
     p = camera.parameters.copy()
     for name, value in free_start_values(settings, camera.name, given).items():
@@ -289,12 +301,12 @@ def _started(camera: Camera, settings: CameraSettings, given: StartCameras | Non
 
 
 def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) -> tuple[Network, Estimate]:
-    """Return the network and estimate without the cameras of single photographs that have left it.
+    """Return the network and estimate without the cameras of single photographs that were removed.
 
     Args:
-        network: as `split_cameras` returns it, or a part.
-        estimate: of the same.
-        count: of cameras of the survey; as many stay as they are.
+        network: result of `split_cameras`, or a part of it.
+        estimate: of this network.
+        count: number of cameras of the survey; with only so many cameras nothing is removed.
     """
     if len(estimate.cameras) == count:
         return network, estimate
@@ -321,13 +333,13 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) ->
 def refuse_ungrouped(
     cameras: Sequence[CameraSettings], images: Iterable[str], camera: Iterable[int], source: str
 ) -> None:
-    """Raise SurveyFileError if a photograph is in no group of its camera, or in more than one.
+    """Raise SurveyFileError if a photograph is in no group of its camera, or in several.
 
     Args:
-        cameras: of the survey.
+        cameras: cameras of the survey.
         images: names of the photographs.
-        camera: index of the camera of each of them.
-        source: what messages call the survey.
+        camera: camera index of each photograph.
+        source: name of the survey in error messages.
     """
     for image, a in zip(images, camera, strict=True):
         if cameras[a].groups:
@@ -337,8 +349,13 @@ def refuse_ungrouped(
 def group_of_image(settings: CameraSettings, image: str, source: str = "survey") -> int:
     """Return the index of the group that a photograph of a camera belongs to.
 
+    Args:
+        settings: states the groups.
+        image: name of the photograph.
+        source: name of the survey in error messages.
+
     Raises:
-        SurveyFileError: no group, or more than one.
+        SurveyFileError: the photograph is in no group or in several.
     """
     matches = [g for g, glob in enumerate(settings.groups) if fnmatch.fnmatchcase(image, glob)]
     if len(matches) != 1:
@@ -351,7 +368,7 @@ def group_of_image(settings: CameraSettings, image: str, source: str = "survey")
 
 
 def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tuple[list[Camera], IntArray]:
-    """Return a camera for each photograph or group whose parameters vary, and whose is whose."""
+    """Return a camera for each photograph or group with varying parameters, and each photograph's camera."""
     observed = [name for name, _ in settings.weighted]
     camera = replace(camera, free=camera.free | np.array([name in observed for name in camera.names]))
     grouped = [group_of_image(settings, image) if settings.groups else 0 for image in images]

@@ -1,13 +1,13 @@
-"""The equipment file (TOML), shared by many surveys: bars, scale crosses, frames and probes with calibration.
+"""The equipment file (TOML) of many surveys: calibrated bars, scale crosses, frames and probes.
 
 Lengths are corrected from the temperature of their calibration to that of the survey,
 
     l = l0 (1 + alpha (T - T0)),
 
-and what is not known of T and alpha is part of their standard deviations. An error that N placements have in
-common is taken with each of them as sqrt(N) times as large, so that it is what it is in the scale that they
-give together. Placements of one item have the error of its calibration in common, those of items of one
-expansion (a material) the error of the coefficient, and all of them that of T.
+and the uncertainty of T and alpha is part of their standard deviations. An error that N placements have in
+common is multiplied by sqrt(N) for each of them. The scale that they give together then has the correct
+error. Placements of one item share the error of its calibration. Items with the same expansion (a material)
+share the error of the coefficient. All placements share the error of T.
 
 Source: ISO 1 (reference temperature of 20 deg C); JCGM 100 (GUM), sec. 5.1 and annex H.1 (end gauges).
 """
@@ -43,20 +43,22 @@ from sfm.survey.inputs.settings import (
 )
 from sfm.survey.observation_tables import ObservationTable, observation_table
 
-FRAME = "rigid frame"  # the kind of observation that frames are
+FRAME = "rigid frame"  # kind of observation of frames
 PPM = 1e-6
-MIN_PPM = 1e-3  # smaller coefficients are those of nothing, but for 11.5e-6 in place of 11.5
+MIN_PPM = 1e-3  # no material has a smaller coefficient: the unit is wrong, as in 11.5e-6 for 11.5
 COORDINATES = ("X", "Y", "Z", "sX", "sY", "sZ")
 
 
 class CalibratedEquipment(Section):
-    """Data of a bar or a frame beside its lengths."""
+    """Data of a bar or a frame besides its lengths."""
 
-    name: Name  # by which surveys refer to it
-    calibrated: date  # day of its calibration, as on its certificate
-    temperature: Temperature = 20.0  # of its calibration, for which its lengths are stated, deg C
+    name: Name  # name used in surveys
+    calibrated: date  # date of its calibration, as on its certificate
+    temperature: Temperature = 20.0  # of its calibration, to which its lengths refer, deg C
     expansion: Annotated[float, Field(ge=-50, le=200)]  # coefficient, 1e-6 per K: steel 11.5
-    expansion_sigma: Annotated[float, Field(ge=0, le=50)] = 0.0  # standard deviation of it, 1e-6 per K
+    expansion_sigma: Annotated[float, Field(ge=0, le=50)] = (
+        0.0  # standard deviation of the expansion, 1e-6 per K
+    )
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
@@ -67,12 +69,12 @@ class CalibratedEquipment(Section):
         return self
 
     def factor(self, temperature: float) -> float:
-        """Return by what lengths are multiplied at a temperature, deg C."""
+        """Return the factor of lengths at a temperature, deg C."""
         return 1 + PPM * self.expansion * (temperature - self.temperature)
 
     @property
     def material(self) -> tuple[float, float]:
-        """Expansion and its standard deviation, which items of one material have in common."""
+        """Expansion and its standard deviation, which items of one material share."""
         return self.expansion, self.expansion_sigma
 
 
@@ -85,7 +87,7 @@ class Bar(CalibratedEquipment):
 
 
 class Frame(CalibratedEquipment):
-    """[[frame]]: targets that are rigid to one another, as of a bar of several, a scale cross or a probe."""
+    """[[frame]]: targets fixed to one another, on a bar with several targets, a scale cross or a probe."""
 
     file: Name  # point,X,Y,Z,sX,sY,sZ in a separate system, beside the equipment file
 
@@ -104,28 +106,29 @@ class Equipment:
 
     path: Path
     content: EquipmentFile
-    tables: dict[str, CsvTable]  # of frames, by their names
+    tables: dict[str, CsvTable]  # tables of the frames by their names
 
 
 @dataclass(frozen=True)
 class GivenEquipment:
-    """Observations of a survey by its equipment."""
+    """Observations of a survey from its equipment."""
 
     bars: tuple[ScaleBar, ...] = ()
     frames: tuple[ObservationTable, ...] = ()
-    placed: tuple[PlacedEquipment, ...] = ()  # what they are of
+    placed: tuple[PlacedEquipment, ...] = ()  # equipment of these observations
 
 
 def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
     """Read an equipment file and the tables that it names.
 
     Args:
-        path: of the file.
-        allow_outside: whether its tables may lie outside its folder.
+        path: path of the file.
+        allow_outside: whether its tables may be outside its folder.
 
     Raises:
-        SurveyFileError: unreadable, an unknown key, a wrong type or bound, a calibration in the future, a
-            name that comes twice, or a table that leaves its folder or cannot be read.
+        SurveyFileError: the file is unreadable, or it has an unknown key, a wrong type, a value out of
+            bounds, a calibration in the future, a duplicate name, or a table that is outside its folder or
+            unreadable.
     """
     from sfm.survey.inputs.survey_file import inside
 
@@ -155,19 +158,19 @@ def given_by(
     temperature: float | None,
     temperature_sigma: float,
 ) -> GivenEquipment:
-    """Return the scale bars and rigid frames of a survey by what equipment was photographed.
+    """Return the scale bars and rigid frames of a survey from its photographed equipment.
 
     Args:
-        equipment: the bars and frames that there are.
-        used: those of the survey, each as often as it was placed.
-        where: survey file, for messages.
-        unit: of the survey.
-        temperature: of the equipment in the survey, deg C.
+        equipment: the bars and frames of the equipment file.
+        used: equipment of the survey, each item as often as it was placed.
+        where: survey file, for error messages.
+        unit: object unit of the survey.
+        temperature: temperature of the equipment during the survey, deg C.
         temperature_sigma: its standard deviation, K.
 
     Raises:
-        SurveyFileError: no temperature, an unknown name, another number of points, or an item that comes
-            twice on the same points.
+        SurveyFileError: no temperature, an unknown name, a wrong number of points, or an item placed twice on
+            the same points.
     """
     used = tuple(used)
     if used and temperature is None:
@@ -221,7 +224,7 @@ def given_by(
 
 
 def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Names:
-    """Return what a survey calls the points of its equipment."""
+    """Return the names of the points of an item in the survey."""
     points = one.points or names
     if len(points) != count or len(set(points)) < count:
         raise SurveyFileError(
@@ -234,19 +237,14 @@ def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Nam
 def _frame(
     group: str, points: Names, table: CsvTable, factor: float, calibration: float, relative: float
 ) -> ObservationTable:
-    """Return a frame at its place, coordinates at the temperature of the survey.
+    """Return a frame at one placement, with coordinates at the temperature of the survey.
 
-    Args:
-        group: name of the frame at this place.
-        points: what the survey calls its points, (n,).
-        table: of the frame.
-        factor: by which coordinates are multiplied.
-        calibration: by which their standard deviations are.
-        relative: standard deviation of the factor over it.
+    Coordinates are multiplied by `factor`, which has the relative sigma `relative`; their sigmas by
+    `calibration`.
     """
     xyz, sigma = np.split(table.values, [3], axis=1)
     away: FloatArray = factor * np.abs(xyz - xyz.mean(axis=0))
-    common = relative * np.sqrt((away > 0).sum()) * away  # of one scale, as in the source of this module
+    common = relative * np.sqrt((away > 0).sum()) * away  # together they give the scale the correct error
     values = np.hstack([factor * xyz, np.hypot(calibration * sigma, common)])
     columns = dict(zip(COORDINATES, values.T, strict=True))
     return observation_table(

@@ -1,4 +1,7 @@
-"""Observed exterior orientation as a survey is given it: satellite positioning, a tracker, known stations."""
+"""Observed exterior orientation of a survey, by satellite positioning, a tracker or known stations.
+
+The same tables give the mounts of cameras on rigs.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from sfm.survey.inputs.given import (
 from sfm.survey.inputs.settings import RigSettings
 
 FULL_TURN = 360.0  # deg
-MIN_COS_PHI = 0.01  # nearer to phi = +-90 deg omega and kappa describe nearly the same
+MIN_COS_PHI = 0.01  # closer to phi = +-90 deg, omega and kappa describe nearly the same rotation
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class ObservedExterior:
     names: tuple[str, ...]  # photographs, (e,)
     value: FloatArray  # X0, Y0, Z0, omega, phi, kappa; NaN where not observed, (e, 6)
     sigma: FloatArray  # standard deviations, 0 = fixed, infinite where not observed, (e, 6)
-    table: CsvTable  # where they are, for messages
+    table: CsvTable  # their table, for error messages
 
     @classmethod
     def from_arrays(
@@ -56,14 +59,14 @@ class ObservedExterior:
         """Return observed exterior orientations from arrays.
 
         Args:
-            names: of the photographs, e different ones.
+            names: e unique names of the photographs.
             position: projection centres, object unit; NaN = not observed, (e, 3).
-            position_sigma: their standard deviations, 0 = fixed, (e, 3) or what can be broadcast to it.
+            position_sigma: their standard deviations, 0 = fixed, object unit, (e, 3) or broadcastable to it.
             angles_deg: omega, phi, kappa, degrees; NaN = not observed, (e, 3).
-            angles_sigma_deg: their standard deviations, 0 = fixed, degrees.
+            angles_sigma_deg: their standard deviations, 0 = fixed, degrees, (e, 3) or broadcastable to it.
 
         Raises:
-            SurveyFileError: as `read_observed_exterior`.
+            SurveyFileError: as in `read_observed_exterior`.
         """
         what, names_of_columns = "observed exterior", (*AXES, *ANGLES, *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
         given = [(position, 3), (angles_deg, 3), (position_sigma, 3), (angles_sigma_deg, 3)]
@@ -75,19 +78,20 @@ class ObservedExterior:
 
 
 def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior:
-    """Read observed exterior orientations; images.csv of a result is welcome.
+    """Read observed exterior orientations; images.csv of a result is accepted too.
 
     Columns are image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]. An
-    empty cell means not observed; no column of sigma, or a sigma of 0, means fixed.
+    empty cell means not observed. No column of sigma, or a sigma of 0, means fixed.
 
     Args:
-        path: the table.
-        of: what its first column names: photographs, or cameras, whose mounts these are.
+        path: path of the table.
+        of: name of its first column: "image" for photographs, or "camera" for mounts.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate image, a sigma that is
-            negative or alone or missing, one so small that its unit must be another, angles of
-            which only some are fixed, or that cannot be distinguished.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not finite, a
+            duplicate image, a sigma without a value or a value without a sigma, a sigma that is negative or
+            so small that its unit must be wrong, angles of which only some are fixed, or angles that cannot
+            be distinguished.
     """
     header = read_header(path)
     sigmas_of_axes = SIGMAS_OF_AXES if any(name in header for name in SIGMAS_OF_AXES) else ()
@@ -119,7 +123,7 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
 def _observed_exterior(
     table: CsvTable, value: FloatArray, sigma: FloatArray, of: str = "image"
 ) -> ObservedExterior:
-    """Return observed orientations, (e, 6) in degrees with NaN where not observed, as they are adjusted."""
+    """Return observed orientations from values and sigmas in degrees, NaN if not observed, (e, 6)."""
     sigma = np.where(np.isnan(sigma), np.inf, sigma)
     _refuse_impossible(table, value, sigma)
     names = table.texts[table.names.index("image")]
@@ -132,16 +136,16 @@ def _observed_exterior(
 def mount_observations(
     tables: Sequence[ObservedExterior], rigs: Sequence[RigSettings], cameras: Sequence[str]
 ) -> MountObservations:
-    """Return the mounts that the tables of rigs give.
+    """Return the mounts from the tables of rigs.
 
     Args:
-        tables: position and angles of cameras in the axes of their rigs.
-        rigs: of the survey.
-        cameras: names of all its cameras.
+        tables: positions and angles of cameras in the axes of their rigs.
+        rigs: rigs of the survey.
+        cameras: names of all cameras of the survey.
 
     Raises:
-        SurveyFileError: of a camera that is on no rig or the reference of one, not of all six values, or held
-            fixed in part.
+        SurveyFileError: a mount of a camera that is on no rig or the reference of a rig, or a mount with
+            missing values or only some values held fixed.
     """
     number = {name: a for a, name in enumerate(cameras)}
     mounted = {name for rig in rigs for name in rig.cameras[1:]}
@@ -183,7 +187,7 @@ def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: 
 
 
 def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) -> None:
-    """Refuse observed orientations (degrees) that no adjustment can take as they are."""
+    """Refuse observed orientations (degrees) that no adjustment can use."""
     columns = (*SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES)
     table.refuse(sigma, sigma < 0, columns, "0 (fixed) or more")
     known = value[np.isfinite(value[:, :3]).all(axis=1), :3]

@@ -1,4 +1,4 @@
-"""Data that a survey takes from the EXIF data of its photographs: projection centres, and moments of rigs."""
+"""Projection centres and moments of rigs from the EXIF data of a survey's photographs."""
 
 from __future__ import annotations
 
@@ -21,20 +21,19 @@ from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
-MAX_DISTANCE_M = (
-    100_000.0  # from the middle, of a photograph of the same object: farther than mountains are seen
-)
+# Largest distance of a photograph from the median position: mountains are not seen from farther away.
+MAX_DISTANCE_M = 100_000.0
 
 
 def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tuple[Remark, ...]]:
-    """Return the survey with positions in EXIF data as observed exterior orientation, where it asks for it.
+    """Return the survey with EXIF positions as observed exterior orientation, if it asks for them.
 
     Args:
-        survey: as it was, with no remark, without `exif_sigma_m`.
-        files: its photographs; those that cannot be read, or state no position, are not observed.
+        survey: states `exif_sigma_m`; otherwise it is returned unchanged, without remarks.
+        files: photographs of the survey; unreadable ones and those without a position are not observed.
 
     Raises:
-        SurveyFileError: no photograph states a position, or most positions are not of one place.
+        SurveyFileError: no photograph states a position, or no place has most of the positions.
     """
     if survey.exif_sigma_m is None:
         return survey, ()
@@ -43,7 +42,7 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
         try:
             position = read_metadata(path).position
         except PhotographError:
-            continue  # whoever measures in it names it
+            continue  # reported when it is measured
         if position is not None:
             positions[name] = position
     if not positions:
@@ -74,21 +73,22 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
 
 
 def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tuple[Remark, ...]]:
-    """Return the survey with the moments of rigs by the times in EXIF data, where rigs ask for it.
+    """Return the survey with the moments of rigs from EXIF times, for rigs that ask for them.
 
-    A moment begins with the first photograph that is later than the start of the one before by more than
-    the tolerance of the rig; it is named by its time. A clock that differs from that of the reference camera
-    is corrected by the offset at which most photographs have a partner.
+    A new moment begins with a photograph taken later than the start of the previous moment by more than the
+    tolerance of the rig. Its name is its time. A clock that differs from that of the reference camera is
+    corrected by the offset at which most photographs have a partner.
 
     Args:
-        survey: with rigs.
-        files: its photographs.
+        survey: has rigs.
+        files: photographs of the survey.
 
     Returns:
         The survey, and a remark on each clock that differs.
 
     Raises:
-        SurveyFileError: a photograph of such a rig states no time.
+        SurveyFileError: a photograph of such a rig states no time, or several offsets of a clock are
+            possible.
     """
     moments, remarks = dict(survey.moments), []
     for rig in survey.rigs:
@@ -118,7 +118,7 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
 
 
 def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[str, datetime]:
-    """Return when the photographs of a camera were taken, by its clock."""
+    """Return the times of the photographs of a camera by its clock, by name."""
     times: dict[str, datetime] = {}
     for name, path in zip(files.names, files.paths, strict=True):
         if not any(fnmatch.fnmatchcase(name, glob) for glob in camera.images or ()):
@@ -126,7 +126,7 @@ def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[st
         try:
             taken = read_metadata(path).taken
         except PhotographError:
-            continue  # whoever measures in it names it
+            continue  # reported when it is measured
         if taken is None:
             raise SurveyFileError(
                 f"{where}: moment = 'exif', and photograph '{name}' states no time in its EXIF data; "
@@ -137,10 +137,10 @@ def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[st
 
 
 def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> list[float]:
-    """Return by how much a clock may be ahead of that of the reference camera, s; 0 where it need not be.
+    """Return the possible offsets of a clock from that of the reference camera, s; 0 if that fits as well.
 
-    Most pairs of photographs agree at the right offset. Several mean that nothing shows which one is right,
-    as of photographs at regular intervals.
+    Most pairs of photographs agree at the correct offset. With photographs at regular intervals several
+    offsets are possible, and nothing shows which is correct.
     """
     if not reference or not times:
         return [0.0]
@@ -160,10 +160,10 @@ def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s:
 
 
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:
-    """Return the positions of photographs, by name, without those that are not of one survey with the others.
+    """Return the positions of photographs, by name, without those that are too far from the others.
 
-    Errors of less than MAX_DISTANCE_M are left to the tests of the adjustment. Where most are of no one
-    place, none is plausible.
+    The tests of the adjustment find errors smaller than MAX_DISTANCE_M. If no place has most of the
+    positions, none is plausible.
     """
     _, places = local_coordinates(tuple(positions.values()))
     distance = np.linalg.norm(places[:, :2] - np.median(places[:, :2], axis=0), axis=1)
@@ -174,7 +174,7 @@ def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str,
 
 
 def _farthest(positions: Mapping[str, SatellitePosition]) -> tuple[str, str]:
-    """Return the names of the first photograph and the one that is farthest from it."""
+    """Return the names of the first photograph and of the photograph farthest from it."""
     names, (_, places) = list(positions), local_coordinates(tuple(positions.values()))
     return names[0], names[int(np.linalg.norm(places[:, :2] - places[0, :2], axis=1).argmax())]
 
@@ -185,8 +185,8 @@ def observed_positions(
     """Return positions as observed exterior orientation in a local system: X east, Y north, Z up.
 
     Args:
-        positions: of photographs by name, at least one.
-        sigma_m: standard deviations in the plane and of the height, of those that state none, m.
+        positions: positions of at least one photograph, by name.
+        sigma_m: standard deviations in the plane and of the height, for photographs that state none, m.
         unit: object unit.
     """
     origin, places = local_coordinates(tuple(positions.values()))

@@ -1,8 +1,8 @@
-"""Input of a survey besides photographs: control, image points, sizes, start values.
+"""Input of a survey besides photographs: control, image points, diameters and start values.
 
-Each kind is a frozen dataclass that is made from a CSV file by its `read_...`, or from arrays by
-`from_arrays`; both refuse the same, with the line or row and the column. Rules of all tables are in
-`sfm.files.csv_tables`.
+Each kind is a frozen dataclass. A function `read_...` makes it from a CSV file, and `from_arrays` from
+arrays. Both refuse the same faults, and state the line or row and the column. `sfm.files.csv_tables` has the
+rules of all tables.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
 from sfm.reduced_network import CORRELATION_LIMIT, possible_covariances
 
-MIN_SIGMA = 1e-9  # in any unit used here less than an atom
+MIN_SIGMA = 1e-9  # less than an atom in any unit used here
 MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
-CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that only checks
+CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that is only a check
 COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
 SEEN_OF_POINTS = ("rays", "code", "angle_deg", "rms_px", "limiting_sX", "limiting_sY", "limiting_sZ")
@@ -41,16 +41,16 @@ class KnownPoints:
     """
 
     names: tuple[str, ...]  # (n,)
-    xyz: FloatArray  # object unit, NaN where a coordinate is not known, (n, 3)
-    sigma: FloatArray  # standard deviations, 0 = fixed, infinite = not known, object unit, (n, 3)
+    xyz: FloatArray  # object unit, NaN for an unknown coordinate, (n, 3)
+    sigma: FloatArray  # standard deviations, 0 = fixed, infinite = unknown, object unit, (n, 3)
     covariances: FloatArray | None = None  # of X and Y, X and Z, Y and Z, object unit^2, 0 if None, (n, 3)
-    check: BoolArray | None = None  # coordinates that take no part but check the result; none if None, (n, 3)
+    check: BoolArray | None = None  # coordinates that are not adjusted but check the result, (n, 3)
 
     def __post_init__(self) -> None:
-        """Refuse standard deviations and covariances that coordinates cannot have.
+        """Refuse impossible standard deviations and covariances.
 
         Raises:
-            SurveyFileError: with the name of the point.
+            SurveyFileError: the message states the name of the point.
         """
         good: BoolArray = np.asarray((self.sigma >= 0).all(axis=1))
         good[good] = possible_covariances(self.covariance[good])
@@ -63,7 +63,7 @@ class KnownPoints:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance matrices, object unit^2; variance 0 = fixed, infinite = not known, (n, 3, 3)."""
+        """Covariance matrices, object unit^2; variance 0 = fixed, infinite = unknown, (n, 3, 3)."""
         C = np.zeros((len(self.names), 3, 3))
         C[:, range(3), range(3)] = self.sigma**2
         if self.covariances is not None:
@@ -76,12 +76,12 @@ class KnownPoints:
         """Return points from arrays.
 
         Args:
-            names: of the points, n different ones.
+            names: n unique names of the points.
             xyz: coordinates, object unit, (n, 3).
-            sigma: standard deviations, 0 = fixed, object unit, (n, 3) or what can be broadcast to it.
+            sigma: standard deviations, 0 = fixed, object unit, (n, 3) or broadcastable to it.
 
         Raises:
-            SurveyFileError: as `read_control`.
+            SurveyFileError: as in `read_control`.
         """
         columns = columns_of("control", (*AXES, *SIGMAS_OF_AXES), len(names), (xyz, 3), (sigma, 3))
         return _known_points(array_table("control", {"id": names}, columns))
@@ -94,7 +94,7 @@ class StartOrientations:
     names: tuple[str, ...]  # photographs, (m,)
     position: FloatArray  # projection centres X0, object unit, (m, 3)
     rotation: FloatArray  # R, image to object axes, (m, 3, 3)
-    table: CsvTable  # where they are, for messages
+    table: CsvTable  # their table, for error messages
 
     @classmethod
     def from_arrays(
@@ -103,7 +103,7 @@ class StartOrientations:
         """Return start values from arrays.
 
         Args:
-            names: of the photographs, m different ones.
+            names: m unique names of the photographs.
             position: projection centres, object unit, (m, 3).
             angles_deg: omega, phi, kappa, degrees, (m, 3).
         """
@@ -115,10 +115,10 @@ class StartOrientations:
 class StartCameras:
     """Approximate values of interior orientation, as in cameras.csv of a result."""
 
-    camera: tuple[str, ...]  # camera of each row, or photograph or group of one with other values, (k,)
+    camera: tuple[str, ...]  # camera of each row, or its photograph or group with separate values, (k,)
     parameter: tuple[str, ...]  # (k,)
     value: FloatArray  # in the parameter's unit, (k,)
-    table: CsvTable  # where they are, for messages
+    table: CsvTable  # their table, for error messages
 
     def of(self, camera: str) -> dict[str, float]:
         """Return the values of one camera, by parameter."""
@@ -140,10 +140,9 @@ class Observations:
     image: tuple[str, ...]  # photograph of each row, (k,)
     point: tuple[str, ...]  # point of each row, (k,)
     xy: FloatArray  # px in the pixel frame or mm in the image frame, (k, 2)
-    sigma: FloatArray | None  # standard deviations in the same unit, NaN where there is none, None without
-    # any, (k, 2)
+    sigma: FloatArray | None  # standard deviations in the same unit, NaN if not given, (k, 2); or None
     unit: str  # px | mm
-    table: CsvTable  # where they are, for messages
+    table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
 
     @classmethod
@@ -159,15 +158,15 @@ class Observations:
         """Return measured image points from arrays.
 
         Args:
-            image: name of the photograph of each row, k of them.
+            image: name of the photograph of each of k rows.
             point: name of the point of each row.
             xy: positions, px in the pixel frame or mm in the image frame, (k, 2).
-            sigma: standard deviations in the same unit, (k, 2) or what can be broadcast to it; the survey's
-                sigma_px if not given.
+            sigma: standard deviations in the same unit, (k, 2) or broadcastable to it; the survey's sigma_px
+                if not given.
             unit: px or mm.
 
         Raises:
-            SurveyFileError: as `read_image_points`, or another unit.
+            SurveyFileError: as in `read_image_points`, or an unknown unit.
         """
         if unit not in ("px", "mm"):
             raise SurveyFileError(f"observations: unit '{unit}', expected px or mm")
@@ -183,7 +182,7 @@ class Diameters:
 
     names: tuple[str, ...]  # of the targets, (n,)
     diameter: FloatArray  # object unit, (n,)
-    source: str  # the table, for messages
+    source: str  # name of the table, for error messages
 
 
 @dataclass(frozen=True)
@@ -212,14 +211,14 @@ class ScaleBar:
 def read_control(path: Path) -> KnownPoints:
     """Read known object points: id,X,Y,Z[,sX,sY,sZ[,cXY,cXZ,cYZ][,checkX,checkY,checkZ]].
 
-    No sigma or 0 means fixed. Coordinates with 1 in checkX, checkY or checkZ take no part in the adjustment,
-    they check it. An empty cell among X, Y, Z is a coordinate that is not known, its sigma is not read.
-    cXY, cXZ and cYZ are covariances, empty or 0 where there are none.
+    No sigma, or a sigma of 0, means fixed. Coordinates with 1 in checkX, checkY or checkZ are not adjusted,
+    but check the result. An empty cell among X, Y, Z means an unknown coordinate, and its sigma is ignored.
+    cXY, cXZ and cYZ are covariances; empty or 0 means none.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number, a duplicate id, a negative sigma, or
-            one that is so small beside the coordinates that its unit must be another, covariances that are
-            larger than the sigmas allow.
+        SurveyFileError: the table is unreadable or has wrong columns, a cell is not a finite number, an id
+            occurs twice, a sigma is negative or so small that its unit must differ from that of the
+            coordinates, or a covariance is larger than the sigmas allow.
     """
     header = read_header(path)
     covariances = COVARIANCES if COVARIANCES[0] in header else ()
@@ -234,7 +233,7 @@ def read_control(path: Path) -> KnownPoints:
 
 
 def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
-    """Return the points of a table with or without sigmas, so many columns of covariances, and checks."""
+    """Return the points of a table that may have sigmas, `covariances` columns of covariances, and checks."""
     xyz, sigma, mixed, check = np.split(table.values, (3, 6, 6 + covariances), axis=1)
     if not sigma.size:
         sigma = np.zeros_like(xyz)
@@ -264,10 +263,10 @@ def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
 
 
 def _covariances(table: CsvTable, sigma: FloatArray, given: FloatArray) -> FloatArray | None:
-    """Return the covariances of control, 0 where empty; None without any.
+    """Return the covariances of control, 0 for empty cells; None without covariances.
 
     Raises:
-        SurveyFileError: of a coordinate that is fixed or not known, or as large as no covariance can be.
+        SurveyFileError: a covariance of a fixed or unknown coordinate, or an impossibly large one.
     """
     if not given.size:
         return None
@@ -288,7 +287,8 @@ def read_diameters(path: Path) -> Diameters:
     """Read the diameters of targets: id,diameter, object unit.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a positive number or a duplicate id.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not positive, or a
+            duplicate id.
     """
     table = read_table(path, ("id",), ("diameter",), aliases=(("point", "id"),))
     table.refuse(table.values, table.values < MIN_SIGMA, ("diameter",), "more than 0")
@@ -296,10 +296,11 @@ def read_diameters(path: Path) -> Diameters:
 
 
 def read_points(path: Path) -> KnownPoints:
-    """Read approximate object points: point,X,Y,Z; points.csv of a result is welcome.
+    """Read approximate object points: point,X,Y,Z; points.csv of a result is accepted too.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate point.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not finite, or a
+            duplicate point.
     """
     table = read_table(
         path,
@@ -312,17 +313,20 @@ def read_points(path: Path) -> KnownPoints:
 
 
 def read_exterior(path: Path) -> StartOrientations:
-    """Read exterior orientations: image,X,Y,Z,omega_deg,phi_deg,kappa_deg; images.csv of a result is welcome.
+    """Read exterior orientations: image,X,Y,Z,omega_deg,phi_deg,kappa_deg.
+
+    images.csv of a result is accepted too.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number or a duplicate image.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not finite, or a
+            duplicate image.
     """
     ignored = ("camera", *SIGMAS_OF_AXES, *SIGMAS_OF_ANGLES, "points", "rms_px", "coverage")
     return _start_orientations(read_table(path, ("image",), (*AXES, *ANGLES), ignored=ignored))
 
 
 def _start_orientations(table: CsvTable) -> StartOrientations:
-    """Return the orientations of a table in degrees."""
+    """Return the orientations of a table with angles in degrees."""
     rotation = [rotation_from_angles(*row) for row in np.radians(table.values[:, 3:])]
     return StartOrientations(
         table.keys("image"), table.values[:, :3], np.reshape(rotation, (-1, 3, 3)), table
@@ -330,10 +334,11 @@ def _start_orientations(table: CsvTable) -> StartOrientations:
 
 
 def read_start_cameras(path: Path) -> StartCameras:
-    """Read interior orientation: camera,parameter,value; cameras.csv of a result is welcome.
+    """Read interior orientation: camera,parameter,value; cameras.csv of a result is accepted too.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number, or one parameter of a camera twice.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not finite, or a
+            parameter of a camera twice.
     """
     table = read_table(path, ("camera", "parameter"), ("value",), ignored=("sigma", "unit"))
     camera, parameter = table.texts
@@ -344,14 +349,15 @@ def read_start_cameras(path: Path) -> StartCameras:
 def read_image_points(path: Path) -> Observations:
     """Read image points: image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]], or with mm in place of px.
 
-    Sigmas may be empty where none is known; cxy is the covariance of x and y, empty or 0 where there is none.
-    A point that is a duplicate in an image is left to `sfm.survey.inputs.start`.
+    Unknown sigmas may be empty. cxy is the covariance of x and y; empty or 0 means none.
+    `sfm.survey.inputs.start` treats points that occur twice in an image.
 
-    image_points.csv of a result is welcome; its residuals and rejections are passed over, everything is
-    taken as measured.
+    image_points.csv of a result is accepted too. Its residuals and rejections are ignored, and all its image
+    points are taken as measured.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, not a finite number, or a sigma that is not positive.
+        SurveyFileError: the table is unreadable or has wrong columns, a number that is not finite, or a sigma
+            that is not positive.
     """
     unit = "mm" if "x_mm" in read_header(path) else "px"
     sigmas: tuple[str, ...] = (f"sx_{unit}", f"sy_{unit}")
@@ -369,7 +375,7 @@ def read_image_points(path: Path) -> Observations:
 
 
 def _observations(table: CsvTable, unit: str) -> Observations:
-    """Return the image points of a table with or without sigmas."""
+    """Return the image points of a table that may have sigmas and covariances."""
     xy, sigma, covariance = np.split(table.values, (2, 4), axis=1)
     sigmas = (f"sx_{unit}", f"sy_{unit}")
     table.refuse(sigma, sigma < MIN_SIGMA, sigmas, f"more than 0, at least {MIN_SIGMA:g}")
@@ -395,10 +401,16 @@ def _observations(table: CsvTable, unit: str) -> Observations:
 def columns_of(
     what: str, names: tuple[str, ...], rows: int, *given: tuple[npt.ArrayLike, int]
 ) -> dict[str, FloatArray]:
-    """Return arrays, each with the number of its columns, as named columns of so many rows.
+    """Return arrays as named columns.
+
+    Args:
+        what: name of the table in error messages.
+        names: names of the columns.
+        rows: number of rows.
+        *given: (array, number of its columns), in the order of the names.
 
     Raises:
-        SurveyFileError: an array of another shape.
+        SurveyFileError: an array has another shape.
     """
     columns: list[FloatArray] = []
     for values, width in given:

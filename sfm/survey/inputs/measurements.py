@@ -29,20 +29,20 @@ from sfm.targets.detect import Targets
 if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
 
-MAX_PHOTOGRAPHS = 20_000  # a table of a byte for each pair takes 400 MB
+MAX_PHOTOGRAPHS = 20_000  # a table with one byte for each pair takes 400 MB
 
 
 @dataclass(frozen=True)
 class PhotographList:
     """The photographs of a survey in order of camera and name."""
 
-    names: tuple[str, ...]  # file names, by which tables and reports know them, (m,)
+    names: tuple[str, ...]  # file names relative to the folder, used in tables and reports, (m,)
     paths: tuple[Path, ...]  # (m,)
     camera: IntArray  # index of the camera, (m,)
-    folder: Path  # that the names are relative to
+    folder: Path  # base folder of the names
 
     def by_camera(self) -> tuple[tuple[str, ...], ...]:
-        """Return the names of the photographs of each camera that has some."""
+        """Return the names of the photographs of each camera that has any."""
         return tuple(
             tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == one)
             for one in np.unique(self.camera)
@@ -59,13 +59,13 @@ class MeasuredPhotographs:
     names: tuple[str, ...]  # (m,)
     paths: tuple[Path, ...]  # (m,)
     camera: IntArray  # index into cameras, (m,)
-    cameras: tuple[Camera, ...]  # with start values of the interior orientation
+    cameras: tuple[Camera, ...]  # they have start values of the interior orientation
     targets: tuple[Targets, ...]  # (m,)
     failed: tuple[FailedImage, ...]  # photographs that could not be read
-    stored: tuple[bool, ...] = ()  # whether the targets were measured in an earlier run, (m,) or none
+    stored: tuple[bool, ...] = ()  # whether the targets were measured in an earlier run, (m,) or empty
 
     def overlays(self) -> tuple[PhotographTargets, ...]:
-        """Return what the report draws into each photograph."""
+        """Return the overlay of each photograph in the report."""
         return tuple(
             PhotographTargets(
                 name,
@@ -93,15 +93,15 @@ class MeasuredPhotographs:
 
 @dataclass(frozen=True)
 class Naming:
-    """Which object point every measured target is."""
+    """The object point of every measured target."""
 
     names: tuple[str, ...]  # of the object points: code number, tag and corner, or u and a number, (n,)
     code: IntArray  # code number of each point, of a corner as in TagCorners, -1 = uncoded, (n,)
-    point: tuple[IntArray, ...]  # of each photograph, the point of each target or UNNAMED, (k_i,)
+    point: tuple[IntArray, ...]  # for each photograph, the point of each target or UNNAMED, (k_i,)
     corners: bool = False  # whether the coded points are corners of tags
 
     def codes(self, network: Network) -> IntArray:
-        """Return the code number or the tag of each point of a network, -1 where uncoded, (n,)."""
+        """Return the code number or tag of each point of a network, -1 if uncoded, (n,)."""
         per_code = len(CORNERS) if self.corners else 1
         code = dict(zip(self.names, self.code // per_code, strict=True))
         return np.array([code[name] for name in network.points], dtype=np.int64)
@@ -109,32 +109,33 @@ class Naming:
 
 @dataclass(frozen=True)
 class Measurements:
-    """The image points of a survey that have a name, and what they come from."""
+    """The named image points of a survey, and their sources."""
 
     network: Network  # image points with their covariance; control and scale bars among the points
-    cameras: tuple[Camera, ...]  # with start values of the interior orientation
-    images: tuple[str, ...]  # all photographs of the survey, also those that could not be read
+    cameras: tuple[Camera, ...]  # they have start values of the interior orientation
+    images: tuple[str, ...]  # all photographs of the survey, including unreadable ones
     min_rays: IntArray  # photographs that each point needs, (n,)
     failed: tuple[FailedImage, ...] = ()  # photographs that could not be read
-    overlays: tuple[PhotographTargets, ...] = ()  # what the report draws into each photograph
+    overlays: tuple[PhotographTargets, ...] = ()  # drawn into each photograph of the report
     files: PhotographList | None = None  # None with observations
-    photographs: MeasuredPhotographs | None = None  # with all targets, uncoded ones too; None without targets
+    photographs: MeasuredPhotographs | None = None  # with all targets, coded or not; None without targets
     naming: Naming | None = None  # of these targets
-    remarks: tuple[Remark, ...] = ()  # on what was given and measured
+    remarks: tuple[Remark, ...] = ()  # on the given and measured values
     left_out: tuple[LeftOutPoint, ...] = ()  # image points that contradict one another
 
 
 def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:
-    """Return the photographs that the globs of the cameras name.
+    """Return the photographs that match the globs of the cameras.
 
     Args:
         survey: a survey with photographs, or its file.
-        images_dir: folder of the photographs in place of that of the survey; photographs in a folder that the
-            user names may be links to files in the user's home folder.
+        images_dir: folder of the photographs in place of the survey's folder. Photographs in this folder may
+            be links to files in the user's home folder.
 
     Raises:
-        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, of no
-            group where its camera has groups, or with a name with control or invisible characters.
+        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, a
+            photograph in no group although its camera has groups, or a name with control or invisible
+            characters.
     """
     folder = Path(images_dir) if images_dir is not None else survey.folder
     if not folder.is_dir():
@@ -189,7 +190,12 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
 
 
 def refuse_many(where: str, images: Sequence[str]) -> None:
-    """Raise SurveyFileError if there are more photographs than one adjustment has room for."""
+    """Raise SurveyFileError if there are more photographs than one adjustment can take.
+
+    Args:
+        where: name of the survey or table in the error message.
+        images: names of the photographs.
+    """
     if len(images) > MAX_PHOTOGRAPHS:
         raise SurveyFileError(
             f"{where}: {counted(len(images), 'photograph')}, at most {MAX_PHOTOGRAPHS} are adjusted together"
@@ -197,7 +203,7 @@ def refuse_many(where: str, images: Sequence[str]) -> None:
 
 
 def _describe_files(folder: Path) -> str:
-    """Return in a few words which files a folder contains."""
+    """Return a short description of the files in a folder."""
     files = sorted(path.name for path in folder.iterdir() if path.is_file())
     if not files:
         return "which has no files (--images names another folder)"
@@ -207,12 +213,12 @@ def _describe_files(folder: Path) -> str:
 def refuse_incomplete_cameras(
     settings: Sequence[CameraSettings], source: str, photographs: PhotographList
 ) -> None:
-    """Raise SurveyFileError if the pixel size or principal distance of cameras is not known from anywhere.
+    """Raise SurveyFileError if nothing gives the pixel size or principal distance of a camera.
 
     Args:
-        settings: of the cameras in the survey.
-        source: what messages call the survey.
-        photographs: whose EXIF data may give the rest.
+        settings: cameras of the survey.
+        source: name of the survey in error messages.
+        photographs: their EXIF data may give missing values.
     """
     lines = []
     for number, one in enumerate(settings):
@@ -231,7 +237,7 @@ def refuse_incomplete_cameras(
 
 
 def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
-    """Return (what to write, where EXIF data have it) of what a camera does not state."""
+    """Return (key of the survey file, attribute of `Metadata`) of values that a camera does not state."""
     said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
     wanted = []
     if one.pixel_mm is None and one.sensor_mm is None:
@@ -242,7 +248,7 @@ def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
 
 
 def _readable(paths: Sequence[Path]) -> list[Metadata]:
-    """Return the metadata of the photographs that have some; the others are reported where they are read."""
+    """Return the metadata of the readable photographs; the others are reported when they are read."""
     found = []
     for path in paths:
         with suppress(PhotographError, OSError):

@@ -1,4 +1,7 @@
-"""The sections of the survey file: keys, types and bounds, and errors in one line each."""
+"""The sections of the survey file: their keys, types and bounds, and one-line error messages.
+
+The comment on each key is its description in the reference of the survey file.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,8 @@ from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
 from sfm.observations import TABLES
 
 MAX_SHOWN = 60  # characters of a key
-MAX_TOLD = 10  # keys that one line names
-FEW = 3  # values of a list that has a fixed number of them
+MAX_LISTED = 10  # keys listed in one message
+FEW = 3  # a list of at most so many values has a fixed length
 _NEEDED = (
     ("string_type", "a text in quotes"),
     ("float_type", "a number"),
@@ -30,12 +33,12 @@ _NEEDED = (
 
 
 def _pairs(value: Any) -> Any:
-    """Turn a TOML table into (key, value) pairs, so that no dictionary goes beyond this module."""
+    """Turn a TOML table into (key, value) pairs, so that no dictionary leaves this module."""
     return tuple(value.items()) if isinstance(value, dict) else value
 
 
 def _listed(value: Any) -> Any:
-    """Turn one text into a list of one."""
+    """Turn a single text into a list."""
     return (value,) if isinstance(value, str) else value
 
 
@@ -48,7 +51,8 @@ def _plain(value: str) -> str:
     return value
 
 
-# Beyond these no length, sigma or parameter makes sense in any unit, and their squares or inverses overflow.
+# Lengths, sigmas and parameters beyond these bounds make no sense in any unit: their squares or inverses
+# overflow.
 SMALLEST, LARGEST = 1e-9, 1e12
 MIN_SIGMA = 1e-30  # of a distortion parameter, mm^-8
 MAX_SIDE_PX = 1_000_000
@@ -56,10 +60,10 @@ MAX_CORRELATIONS = 200  # of the parameters of one camera
 MAX_CAMERAS, MAX_GROUPS = 1000, 1000  # each is tried on every photograph
 MAX_TABLES = 100  # of survey observations
 MAX_RIGS, MAX_PATTERN = 100, 200  # rigs, and characters of the expression that finds a moment
-# parameters that are adjusted where a survey states nothing, as far as its photographs determine them
+# Parameters that are adjusted if a survey states none, as far as its photographs determine them.
 FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "k2", "k")
 MAX_GLOBS = 1000  # of the photographs of all cameras
-MAX_LENGTH_PER_SIGMA = 1e6  # no scale bar is calibrated to better than a millionth of its length
+MAX_LENGTH_PER_SIGMA = 1e6  # no calibration of a scale bar is better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 Temperature = Annotated[float, Field(ge=-100, le=200)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
@@ -108,31 +112,31 @@ class Section(BaseModel):
 
 
 class Head(Section):
-    """[survey]: what the survey is called."""
+    """[survey]: name and unit of the survey, and its equipment."""
 
     name: Name  # of the survey, in the report and its file names
     unit: Unit  # of the object coordinates
-    equipment: Name | None = None  # a file of bars and frames that [[equipment]] refers to
-    temperature: Temperature | None = None  # of this equipment during the survey, deg C
+    equipment: Name | None = None  # equipment file with the bars and frames of [[equipment]]
+    temperature: Temperature | None = None  # of the equipment during the survey, deg C
     temperature_sigma: Length = 1.0  # standard deviation of temperature, K
 
 
 class CameraSettings(Section):
-    """[[camera]]: one camera, its photographs and what is known of its interior orientation."""
+    """[[camera]]: one camera, its photographs and its interior orientation."""
 
-    name: Name  # what people call the camera; unique in the survey
-    images: Globs | None = None  # of its photographs; may be left out with [observations] and one camera
-    size_px: TwoCounts | None = None  # else from the photographs, px
+    name: Name  # name of the camera; unique in the survey
+    images: Globs | None = None  # globs of its photographs; optional with [observations] and one camera
+    size_px: TwoCounts | None = None  # width and height of its photographs, else read from them, px
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
-    # distortion model: corrections of the measured point, or distortion of the ideal one
+    # distortion model: it corrects the measured point, or distorts the ideal point
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
-    free: Names = ()  # parameters to be adjusted; [] = a calibrated camera; not given: the photographs decide
-    fixed: Values = ()  # what is not free, in the model's units; else 0
-    start: Values = ()  # values that free ones start from, in the model's units; else 0
+    free: Names = ()  # free parameters; [] for a calibrated camera; if missing, the photographs decide
+    fixed: Values = ()  # values of parameters that are not free, in the model's units; else 0
+    start: Values = ()  # start values of free parameters, in the model's units; else 0
     balanced: Values = ()  # values in AICON's form with R0, in place of fixed and start
-    weighted: Observed = ()  # adjusted, with value and standard deviation as an observation
+    weighted: Observed = ()  # parameters adjusted as observations, with value and standard deviation
     correlations: Correlations = ()  # of weighted parameters; 0 if not given
     calibration: Name | None = None  # folder of an earlier result, relative to the survey file
     calibration_use: Literal["fixed", "weighted"] = "fixed"  # held, or an observation with its covariance
@@ -142,12 +146,12 @@ class CameraSettings(Section):
 
     @property
     def adjusted(self) -> tuple[str, ...]:
-        """Parameters that are adjusted, with or without an observation of them."""
+        """Parameters that are adjusted, observed or not."""
         return (*self.free, *(name for name, _ in self.weighted))
 
     @property
     def states_free(self) -> bool:
-        """Whether `free` is there, empty or not, or a calibration; else the photographs decide."""
+        """Whether the survey states the free parameters, perhaps none; else the photographs decide."""
         varying = self.per_photograph or self.per_group
         return bool(
             "free" in self.model_fields_set or self.fixed or self.balanced or self.weighted or varying
@@ -155,91 +159,95 @@ class CameraSettings(Section):
 
     @property
     def states_model(self) -> bool:
-        """Whether `model` is there, or parameters that are those of one; else the photographs decide."""
+        """Whether the survey states the model, or parameters of a model; else the photographs decide."""
         return bool("model" in self.model_fields_set or self.states_free or self.start or self.calibration)
 
     @property
     def may_be_free(self) -> tuple[str, ...]:
-        """Parameters that are adjusted without an observation, or may be where nothing is stated."""
+        """Parameters that are adjusted without an observation, or may be if the survey states none."""
         if self.states_free:
             return self.free
         return tuple(name for name in MODELS[self.model].names if name in FREED_FIRST)
 
 
 class PlateSettings(Section):
-    """[[plate]]: another calibration plate, fixed to that of [targets]; its points are numbered on."""
+    """[[plate]]: another calibration plate, fixed to the plate of [targets]; its points follow in number."""
 
-    codes: Name  # a plate or board of another kind or with other tags than that of [targets]
-    rows: PlateSide | None = None  # of the dots of a plate, or of the crossings inside a board
-    columns: PlateSide | None = None  # of the same
+    codes: Name  # a plate or board of another kind, or with other tags, than the plate of [targets]
+    rows: PlateSide | None = None  # rows of dots of a plate, or of crossings inside a board
+    columns: PlateSide | None = None  # columns of dots of a plate, or of crossings inside a board
     pitch: Length | None = None  # distance of neighbouring dots or crossings, object unit
     marks: Marks = ()  # [row, column], from 0, of the dots that are larger or rings
-    plate_sigma: Length | None = None  # standard deviation of its coordinates, true without, object unit
+    plate_sigma: Length | None = None  # standard deviation of its coordinates, else exact, object unit
     dictionary: Name | None = None  # tags of a ChArUco board or AprilGrid, whose side is tag_size
     tag_size: Length | None = None  # side of the black square of all tags, object unit
-    first_tag: TagNumber = 0  # of the first of these
+    first_tag: TagNumber = 0  # number of the first tag of the board
 
 
 class TargetSettings(PlateSettings):
-    """[targets]: what circular targets look like in the photographs, and the plate that they are on."""
+    """[targets]: appearance and codes of the targets in the photographs, and the plate that they are on."""
 
-    polarity: Literal["dark", "bright", "auto"] = "auto"  # targets darker or brighter than what is around
-    channel: Literal["luminance", "red", "green", "blue"] = "luminance"  # of colour photographs
-    tone: Literal["linear", "srgb"] = "linear"  # tone curve of the photographs, taken back before measuring
-    codes: Name = "none"  # a code family, or a table file relative to the survey file
-    ring_radii: TwoLengths | None = (
-        None  # of the ring, inner and outer, in those of the dot; else the family's
+    polarity: Literal["dark", "bright", "auto"] = "auto"  # targets darker or brighter than their surroundings
+    channel: Literal["luminance", "red", "green", "blue"] = (
+        "luminance"  # measured channel of colour photographs
     )
-    min_diameter_px: Length = 6.0  # of the smallest target that is measured, px
-    eccentricity: bool = True  # whether to correct it
-    diameter: Length | None = None  # of all targets, object unit; else of each from its ellipses
-    diameters: Name | None = None  # a table id,diameter of single targets, before the one of all
+    tone: Literal["linear", "srgb"] = "linear"  # tone curve of the photographs, inverted before measuring
+    codes: Name = "none"  # a code family, or a table file relative to the survey file
+    # inner and outer radius of the ring, in radii of the dot; else those of the code family
+    ring_radii: TwoLengths | None = None
+    min_diameter_px: Length = 6.0  # diameter of the smallest target to measure, px
+    eccentricity: bool = True  # whether to correct the eccentricity of the ellipses
+    diameter: Length | None = None  # of all targets, object unit; else from the ellipses of each target
+    diameters: Name | None = None  # a table id,diameter of single targets, which replaces diameter
     tag_sigma: Length | None = None  # standard deviation of tag_size, common to all tags, object unit
-    pitch_assumed: bool = False  # whether the pitch was not measured
+    pitch_assumed: bool = False  # whether the pitch is assumed and not measured
 
 
 class TiePointSettings(Section):
     """[tie_points]: natural texture in place of targets."""
 
-    detector: Literal["foerstner", "sift"] = "foerstner"  # what finds the interest points
+    detector: Literal["foerstner", "sift"] = "foerstner"  # detector of the interest points
     window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
-    max_features: Annotated[int, Field(ge=100, le=20_000)] = 2000  # of each photograph, spread over it
-    max_points: Annotated[int, Field(ge=100, le=100_000)] = 6000  # of each photograph, over its texture
+    max_features: Annotated[int, Field(ge=100, le=20_000)] = 2000  # in each photograph, spread over it
+    max_points: Annotated[int, Field(ge=100, le=100_000)] = (
+        6000  # in each photograph, spread over its texture
+    )
 
 
 class DatumSettings(Section):
-    """[datum]: what position, orientation and scale of the result rest on."""
+    """[datum]: definition of position, orientation and scale of the result."""
 
-    kind: Literal["free", "minimal", "control"] = (
-        "free"  # inner constraints, seven held coordinates, or control
-    )
+    # inner constraints, seven held coordinates, or control
+    kind: Literal["free", "minimal", "control"] = "free"
     points: Names = ()  # object points that carry a free or minimal datum; all if none are named
 
 
 class RigSettings(Section):
     """[[rig]]: cameras mounted on one frame, whose photographs of one moment move together."""
 
-    name: Name  # what people call the rig; unique in the survey
+    name: Name  # name of the rig; unique in the survey
     cameras: Names  # names of its cameras; the first is the reference
-    # "order": the photographs of each camera in the order of their names; "exif": by the times in their EXIF
-    # data; a table image,moment (.csv); else a regular expression with one group, which is the moment,
-    # searched for in the names of photographs
+    # "order": photographs of each camera in the order of their names; "exif": by the times in their EXIF
+    # data; a
+    # table image,moment (.csv); else a regular expression with one group, which finds the moment in the names
+    # of
+    # photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
-    # globs of the photographs of blocks of time, between which mounts changed and the cameras did not
+    # globs of the photographs of blocks of time, between which the mounts changed but not the cameras
     blocks: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()
-    tolerance_s: Annotated[float, Field(ge=0, le=86_400)] = 1.0  # between times of one moment, s
+    tolerance_s: Annotated[float, Field(ge=0, le=86_400)] = 1.0  # difference of EXIF times of one moment, s
     # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
     # the reference camera; sigma 0 = held fixed
     mounts: Name | None = None
 
     @property
     def named(self) -> bool:
-        """Whether photographs are listed with their moments, by a table or EXIF data."""
+        """Whether a table or EXIF data list the photographs with their moments."""
         return self.moment == "exif" or self.table is not None
 
     @property
     def table(self) -> str | None:
-        """The table that names the moments, if one does."""
+        """The table that names the moments, or None."""
         return self.moment if self.moment.endswith(".csv") and "(" not in self.moment else None
 
 
@@ -250,12 +258,12 @@ class ControlSettings(Section):
 
 
 class ExteriorSettings(Section):
-    """[exterior]: observed exterior orientation, as by satellite positioning, a tracker or known stations."""
+    """[exterior]: exterior orientation observed by satellite positioning, a tracker or known stations."""
 
     # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
     file: Name | None = None
-    # in place of file, positions in EXIF data, with their standard deviations in the plane and of the height
-    exif_sigma_m: TwoLengths | None = None  # where a photograph states none, m
+    # in place of file: standard deviations of positions in EXIF data, in the plane and of the height
+    exif_sigma_m: TwoLengths | None = None  # for photographs that state none, m
 
 
 class ScaleBarSettings(Section):
@@ -270,8 +278,8 @@ class ScaleBarSettings(Section):
 class EquipmentSettings(Section):
     """[[equipment]]: a bar or frame of the equipment file, once for each place where it was photographed."""
 
-    name: Name  # in the equipment file
-    points: Names = ()  # its points as the survey names them, in the order there; left out: as there
+    name: Name  # its name in the equipment file
+    points: Names = ()  # its points in this survey, in the order of the equipment file; else named as there
 
 
 class ObservationSettings(Section):
@@ -281,9 +289,9 @@ class ObservationSettings(Section):
 
 
 class ObservationTableSettings(Section):
-    """[[survey_observations]]: a table of observations beside photographs, as of tape, level or GNSS."""
+    """[[survey_observations]]: a table of observations beside photographs, such as tape, level or GNSS."""
 
-    # distance, height difference, plane, ...: docs/how-to/scale-and-control.md lists them with their columns
+    # distance, height difference, plane, ...: see docs/how-to/scale-and-control.md for kinds and columns
     kind: Literal[tuple(TABLES)]  # type: ignore[valid-type]
     file: Name  # a table with the columns of its kind
 
@@ -305,26 +313,22 @@ class AdjustSettings(Section):
 
 
 class CompareSettings(Section):
-    """[compare]: the other adjuster on the survey's network, the other pipeline on its photographs."""
+    """[compare]: comparison with another adjuster and another pipeline."""
 
-    backend: Literal["colmap", "none"] = (
-        "colmap"  # adjuster that the same image points are given to, where it is installed
-    )
-    baseline: Literal["mapper", "none"] = (
-        "none"  # pipeline that the same photographs are given to: COLMAP's mapper
-    )
+    backend: Literal["colmap", "none"] = "colmap"  # other adjuster of the same image points, if installed
+    baseline: Literal["mapper", "none"] = "none"  # other pipeline for the same photographs: COLMAP's mapper
 
 
 def first_error(path: Path | str, text: str, error: ValidationError, whole: type[Section]) -> str:
-    """Return the first error of pydantic as one line with file, line, key, found and needed.
+    """Return the first error of pydantic as one line with file, line, key, found and needed value.
 
-    Unknown keys come first: a misspelt key is unknown, and missing under its right name.
+    Unknown keys come first: a misspelt key is unknown, and missing under its correct name.
 
     Args:
-        path: the survey file, or what else messages begin with.
-        text: its content; empty for settings from Python.
-        error: what pydantic found.
-        whole: the file as a section, for the keys that it may have.
+        path: the survey file, or another beginning of the message.
+        text: content of the file; empty for settings from Python.
+        error: the error of pydantic.
+        whole: the section of the whole file, which declares the known keys.
     """
     errors = error.errors(include_url=False)
     first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
@@ -343,7 +347,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         return f"{where}{_key(location[:-1])}: found {found}, needed {counted(location[-1] + 1, 'value')}"
     if kind == "missing":
         every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
-        return f"{where}{listed(every, most=MAX_TOLD)} {'is' if len(every) == 1 else 'are'} missing"
+        return f"{where}{listed(every, most=MAX_LISTED)} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
     needed = dict(_NEEDED).get(kind)
@@ -368,13 +372,13 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
 
 
 def _found(value: Any) -> str:
-    """Show a value as it is in a TOML file, shortened."""
+    """Return a value as written in a TOML file, shortened."""
     shown = str(value).lower() if isinstance(value, bool) else repr(value)
     return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
 def _key(location: tuple[str | int, ...]) -> str:
-    """Write a location as a person would: camera 2 pixel_mm, value 1."""
+    """Return a location for people, such as "camera 2.pixel_mm 1"."""
     words: list[str] = []
     for part in location:
         if isinstance(part, int):
@@ -394,21 +398,21 @@ def _known(location: tuple[str | int, ...], whole: type[Section]) -> str:
 
 
 def _section_in(annotation: Any) -> type[Section] | None:
-    """Return the section that the type of a field is, or is a list of."""
+    """Return the section in the type of a field, alone or in a list, or None."""
     if isinstance(annotation, type) and issubclass(annotation, Section):
         return annotation
     return next(filter(None, (_section_in(part) for part in get_args(annotation))), None)
 
 
 def _line_of(text: str, location: tuple[str | int, ...]) -> int | None:
-    """Return the line of the survey file on which the key of a location is, None if not found."""
+    """Return the line number of a location's key in the survey file, or None."""
     keys = [str(part) for part in location if isinstance(part, str)]
-    # An index behind the table is that of a table in double brackets, a later one counts values of a key.
+    # An index after the table counts tables in double brackets; a later index counts values of a key.
     number = location[1] if len(location) > 1 and isinstance(location[1], int) else 0
     count: dict[str, int] = {}
     table, last = "", None
     for k, line in enumerate(text.splitlines(), 1):
-        header = re.match(r"\s*\[\[?([\w.\- \t]+)\]", line)  # without two parts that may share blanks
+        header = re.match(r"\s*\[\[?([\w.\- \t]+)\]", line)  # not two parts that can match the same blanks
         if header:
             table = header[1].strip()
             count[table] = count.get(table, -1) + 1

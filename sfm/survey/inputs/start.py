@@ -1,11 +1,11 @@
-"""The network that a survey starts from: what is given of points, photographs and cameras.
+"""The network that a survey starts from: given image points, points, photographs and cameras.
 
-Image points outside their photograph: no photograph has them, so that a setting or a value is wrong.
+Image points outside their photograph mean that a value or a setting is wrong. A few are gross errors and are
+left out. If there are more, the survey is refused, and the message states what would bring them inside: x and
+y exchanged, another unit, or a larger photograph.
 
-Single ones are gross errors and are left out by name. More of them refuse the survey, with what would bring
-them inside: x and y exchanged, another unit, or a larger photograph.
-
-An image point that is more than once in a table is one point measured twice in one photograph.
+If a table has an image point more than once, it was measured several times in one photograph. Agreeing
+measurements are averaged, and contradicting ones are left out.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import with_tables
 from sfm.survey.rigs import with_moments
 
-ALPHA = 0.001  # probability with which measurements that agree are taken for contradicting ones
-MARGIN_PX = 1.0  # that programs which count pixels from 1 or from corners differ by
-MAX_OUTSIDE = 0.05  # of the image points: as many gross errors as measuring ever makes
+ALPHA = 0.001  # probability of taking agreeing measurements as contradicting
+MARGIN_PX = 1.0  # difference to programs that count pixels from 1 or from corners
+MAX_OUTSIDE = 0.05  # of the image points; measuring never makes more gross errors
 MIN_RAYS = 2  # photographs that a point with a name needs
 
 
 def measurements_from_observations(survey: Survey) -> Measurements:
     """Return the network of a survey that gives image points in place of photographs.
 
-    Photographs and points are counted in the order in which the observations name them first. The control
-    is part of the network in every datum; the adjustment uses it only where the datum is `control`.
+    Photographs and points are numbered in the order in which the observations first name them. The control is
+    part of the network in every datum. The adjustment uses it only if the datum is `control`.
 
     Args:
         survey: a survey with observations.
 
     Raises:
-        SurveyFileError: there are none, image points are outside of their photographs, or the cameras'
-            start values are incomplete.
+        SurveyFileError: there are no observations, image points are outside their photographs, or the start
+            values of a camera are incomplete.
     """
     given = survey.observations
     if given is None:
@@ -104,11 +104,11 @@ def measurements_from_observations(survey: Survey) -> Measurements:
 
 
 def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
-    """Raise SurveyFileError if given orientations or cameras are none of the survey's.
+    """Raise SurveyFileError if given orientations or start values are of unknown photographs or cameras.
 
     Args:
-        survey: with observed and approximate exterior orientations, or none.
-        images: all photographs of the survey, also those that cannot be read.
+        survey: may give observed and approximate exterior orientations, and start values of cameras.
+        images: all photographs of the survey, including unreadable ones.
     """
     refuse_unknown_cameras(survey.cameras, survey.start_cameras)
     known = set(images)
@@ -122,12 +122,12 @@ def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
 
 
 def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) -> Estimate:
-    """Return start values from [approximate] and the control; NaN for what is not given.
+    """Return start values from [approximate] and the control, NaN where none is given.
 
     Args:
-        survey: gives them, and states whether the control is the datum.
-        network: photographs and points that get their values by name.
-        cameras: with their start values.
+        survey: gives the values, and states whether the control is the datum.
+        network: its photographs and points get their values by name.
+        cameras: cameras with their start values.
     """
     found = given_values(survey, network, cameras)
     if survey.datum.kind == "control":
@@ -137,12 +137,12 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
 
 
 def given_values(survey: Survey, network: Network, cameras: tuple[Camera, ...] = ()) -> Estimate:
-    """Return the values of [approximate] for photographs and points; NaN for all others.
+    """Return the values of [approximate] for photographs and points, NaN for all others.
 
     Args:
-        survey: gives them.
-        network: photographs and points that get their values by name.
-        cameras: with their start values.
+        survey: gives the values.
+        network: its photographs and points get their values by name.
+        cameras: cameras with their start values.
     """
     m, n = len(network.images), len(network.points)
     position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
@@ -163,7 +163,7 @@ def given_values(survey: Survey, network: Network, cameras: tuple[Camera, ...] =
 
 
 def _numbered(names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:
-    """Return the different names in order of first appearance and the number of each entry."""
+    """Return the unique names in order of first appearance, and the index of each entry."""
     number: dict[str, int] = {}
     index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
     return tuple(number), index
@@ -172,7 +172,7 @@ def _numbered(names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:
 def _in_pixels(
     given: Observations, cameras: tuple[Camera, ...], camera: IntArray, sigma_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return positions (k, 2) in px and their covariance (k, 2, 2) in px^2 of rows in px or mm."""
+    """Return positions, px, (k, 2), and their covariance, px^2, (k, 2, 2), of rows in px or mm."""
     xy, sigma = given.xy, given.sigma
     between = np.zeros(len(xy)) if given.covariance is None else given.covariance.copy()
     xy_px = xy.copy()
@@ -191,11 +191,11 @@ def _in_pixels(
 
 
 def outside_photograph(xy: FloatArray, size: FloatArray) -> BoolArray:
-    """Return whether image points are outside of their photographs, (k,).
+    """Return whether image points are outside their photographs, (k,).
 
     Args:
         xy: image points, px, (k, 2).
-        size: width and height of the photograph of each, px, (k, 2).
+        size: width and height of each image point's photograph, px, (k, 2).
     """
     return np.asarray(((xy < -0.5 - MARGIN_PX) | (xy > size - 0.5 + MARGIN_PX)).any(axis=1))
 
@@ -203,16 +203,17 @@ def outside_photograph(xy: FloatArray, size: FloatArray) -> BoolArray:
 def refuse_outside(
     given: Observations, xy: FloatArray, cameras: Sequence[Camera], camera: IntArray
 ) -> BoolArray:
-    """Return which image points are outside of their photographs, (k,).
+    """Return which image points are outside their photographs, (k,).
 
     Args:
-        given: as they were given.
-        xy: in px, (k, 2).
-        cameras: of the survey.
-        camera: of each image point, (k,).
+        given: image points as given.
+        xy: image points, px, (k, 2).
+        cameras: cameras of the survey.
+        camera: camera index of each image point, (k,).
 
     Raises:
-        SurveyFileError: so many are that a setting is wrong, or all are inside with x and y exchanged.
+        SurveyFileError: so many are outside that a setting is wrong, or all are inside with x and y
+            exchanged.
     """
     size = np.array([one.size_px for one in cameras], dtype=float)[camera]
     outside = outside_photograph(xy, size)
@@ -244,7 +245,7 @@ EXCHANGED = "with x and y exchanged, or width and height in size_px, they are in
 def _alternatives(
     given: Observations, xy: FloatArray, size: FloatArray, cameras: Sequence[Camera], camera: IntArray
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield what may be wrong, with the image points and photograph sizes as they would be, px."""
+    """Yield (possible mistake, image points and photograph sizes without it, px)."""
     yield EXCHANGED, xy, size[:, ::-1]
     if given.unit == "mm":
         yield "read as px in place of mm they are inside", given.xy, size
@@ -257,16 +258,16 @@ def _alternatives(
 
 @dataclass(frozen=True)
 class MergedImagePoints:
-    """Image points, each once."""
+    """Image points without repetitions."""
 
     image_points: ImagePoints
-    same: tuple[tuple[int, int], ...]  # (photograph, point) of identical ones, merged
+    same: tuple[tuple[int, int], ...]  # (photograph, point) of identical image points, merged
     averaged: tuple[tuple[int, int], ...]  # of those that differ by no more than chance, averaged
     dropped: tuple[tuple[int, int], ...]  # of those that contradict one another, left out
-    dropped_rows: int  # image points that are left out
+    dropped_rows: int  # number of image points that are left out
 
     def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
-        """Return what was done with the image points that were there more than once."""
+        """Return the remarks on repeated image points."""
         kinds = {
             "image_points_identical": self.same,
             "image_points_averaged": self.averaged,
@@ -280,11 +281,11 @@ class MergedImagePoints:
 
 
 def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
-    """Return image points, each once in its photograph, where it was first.
+    """Merge repeated image points, at the position of their first row.
 
-    Identical positions are one measurement that was written twice. Different ones are two measurements:
-    their weighted mean, if a chi-square test of their differences passes; else it is not known which is
-    right.
+    Identical positions are one measurement that was written several times. Different positions are several
+    measurements. If a chi-square test of their differences passes, their weighted mean is used. Otherwise it
+    is unknown which is correct, and all are left out.
     """
     key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
     _, first, group, count = np.unique(key, return_index=True, return_inverse=True, return_counts=True)
@@ -327,18 +328,18 @@ def network_of(
     *,
     bars: ScaleBars | None = None,
 ) -> Network:
-    """Return the network of image points, with all that the survey gives beside them.
+    """Return the network of image points and all other observations of the survey.
 
     Args:
-        survey: with control, exterior orientation, scale bars, tables of observations and rigs.
+        survey: gives control, exterior orientation, scale bars, tables of observations and rigs.
         images: names of the photographs, (m,).
-        camera: index into the cameras of the survey of each photograph, (m,).
-        points: names of the object points, (n,), by which the survey means them.
-        image_points: measured.
-        bars: scale bars in place of those that the survey gives.
+        camera: index into the cameras of the survey for each photograph, (m,).
+        points: names of the object points, as used in the survey, (n,).
+        image_points: measured image points.
+        bars: scale bars in place of those of the survey.
 
     Raises:
-        SurveyFileError: the moments of photographs of a rig are not known, or contradict one another.
+        SurveyFileError: the moments of photographs of a rig are unknown, or contradict one another.
     """
     network = Network(
         images,
@@ -354,7 +355,7 @@ def network_of(
 
 
 def with_given_mounts(mounts: MountObservations, network: Network) -> Network:
-    """Return the network with given mounts as observations, unless they are held fixed."""
+    """Return the network with given mounts as observations, except for mounts that are held fixed."""
     loose = mounts.select(np.flatnonzero(np.trace(mounts.covariance, axis1=1, axis2=2) > 0))
     return replace(network, observations=(*network.observations, loose)) if len(loose) else network
 
@@ -364,7 +365,7 @@ def exterior_observations(table: ObservedExterior, images: Sequence[str]) -> Ext
     index = {name: i for i, name in enumerate(images)}
     rows = np.array([k for k, name in enumerate(table.names) if name in index], dtype=np.int64)
     image = np.array([index[table.names[k]] for k in rows], dtype=np.int64)
-    # what was not observed has no weight, and any number may be in its place
+    # a value that was not observed has no weight, and may be any number
     value = np.nan_to_num(table.value[rows])
     covariance = np.zeros((len(rows), 6, 6))
     covariance[:, range(6), range(6)] = table.sigma[rows] ** 2
@@ -377,13 +378,13 @@ def control_points(control: KnownPoints | None, points: Sequence[str]) -> Object
         return ObjectPoints()
     index = {name: k for k, name in enumerate(points)}
     given, covariance = np.isfinite(control.xyz), control.covariance
-    if control.check is not None:  # as if it were not known
+    if control.check is not None:  # check coordinates are treated as unknown
         given = given & ~control.check
         covariance = np.where(control.check[:, :, None] | control.check[:, None, :], 0.0, covariance)
         point, axis = np.nonzero(control.check)
         covariance[point, axis, axis] = np.inf
     known = np.array([name in index for name in control.names], dtype=bool) & given.any(axis=1)
-    # an unknown coordinate has any finite value, here the mean of the others, and no weight
+    # an unknown coordinate has no weight and any finite value, here the mean of the others
     count = np.maximum(given.sum(axis=0), 1)
     mean = np.where(given, control.xyz, 0.0).sum(axis=0) / count
     return ObjectPoints(
@@ -394,7 +395,7 @@ def control_points(control: KnownPoints | None, points: Sequence[str]) -> Object
 
 
 def scale_bars(bars: Sequence[ScaleBar], points: Sequence[str]) -> ScaleBars:
-    """Return the scale bars of which both ends are among the points of a network, by their names."""
+    """Return the scale bars with both ends among the points of a network, by their names."""
     index = {name: k for k, name in enumerate(points)}
     bars = [bar for bar in bars if bar.start in index and bar.end in index]
     return ScaleBars(

@@ -1,4 +1,4 @@
-"""A survey: its settings and everything it was given, from a survey file or from Python."""
+"""A survey: its settings and all given values, from a survey file or from Python."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ S = TypeVar("S", bound=Section)
 
 
 class CameraSetup(CameraSettings):
-    """One camera of a survey made in Python; the words are those of [[camera]] in a survey file.
+    """One camera of a survey from Python; the arguments are the keys of [[camera]] in a survey file.
 
     Example:
         >>> import sfm
@@ -88,10 +88,10 @@ class CameraSetup(CameraSettings):
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Survey:
-    """A survey: photographs to be measured and adjusted, and all values known beforehand.
+    """A survey: photographs to measure and adjust, and all values known beforehand.
 
-    Photographs, or observations in place of them. Settings may be given as dictionaries in the words of the
-    survey file: `targets={"codes": "ring14"}`.
+    Given observations may replace the photographs. Settings may be dictionaries with the keys of the survey
+    file, such as `targets={"codes": "ring14"}`.
 
     Example:
         >>> import sfm
@@ -102,42 +102,40 @@ class Survey:
     """
 
     name: str
-    cameras: tuple[CameraSettings, ...]  # a CameraSetup each
+    cameras: tuple[CameraSettings, ...]  # usually `CameraSetup`
     unit: str = "m"  # object unit, for people and reports
     targets: TargetSettings = field(default_factory=TargetSettings)
-    plates: tuple[PlateSettings, ...] = ()  # calibration plates beside that of the targets
+    plates: tuple[PlateSettings, ...] = ()  # calibration plates besides the plate of the targets
     tie_points: TiePointSettings | None = None  # natural texture in place of targets
-    datum: DatumSettings = field(default_factory=DatumSettings)  # or a Datum with points by name
+    datum: DatumSettings = field(default_factory=DatumSettings)  # or a `Datum` with points by name
     adjust: AdjustSettings = field(default_factory=AdjustSettings)  # the stochastic model
-    compare: CompareSettings = field(default_factory=CompareSettings)  # other programs beside the survey
+    compare: CompareSettings = field(default_factory=CompareSettings)  # other programs to compare with
     control: KnownPoints | None = None
     exterior: ObservedExterior | None = None
-    exif_sigma_m: tuple[float, float] | None = None  # in its place positions in EXIF data, see [exterior]
+    exif_sigma_m: tuple[float, float] | None = None  # positions in EXIF data instead, see [exterior]
     rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
-    mounts: tuple[ObservedExterior, ...] = ()  # of cameras of rigs, by their names, as far as they are given
-    moments: Mapping[str, str] = field(default_factory=dict)  # of photographs, where tables name them
+    mounts: tuple[ObservedExterior, ...] = ()  # given mounts of cameras of rigs, by their names
+    moments: Mapping[str, str] = field(default_factory=dict)  # moments of photographs from tables
     scale_bars: tuple[ScaleBar, ...] = ()
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
-    equipment: tuple[PlacedEquipment, ...] = ()  # that scale bars and tables are of, for the report
+    equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
     start_cameras: StartCameras | None = None
-    folder: Path = Path()  # that the globs of the photographs are relative to
-    allow_outside: bool = True  # whether photographs may lie outside the folder
-    source: str = ""  # what messages call the survey; else its name
+    folder: Path = Path()  # base folder of the globs of photographs
+    allow_outside: bool = True  # whether photographs may be outside the folder
+    source: str = ""  # name of the survey in error messages; else its name
 
     def __post_init__(self) -> None:
-        """Turn what was given in Python into settings, and refuse what does not go together."""
+        """Convert arguments from Python into settings, and refuse contradictions."""
         where = self.source or as_plain(f"survey {self.name}")
         head = _section(Head, {"name": self.name, "unit": self.unit}, where)
         cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
         if not cameras:
             raise SurveyFileError(f"{where}: no cameras, at least one is needed")
-        if (
-            self.observations is not None
-        ):  # they are adjusted as they are, with the camera that goes with them
+        if self.observations is not None:  # given image points are adjusted with the stated camera
             said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
             cameras = tuple(said)
         datum: object = self.datum
@@ -169,7 +167,7 @@ class Survey:
         refuse_contradictions(self)
 
     def _place_plate(self, where: str) -> None:
-        """Take the points of a calibration plate as control and, where there are none, as start values."""
+        """Use the points of a calibration plate as control, and as start values if there are none."""
         refuse_contradicting_plates(self.targets, where)
         refuse_contradicting_groups(self.targets, self.plates, where)
         plate = plate_control(self.targets)
@@ -183,7 +181,7 @@ class Survey:
 
     @property
     def reject(self) -> str:
-        """How gross errors are treated; given observations are adjusted as they are unless it is stated."""
+        """Treatment of gross errors; the default is "tau", and "none" for given observations."""
         return self.adjust.reject or ("tau" if self.observations is None else "none")
 
     @property
@@ -194,7 +192,7 @@ class Survey:
 
     @cached_property
     def family(self) -> TargetFamily | None:
-        """Codes of the targets, None where they have none; a table is read once.
+        """Codes of the targets, None without codes; a table is read once.
 
         Raises:
             SurveyFileError: the code table is unreadable.
@@ -205,10 +203,10 @@ class Survey:
 
     @cached_property
     def given_mounts(self) -> MountObservations:
-        """Mounts of cameras of rigs that are known beforehand, held fixed or observed.
+        """Known mounts of cameras of rigs, held fixed or observed.
 
         Raises:
-            SurveyFileError: a table gives a mount of another camera, or a part of one.
+            SurveyFileError: a table gives an incomplete mount, or the mount of a camera on no rig.
         """
         return mount_observations(self.mounts, self.rigs, [one.name for one in self.cameras])
 
@@ -235,13 +233,13 @@ def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
     """Read a survey file and the tables that it names, each once.
 
     Args:
-        path: the TOML file; every path in it is relative to it.
-        allow_outside: whether these paths may lead out of its folder; a file from a stranger should not.
+        path: the TOML file; the paths in it are relative to it.
+        allow_outside: whether these paths may lead out of its folder; do not allow it for files of strangers.
 
     Raises:
         SurveyFileError: the file or a table is unreadable, has an unknown key or column, a wrong type, or
-            settings that contradict one another; the line names the file, the place, what was found and what
-            was needed.
+            settings that contradict one another. The message states the file, the position, the value found
+            and the value needed.
 
     Example:
         >>> import sfm
@@ -252,7 +250,7 @@ def read_survey(path: str | Path, *, allow_outside: bool = False) -> Survey:
 
 
 def survey_of_file(file: SurveyFile) -> Survey:
-    """Return the survey that a survey file describes, with the tables that it names, each read once.
+    """Return the survey that a survey file describes, with all its tables, each read once.
 
     Raises:
         SurveyFileError: a table is unreadable.
@@ -313,7 +311,7 @@ def _given_by_equipment(file: SurveyFile) -> GivenEquipment:
     """Return the scale bars and frames of the equipment that a survey file names.
 
     Raises:
-        SurveyFileError: equipment without a file, or as `read_equipment` and `given_by`.
+        SurveyFileError: equipment without an equipment file, or as in `read_equipment` and `given_by`.
     """
     if file.head.equipment is None:
         if file.equipment:
@@ -331,16 +329,17 @@ def _given_by_equipment(file: SurveyFile) -> GivenEquipment:
 def with_calibration(
     survey: Survey, calibrations: tuple[Calibration, ...], source: str, *, weighted: bool = False
 ) -> Survey:
-    """Return the survey with each camera held at a calibration, or with it as an observation.
+    """Return the survey with each camera held at a calibration, or with the calibration as an observation.
 
     Args:
-        survey: a camera takes the calibration of its name, or the only one, see `calibrated`.
-        calibrations: of an earlier result.
-        source: what messages call that result.
-        weighted: adjusted, with the calibration and its covariance as an observation; else held.
+        survey: its cameras take the calibration of their name, or the only one, see `calibrated`.
+        calibrations: cameras of an earlier result.
+        source: name of the earlier result in error messages.
+        weighted: whether the cameras are adjusted, with the calibration and its covariance as an observation;
+            else they are held.
 
     Raises:
-        SurveyFileError: as `calibrated` does.
+        SurveyFileError: as in `calibrated`.
     """
     cameras = (
         calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
@@ -349,7 +348,7 @@ def with_calibration(
 
 
 def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSettings:
-    """Return the settings of a camera with the calibration that they name, if they name one."""
+    """Return the settings of a camera with the calibration that they name, if any."""
     if camera.calibration is None:
         return camera
     folder = file.beside(camera.calibration)
@@ -358,10 +357,10 @@ def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSett
 
 
 def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:
-    """Return the codes of a survey, rings with the radii that it states, None where targets have none.
+    """Return the codes of a survey, with its stated radii of rings; None without codes.
 
     Args:
-        targets: as the survey describes them.
+        targets: settings of the targets.
         codes: name of the family, or path of the table.
 
     Raises:
@@ -377,7 +376,7 @@ def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:
 
 
 def _section(kind: type[S], value: object, where: str) -> S:
-    """Return settings as they are, or of a dictionary in the words of the survey file."""
+    """Return settings unchanged, or from a dictionary with the keys of the survey file."""
     if isinstance(value, kind):
         return value
     if not isinstance(value, Mapping):
@@ -389,5 +388,5 @@ def _section(kind: type[S], value: object, where: str) -> S:
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with the lists and numbers of Python in place of numpy's."""
+    """Return settings with Python lists and numbers in place of numpy's."""
     return {key: value.tolist() if hasattr(value, "tolist") else value for key, value in settings.items()}

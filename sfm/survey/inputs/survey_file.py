@@ -1,4 +1,7 @@
-"""The survey file (TOML): read and checked; its sections are described in `sfm.survey.inputs.settings`."""
+"""The survey file (TOML): reading and checking.
+
+`sfm.survey.inputs.settings` declares its sections.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,7 @@ from sfm.targets.codes.plates import is_table
 
 
 class SurveyFile(Section):
-    """Content of a survey file; the tables that it names are not read yet."""
+    """Content of a survey file; its tables are not read yet."""
 
     head: Head = Field(alias="survey")
     cameras: Annotated[
@@ -82,12 +85,12 @@ class SurveyFile(Section):
 
     @property
     def source(self) -> str:
-        """Name of the survey in messages."""
+        """Name of the survey in error messages."""
         return str(self._path)
 
     @property
     def folder(self) -> Path:
-        """Folder that the globs of the photographs are relative to."""
+        """Base folder of the globs of photographs."""
         return self._path.parent
 
     @property
@@ -103,7 +106,7 @@ class SurveyFile(Section):
 
     @property
     def exif_sigma_m(self) -> tuple[float, float] | None:
-        """Standard deviations of positions in EXIF data, where they are observed."""
+        """Standard deviations of EXIF positions, m, if these are observed."""
         return self.exterior.exif_sigma_m if self.exterior else None
 
     @property
@@ -112,18 +115,19 @@ class SurveyFile(Section):
         return self._allow_outside
 
     def beside(self, name: str) -> Path:
-        """Return the path of a file that is named relative to the survey file.
+        """Return the path of a file from its name relative to the survey file.
 
         Raises:
-            SurveyFileError: it leaves the survey's folder, which only the person who runs it can allow.
+            SurveyFileError: the path leaves the survey's folder; only the person who runs the survey can
+                allow that.
         """
         return inside(self._path.parent, name, str(self._path), allow_outside=self._allow_outside)
 
     def tables(self) -> tuple[Path, ...]:
-        """Return the paths of all tables that the survey names.
+        """Return the paths of all tables of the survey.
 
         Raises:
-            SurveyFileError: one of them leaves the survey's folder.
+            SurveyFileError: a path leaves the survey's folder.
         """
         names = [
             self.control.file if self.control else None,
@@ -149,22 +153,22 @@ class SurveyFile(Section):
 
 
 def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
-    """Return the path of a file in a folder, links followed.
+    """Return the path of a file in a folder; symbolic links are followed for the check.
 
     Args:
         folder: the folder.
-        name: a path relative to it.
-        where: the file that names it, for the error.
-        allow_outside: whether it may leave the folder.
+        name: path relative to the folder.
+        where: file that states the path, for error messages.
+        allow_outside: whether the path may leave the folder.
 
     Raises:
-        SurveyFileError: the path leaves the folder, or is none.
+        SurveyFileError: the path leaves the folder, or is no valid path.
     """
     try:
         path = folder / name
-        path.is_file()  # raises where a name is too long for the disk
+        path.is_file()  # raises if a name is too long for the disk
         left = not path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # a circle of links, a null byte
+    except (OSError, ValueError, RuntimeError) as error:  # circular links, a null byte
         raise SurveyFileError(f"{where}: {name!r:.100} is no path of a file") from error
     if left and not allow_outside:
         raise SurveyFileError(
@@ -175,9 +179,12 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
 
 
 def is_home_file(path: Path) -> bool:
-    """Return whether a link leads to a file in the user's home folder, and through no hidden folder there.
+    """Return whether a link leads to a file in the user's home folder outside hidden folders.
 
-    Links to photographs in a folder that the user names are how photographs are put together, and no attack.
+    People use links to collect photographs in a folder, so these links are no attack.
+
+    Args:
+        path: path of the link.
     """
     try:
         target, home = path.resolve(), Path.home().resolve()
@@ -192,12 +199,13 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
     """Read and check a survey file, without the tables that it names.
 
     Args:
-        path: the TOML file; every path in it is relative to it.
-        allow_outside: whether these paths may lead out of its folder; a file from a stranger should not.
+        path: the TOML file; the paths in it are relative to it.
+        allow_outside: whether these paths may lead out of its folder; do not allow it for files of strangers.
 
     Raises:
-        SurveyFileError: unreadable, no TOML, an unknown key, a wrong type, or settings that contradict one
-            another; the line names the file, the key, what was found and what was needed.
+        SurveyFileError: the file is unreadable or no TOML, or has an unknown key, a wrong type, or settings
+            that contradict one another. The message states the file, the key, the value found and the value
+            needed.
     """
     path = Path(path)
     if not is_plain(str(path)):

@@ -1,12 +1,12 @@
-"""Points that cover the texture of photographs, once their orientation is known.
+"""Points that cover the texture of oriented photographs, measured by least squares matching.
 
-A few hundred tie points orient the photographs and give the shape of the surface. The rest needs no features:
-squares with texture, side by side, are put on the plane through the points around them in space, projected
-into all photographs that look at that plane, and measured there by least squares matching, in those with the
-most similar direction first, whose rays correct the place for the others. So a point is followed through all
-its photographs, also where the directions are too different for descriptors. No pixel is measured twice: each
-photograph gives squares where those of the ones before leave its pixels free, and a square is looked for in
-photographs whose pixels there are free.
+A few hundred tie points orient the photographs and give the shape of the surface. No more features are needed
+after that. Textured squares, side by side, are placed on the plane through the points around them in space.
+They are projected into all photographs that see the plane, and matched there. Photographs with the most
+similar direction come first, and their rays correct the position of the point for the others. A point is thus
+followed through all its photographs, even if their directions are too different for descriptors. No pixel is
+measured twice. Each photograph takes squares from pixels that earlier photographs did not cover. A square is
+matched only in photographs whose pixels there are still free.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from sfm.network import Estimate, ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.runtime.progress import give_back_memory, reported
 
-FIRST_PHOTOGRAPHS = 4  # with the most similar direction, whose rays correct the place of a point
-FIRST_SHIFT_PX = 6.0  # how far a point may be from where the plane puts it
-LATER_SHIFT_PX = 3.0  # and from where its first rays put it
-MIN_COSINE = 0.35  # between a ray and the normal of the plane: below it windows are squeezed to a third
-SCALES = (0.4, 2.5)  # of a window in another photograph relative to the reference
+FIRST_PHOTOGRAPHS = 4  # of the most similar direction; their rays correct the position of a point
+FIRST_SHIFT_PX = 6.0  # largest distance of a match from the position that the plane gives
+LATER_SHIFT_PX = 3.0  # largest distance of a match from the position that the first rays give
+MIN_COSINE = 0.35  # between a ray and the normal of the plane; below it windows shrink to a third
+SCALES = (0.4, 2.5)  # smallest and largest scale of a window relative to the reference
 BORDER_PX = 4  # between a window and the border of a photograph
-RETURN_FACTOR = 3.0  # of the usual distance, in sigmas, at which a match comes back that is matched back
-MIN_CORRELATION = 0.7  # smallest coefficient r of a match
-MIN_RAYS = 3  # of a point where so many photographs see the surface; where two do, it has two
+RETURN_FACTOR = 3.0  # largest return error of a match that is matched back, over the median error, in sigmas
+MIN_CORRELATION = 0.7  # smallest correlation coefficient r of a match
+MIN_RAYS = 3  # of a point; two where only two photographs see the surface
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -44,32 +44,32 @@ TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 class CoveringPoints:
     """Points and their rays."""
 
-    image_points: ImagePoints  # k of them, their points 0 to n - 1
+    image_points: ImagePoints  # k image points of the points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
-    residuals: FloatArray  # of the rays with the orientation as it was, px, (k, 2)
-    matched: int  # rays of points that enough photographs matched, of which these k agree with each other
+    residuals: FloatArray  # of the rays in the given orientation, px, (k, 2)
+    matched: int  # rays of points that enough photographs matched; k of them agree with each other
 
 
 @dataclass(frozen=True)
-class _Places:
-    """Points of one reference photograph."""
+class _Squares:
+    """Textured squares of one reference photograph."""
 
     image: int  # the photograph
-    xy: FloatArray  # whole pixels, (k, 2)
+    xy: FloatArray  # middles, whole pixels, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
 
     def __len__(self) -> int:
         return len(self.xy)
 
-    def select(self, rows: BoolArray) -> _Places:
-        """Return some of them."""
-        return _Places(self.image, self.xy[rows], self.normal[rows], self.points[rows])
+    def select(self, rows: BoolArray) -> _Squares:
+        """Return the selected squares."""
+        return _Squares(self.image, self.xy[rows], self.normal[rows], self.points[rows])
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """The places of one reference photograph, measured in all that see them."""
+    """The squares of one reference photograph, measured in all photographs that see them."""
 
     image_points: ImagePoints
     scale: FloatArray  # of the windows relative to the reference, (k,)
@@ -81,7 +81,7 @@ class _Matched:
 
     seen: ImagePoints
     scale: FloatArray  # of the windows relative to the reference, (k,)
-    in_reference: FloatArray  # half of the noise, which goes to the reference, px^2, (k, 2, 2)
+    in_reference: FloatArray  # half of the noise, assigned to the reference, px^2, (k, 2, 2)
 
 
 def find_covering_points(
@@ -95,18 +95,17 @@ def find_covering_points(
     references: Sequence[int] | None = None,
     threads: int = 1,
 ) -> CoveringPoints:
-    """Measure points in all photographs that see them, until the texture of these is covered.
+    """Measure points in all photographs that see them, until the texture of the photographs is covered.
 
     Args:
-        photographs: (H, W), m of them; read when they are asked for, of files.
-        estimate: orientation of the photographs, to a few pixels, and the tie points that there are.
+        photographs: m photographs, (H, W) each; files are read when needed.
+        estimate: orientation of the photographs, good to a few pixels, and the tie points.
         camera: index of the camera of each photograph, (m,).
-        seen: image points of the tie points that fit, which give the surface.
-        windows: their side and model.
-        side_px: of the squares that the windows are in the middle of; no two of them share pixels.
-        references: photographs that points are taken from; all, those with the most tie points first, if not
-            given.
-        threads: photographs worked on at a time.
+        seen: image points of the fitting tie points, which give the surface.
+        windows: side and model of the windows.
+        side_px: side of the squares around the windows, px; no two squares share pixels.
+        references: photographs to take points from; by default all, those with the most tie points first.
+        threads: number of photographs processed in parallel.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
@@ -119,19 +118,19 @@ def find_covering_points(
     found = [_none()]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
-        """Take points from a photograph that so many see, or more."""
+        """Take points that exactly `rays` photographs see, or at least so many if `more`."""
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
-        places = _Places(i, xy, normal, points).select(known)
-        visible, free = _visible(estimate, camera, places, covered, margin, side_px)
+        squares = _Squares(i, xy, normal, points).select(known)
+        visible, free = _visible(estimate, camera, squares, covered, margin, side_px)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
         if not of.any():
             return
         measured = _followed(
-            *(grey, estimate, camera, places.select(of), free[:, of], windows, threads), both_ways=not more
+            *(grey, estimate, camera, squares.select(of), free[:, of], windows, threads), both_ways=not more
         )
         new, used = _agreeing(measured.image_points, estimate, camera, rays)
         found.append(new)
@@ -152,28 +151,28 @@ def find_covering_points(
 def _visible(
     estimate: Estimate,
     camera: IntArray,
-    places: _Places,
+    squares: _Squares,
     covered: CoveredPixels,
     margin: int,
     side_px: int,
 ) -> tuple[BoolArray, BoolArray]:
-    """Return which photographs look at the planes and have them inside, and not covered, both (m, k).
+    """Return which photographs see the squares, and which of these have their pixels free, (m, k) each.
 
     The reference is among them.
     """
-    visible = np.zeros((len(covered.shapes), len(places)), dtype=bool)
+    visible = np.zeros((len(covered.shapes), len(squares)), dtype=bool)
     free = visible.copy()
     for j in np.flatnonzero(estimate.oriented).tolist():
-        at = pictures_of(estimate, camera, np.full(len(places.xy), j), places.points)
+        at = pictures_of(estimate, camera, np.full(len(squares.xy), j), squares.points)
         size = np.array(covered.shapes[j][::-1])
-        ray = estimate.position[j] - places.points
-        cosine = np.sum(ray * places.normal, axis=1) / np.linalg.norm(ray, axis=1)
+        ray = estimate.position[j] - squares.points
+        cosine = np.sum(ray * squares.normal, axis=1) / np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
         rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
         visible[j, rows] = True
         free[j, rows] = covered.is_free(j, at[rows], side_px)
-    visible[places.image] = free[places.image] = True
+    visible[squares.image] = free[squares.image] = True
     return visible, free
 
 
@@ -181,36 +180,36 @@ def _followed(
     photographs: GreyPhotographs,
     estimate: Estimate,
     camera: IntArray,
-    places: _Places,
+    squares: _Squares,
     visible: BoolArray,
     windows: Windows,
     threads: int,
     *,
     both_ways: bool,
 ) -> _Rays:
-    """Measure the places of a photograph in the others, in those with the most similar direction first.
+    """Measure the squares of a photograph in the others, those with the most similar direction first.
 
-    Half of the noise of a match is that of the template and goes to the reference, as in `tie_points`. Where
-    no third ray checks a match, it is matched back, too.
+    Half of the noise of a match is that of the template, and is assigned to the reference, as in
+    `tie_points`. If no third ray checks a match, it is also matched back.
     """
-    i, k = places.image, len(places.xy)
-    ray = estimate.position[:, None] - places.points[None]
+    i, k = squares.image, len(squares.xy)
+    ray = estimate.position[:, None] - squares.points[None]
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
     cosine = np.where(visible, np.einsum("mkc,kc->mk", ray, ray[i]), -np.inf)
     cosine[i] = np.inf
     rank = np.argsort(np.argsort(-cosine, axis=0, kind="stable"), axis=0, kind="stable")
     first = visible & (rank <= FIRST_PHOTOGRAPHS)
     template = photographs[i]
-    parts = [ImagePoints(np.full(k, i), np.arange(k), places.xy, np.full((k, 2, 2), np.nan))]
+    parts = [ImagePoints(np.full(k, i), np.arange(k), squares.xy, np.full((k, 2, 2), np.nan))]
     scales = [np.ones(k)]
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
 
     def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
         at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
         warp = plane_warps(
-            estimate, camera, i, j, places.xy[rows], points[rows], places.normal[rows], windows.side_px / 2
+            estimate, camera, i, j, squares.xy[rows], points[rows], squares.normal[rows], windows.side_px / 2
         )
-        with np.errstate(invalid="ignore"):  # of planes that a photograph does not see
+        with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
             scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
         fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
         if not fits.any():
@@ -218,7 +217,7 @@ def _followed(
         match = match_lsm(
             template,
             photographs[j],
-            places.xy[rows[fits]],
+            squares.xy[rows[fits]],
             at[fits],
             model=windows.model,
             window_px=windows.side_px,
@@ -229,7 +228,7 @@ def _followed(
         )
         good = match.good
         if both_ways:
-            at = places.xy[rows[fits]]
+            at = squares.xy[rows[fits]]
             good &= _returning(template, photographs[j], at, match, windows)
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
@@ -248,7 +247,7 @@ def _followed(
                 parts.append(one.seen)
                 scales.append(one.scale)
 
-    measure(first, places.points, FIRST_SHIFT_PX)
+    measure(first, squares.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
         _concatenated(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
     ).points
@@ -261,7 +260,7 @@ def _followed(
 
 
 def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows) -> BoolArray:
-    """Return which matches come back to where they are from, as the others do, when matched back, (k,)."""
+    """Return which matches, matched back, return to their origin within the usual error, (k,)."""
     rows = np.flatnonzero(match.good)
     back = match_lsm(
         other,
@@ -297,7 +296,7 @@ def _agreeing(
 
 
 def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
-    """Return all image points one after another."""
+    """Concatenate image points."""
     return ImagePoints(
         np.concatenate([one.image for one in parts]),
         np.concatenate([one.point for one in parts]),
@@ -307,7 +306,7 @@ def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
 
 
 def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
-    """Return all points, numbered one after another."""
+    """Concatenate points and renumber them consecutively."""
     first = np.cumsum([0, *(len(one.points) for one in found)])
     moved = [
         replace(one.image_points, point=one.image_points.point + start)
@@ -322,7 +321,7 @@ def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
 
 
 def _none() -> CoveringPoints:
-    """Return no points."""
+    """Return an empty set of points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
     return CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), 0)

@@ -1,8 +1,8 @@
-"""The store of what was measured in photographs: what was measured once in one is not measured again.
+"""The store of measurements in photographs, so that no photograph is measured twice.
 
-It lies in the cache folder of the user, never beside photographs or results, which may come from somebody
-else. Measurements are kept by the content of the photograph, the settings and the code that measures, so
-an entry can be missing or unreadable but never out of date. The folder may be removed at any time.
+It is in the user's cache folder, never beside photographs or results, which may come from somebody else. The
+key of an entry depends on the content of the photograph, the settings and the measuring code. An entry can
+therefore be missing or unreadable, but never out of date. The folder may be removed at any time.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from sfm.targets.detect import Targets
 
 Measured = Targets | NaturalPoints
 M = TypeVar("M", Targets, NaturalPoints)
-MAX_ENTRY_BYTES = 100_000_000  # 400,000 targets, 180,000 features; bounded before any memory is taken
+MAX_ENTRY_BYTES = 100_000_000  # 400,000 targets, 180,000 features; checked before any memory is allocated
 
 
 @dataclass(frozen=True)
 class Kind(Generic[M]):
-    """Measurements of a photograph alone that can be kept: arrays by their names."""
+    """Kind of measurements of a single photograph that can be stored: named arrays."""
 
     type: type[M]
-    measuring: tuple[str, ...]  # modules; what is measured depends on these and on all that they import
-    apart: str  # how the arrays begin that have a separate length; the others have one length
+    measuring: tuple[str, ...]  # modules that measure; the result depends on these and all their imports
+    apart: str  # prefix of the arrays that share another length; all others share one length
 
 
 TARGETS = Kind(Targets, ("sfm.photographs.reading", "sfm.targets.detect"), "rejected")
@@ -48,38 +48,38 @@ TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.i
 
 @dataclass(frozen=True)
 class MeasuredStore:
-    """A folder of what was measured, which is the user's alone."""
+    """A folder of measurements, which belongs to the user alone."""
 
     folder: Path
     held: dict[str, tuple[Measured, bool]] = field(default_factory=dict)
-    """of this run by their keys: what was measured, and whether it was taken from the folder"""
+    """measurements of this run by their keys, each with whether it was read from the folder"""
 
     @classmethod
     def of_user(cls) -> MeasuredStore:
-        """Return the store in the user's cache folder (XDG_CACHE_HOME), which is made when it is needed.
+        """Return the store in the user's cache folder (XDG_CACHE_HOME), which is created when needed.
 
         Raises:
-            OutputError: others can write into it.
+            OutputError: other users can write into the folder.
         """
         return cls(user_folder("measured", "measured points"))
 
     def load(self, key: str, kind: Kind[M]) -> M | None:
-        """Return what was measured under a key; None if it is not there or not whole."""
+        """Return the measurements under a key; None if they are missing or incomplete."""
         try:
             path = self._path(key)
             if path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
             found = _unpacked(path.read_bytes(), kind)
-            os.utime(path)  # asked for now
+            os.utime(path)  # marks it as used now
             return found
         except (OSError, ValueError, TypeError, EOFError, KeyError, MemoryError, zipfile.BadZipFile):
             return None
 
     def save(self, key: str, measured: Measured) -> None:
-        """Keep what was measured, whole or not at all; where there is no room it is simply not kept."""
+        """Store measurements completely or not at all; without room on the disk they are not stored."""
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
-        if data.tell() > MAX_ENTRY_BYTES:  # no one would read it
+        if data.tell() > MAX_ENTRY_BYTES:  # `load` would not read it
             return
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
@@ -87,7 +87,7 @@ class MeasuredStore:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:
-        """Remove entries not asked for in months, and what a killed run left half-written."""
+        """Remove entries not used for months, and half-written files of a killed run."""
         remove_unused(self.folder)
 
     def _path(self, key: str) -> Path:
@@ -97,14 +97,14 @@ class MeasuredStore:
 def measured_once(
     store: MeasuredStore | None, path: Path, kind: Kind[M], settings: str, measure: Callable[[], M]
 ) -> tuple[M, bool]:
-    """Return what is measured in a photograph, and whether an earlier run has measured it.
+    """Return the measurements of a photograph, and whether they were read from the store.
 
     Args:
-        store: is asked first, and keeps what had to be measured; None to measure in any case.
+        store: is searched first, and stores new measurements; None to measure in any case.
         path: the photograph.
-        kind: what is measured.
-        settings: everything but the photograph that it depends on, in any unambiguous text.
-        measure: measures it.
+        kind: kind of measurements.
+        settings: everything else that the measurements depend on, as any unambiguous text.
+        measure: measures the photograph.
 
     Raises:
         PhotographError: the photograph cannot be read.
@@ -125,12 +125,12 @@ def measured_once(
 
 
 def measured_key(path: Path, kind: Kind[M], settings: str) -> str:
-    """Return the key of what is measured in a photograph: a SHA-256 of everything that it depends on.
+    """Return the key of the measurements of a photograph: a SHA-256 of everything they depend on.
 
     Args:
         path: the photograph.
-        kind: what is measured.
-        settings: of the measurement, in any unambiguous text.
+        kind: kind of measurements.
+        settings: settings of the measurement, as any unambiguous text.
 
     Raises:
         PhotographError: the photograph cannot be read.
@@ -157,7 +157,7 @@ def content_hash(path: Path) -> str:
 
 @cache
 def _code_version(measuring: tuple[str, ...]) -> str:
-    """Return a fingerprint of the code that measures: its sources and the libraries it computes with."""
+    """Return a fingerprint of the measuring code: its sources and the versions of its libraries."""
     digest = hashlib.sha256(f"{cv2.__version__} {np.__version__}".encode())
     for _, source in sorted(sources_of(*measuring).items()):
         digest.update(source.encode())
@@ -165,7 +165,7 @@ def _code_version(measuring: tuple[str, ...]) -> str:
 
 
 def _unpacked(data: bytes, kind: Kind[M]) -> M:
-    """Read back what was measured; ValueError or KeyError if it is not what was written."""
+    """Return stored measurements; raise ValueError or KeyError if the data are not as they were written."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > len(data):
             raise ValueError("entries are stored as they are, these are packed")

@@ -1,10 +1,9 @@
-"""The points of a textured survey once its photographs are oriented: their windows cover the photographs.
+"""Surface points of a textured survey: windows side by side that cover the oriented photographs.
 
-Windows that overlap measure the same pixels twice, and their errors have these in common: a result would
-be reported too precise. So the tie points, which lie anywhere, give way to windows side by side. All
-pixels then take part once, whatever the size of the windows; it is chosen by the surface, which is
-hardly plane over large ones, and by the noise, which hides the texture of small ones where it is correlated
-from pixel to pixel.
+Windows that overlap measure the same pixels twice. Their errors are correlated, and the result would look too
+precise. Therefore windows side by side replace the tie points, which lie anywhere. Every pixel then takes
+part once, whatever the size of the windows. The size is a compromise. Over large windows a surface is hardly
+plane. In small windows noise that is correlated from pixel to pixel hides the texture.
 """
 
 from __future__ import annotations
@@ -36,11 +35,15 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 
-# Windows that are tried, the first of those that are about as precise is taken. Noise that is correlated over
-# several pixels hides the texture of small ones, and where texture is weak, the four parameters of an affine
-# warp take from the shift what the plane through the tie points knows better: without them varnished wood has
-# three times as many matches and half of their errors. Affine windows of 31 px, which measure the mean depth
-# of a curved surface, in all photographs alike, leave 0.93 to 1.8 times as much as smaller ones.
+# Windows that are tried; the first of those with about the best precision is taken. Noise that is correlated
+# over
+# several pixels hides the texture of small windows. Where texture is weak, the four parameters of an affine
+# warp
+# weaken the shift, although the plane through the tie points gives them better: without them varnished wood
+# has
+# three times as many matches with half the errors. Affine windows of 31 px measure the mean depth of a curved
+# surface, with the same error in all photographs; their standard deviation is 0.93 to 1.8 times that of
+# smaller ones.
 TRIED_WINDOWS = (
     Windows(15),
     Windows(11),
@@ -48,12 +51,12 @@ TRIED_WINDOWS = (
     Windows(15, "shift"),
     Windows(21, "shift"),
 )
-TRIAL_PHOTOGRAPHS = 2  # of which points are taken to choose the window
-TRIAL_RAYS = 100  # with fewer the window stays as it is
-TRIAL_SIDES = 4  # of windows from one to the next: they need not cover it
-# Spread of the rays of a tie point, in that of all, beyond which it does not show the surface
+TRIAL_PHOTOGRAPHS = 2  # whose points choose the window
+TRIAL_RAYS = 100  # with fewer rays the window stays as it is
+TRIAL_SIDES = 4  # distance of trial windows in sides: they need not cover the photograph
+# Residual of a ray of a tie point, over the spread of all residuals, beyond which it is not on the surface.
 TOLERANCE_FACTOR = 6.0
-RAYS_OF_NOISE = 20_000  # from about so many the noise of matching is estimated: to half a percent
+RAYS_OF_NOISE = 20_000  # about so many rays estimate the noise of matching, to half a percent
 MIN_CONTROL = 3  # points that place the photographs in the system of the control
 
 
@@ -63,7 +66,7 @@ class Surface:
 
     network: Network
     estimate: Estimate
-    overlays: tuple[PhotographTargets, ...]  # what the report draws into each photograph
+    overlays: tuple[PhotographTargets, ...]  # drawn into each photograph of the report
     remarks: tuple[Remark, ...]
 
 
@@ -73,15 +76,15 @@ def cover_photographs(
     """Return the network of a textured survey with points wherever its photographs have texture.
 
     Args:
-        survey: gives the window, or does not, and the sigma of an image coordinate.
+        survey: may state the window; states the sigma of an image coordinate.
         measured: the tie points.
         start: orientation of the photographs.
-        jobs: photographs worked on at a time.
+        jobs: number of photographs processed in parallel.
 
     Returns:
-        None where the tie points are more than the windows, as where the surface is nowhere plane over them,
-        or where the orientation leaves none. Points are named t00001, t00002 ... in the order in
-        which they are found; these are the names that control and scale bars of the survey mean.
+        The network. None if the windows give fewer rays than the tie points, for example if the surface is
+        nowhere plane over them, or if no tie point fits the orientation. Points are named t00001, t00002 ...
+        in the order in which they are found. Control and scale bars of the survey refer to these names.
     """
     network, estimate, files, settings = measured.network, start.estimate, measured.files, survey.tie_points
     if files is None or settings is None:
@@ -122,7 +125,7 @@ def cover_photographs(
         covering, placed, found.image_points.covariance[order], survey.adjust.sigma_px
     )
     control = covering.control.complete
-    if start.kind != "given" and len(control) >= MIN_CONTROL:  # the tie points had none to be placed on
+    if start.kind != "given" and len(control) >= MIN_CONTROL:  # tie points cannot be placed on control
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
     return Surface(
         covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(found)
@@ -130,20 +133,21 @@ def cover_photographs(
 
 
 def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
-    """Return the remark that many of the matched windows contradict each other, where they do."""
+    """Return the remark that many of the matched windows contradict each other, if they do."""
     return unless_note(remark("windows_disagree", share=1 - len(found.image_points) / max(found.matched, 1)))
 
 
 def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray, sigma_px: float) -> Network:
-    """Return the network with the share of matching in its covariances as the residuals show it.
+    """Return the network with the share of matching in its covariances estimated from the residuals.
 
-    Their median stays: sigma0 still shows how much worse the image points are than was expected.
+    The median covariance does not change: sigma0 still shows how much worse the image points are than
+    expected.
 
     Args:
-        network: covering points, weighted as expected.
+        network: covering points with the expected weights.
         estimate: approximate values.
-        matching: covariance that matching states, px^2, (k, 2, 2).
-        sigma_px: expected of what matching does not state, px.
+        matching: covariance from matching, px^2, (k, 2, 2).
+        sigma_px: expected sigma of errors that matching does not see, px.
     """
     seen = network.image_points
     every = max(1, len(seen) // RAYS_OF_NOISE)
@@ -160,7 +164,7 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
 
     try:
         factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], sigma_px)
-    except GeometryError:  # which the adjustment of the survey reports, or mends
+    except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     shown = factor**2 * matching + common_px**2 * np.eye(2)
     usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))
@@ -169,7 +173,7 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
 
 
 def _fitting(network: Network, estimate: Estimate) -> BoolArray:
-    """Return which rays of the tie points fit, of points that keep enough of them, (k,)."""
+    """Return which rays of the tie points fit and belong to points that keep enough rays, (k,)."""
     seen = network.image_points
     off = np.hypot(
         *(pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy).T
@@ -185,9 +189,13 @@ def _fitting(network: Network, estimate: Estimate) -> BoolArray:
 
 
 def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoints:
-    """Return the points without those of two rays that are off the surface of their neighbours.
+    """Return the points without two-ray points that are off the surface of their neighbours.
 
-    Their windows agree with each other, so that they are no longer among the matched ones.
+    The windows of these points agree with each other, so they no longer count as matched rays either.
+
+    Args:
+        found: covering points.
+        estimate: orientation of the photographs.
     """
     seen, n = found.image_points, len(found.points)
     two = np.bincount(seen.point, minlength=n) < MIN_RAYS
@@ -203,7 +211,7 @@ def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoi
 
 
 def _side(estimate: Estimate, window_px: int, most: int) -> int:
-    """Return the odd side of the squares: a window, or more where a photograph would have too many, px."""
+    """Return the side of the squares, px: a window, or larger if a photograph would have too many, odd."""
     area = max(lens.size_px[0] * lens.size_px[1] for lens in estimate.cameras)
     return max(window_px, int(np.sqrt(area / most)) | 1)
 
@@ -216,7 +224,7 @@ def _best_windows(
     settings: TiePointSettings,
     jobs: int,
 ) -> Windows:
-    """Return the windows of TRIED_WINDOWS whose rays, all together, leave the smallest standard deviation."""
+    """Return the windows of TRIED_WINDOWS whose rays together have the smallest standard deviation."""
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
     costs: list[tuple[Windows, float]] = []
     given = settings.window_px if "window_px" in settings.model_fields_set else None

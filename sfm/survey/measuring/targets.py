@@ -1,4 +1,8 @@
-"""The targets of all photographs of a survey, measured side by side."""
+"""Targets of all photographs of a survey, measured in parallel.
+
+Copies of photographs are left out. Photographs of another size than the others of their camera get a separate
+camera or are left out.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +38,14 @@ from sfm.targets.codes.plates import PlateFamily, PlateGroup, TargetFamily
 from sfm.targets.codes.tags import TagFamily
 from sfm.targets.detect import Targets, find_targets
 
-MIN_OWN = 3  # photographs of one size that a separate camera is worth
-# Relative difference of the ratio of the sides of a photograph that was resampled.
+MIN_OWN = 3  # photographs of another size that justify a separate camera
+# Largest relative difference of the aspect ratio of a resampled photograph.
 MAX_ASPECT_DIFFERENCE = 0.005
 RESAMPLED, UPRIGHT, CROPPED = "resampled", "stored upright", "cropped or from another sensor"
 Size = tuple[int, int]
 T = TypeVar("T")
 MIN_PHOTOGRAPHS = 2
-MAX_TOLD = 5  # photographs that a message names
+MAX_LISTED = 5  # photographs that an error message lists
 
 
 def measure_photographs(
@@ -52,21 +56,21 @@ def measure_photographs(
     store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> MeasuredPhotographs:
-    """Read the photographs, find, measure and decode their targets.
+    """Read the photographs, and find, measure and decode their targets.
 
-    A photograph that cannot be read does not stop the others; it is named with the reason, as is one whose
-    file is a copy of another.
+    A photograph that cannot be read does not stop the others. It is listed with the reason, and so is a copy
+    of another photograph.
 
     Args:
-        survey: describes the targets and what is known of the cameras.
-        photographs: the files.
-        jobs: how many photographs are worked on at a time.
-        store: keeps what is measured and spares measuring it again; None to measure everything.
-        progress: informed of every photograph.
+        survey: states the targets and the camera data.
+        photographs: files of the photographs.
+        jobs: number of photographs processed in parallel.
+        store: store of earlier measurements; None to measure everything anew.
+        progress: receives every photograph.
 
     Raises:
         GeometryError: fewer than two readable photographs.
-        PhotographError: photographs of different size under one camera.
+        PhotographError: photographs of different sizes have the same camera.
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
     family = survey.family
@@ -101,7 +105,9 @@ def measure_photographs(
 def _read_and_measure(
     path: Path, settings: TargetSettings, family: TargetFamily | None, store: MeasuredStore | None
 ) -> tuple[Metadata, Targets, bool]:
-    targets, stored = measure_photograph(path, settings, family, store)  # reports faults of a file best
+    targets, stored = measure_photograph(
+        path, settings, family, store
+    )  # first: it reports faults of a file best
     return read_metadata(path), targets, stored
 
 
@@ -111,15 +117,15 @@ def measure_photograph(
     family: TargetFamily | None,
     store: MeasuredStore | None = None,
 ) -> tuple[Targets, bool]:
-    """Return the targets of one photograph and whether an earlier run has measured them.
+    """Return the targets of one photograph, and whether they were read from the store.
 
-    The pixels are released at once.
+    The pixels are released immediately.
 
     Args:
         path: the photograph.
-        settings: what the targets look like.
-        family: their codes, None where they have none.
-        store: is asked first, and keeps what had to be measured.
+        settings: appearance of the targets.
+        family: codes of the targets, None without codes.
+        store: is searched first, and stores new measurements.
 
     Raises:
         PhotographError: the photograph cannot be read.
@@ -134,7 +140,7 @@ def measure_photograph(
 
 
 def target_settings(settings: TargetSettings, family: TargetFamily | None) -> str:
-    """Return what the targets of a photograph depend on besides it, for the store of what was measured."""
+    """Return everything but the photograph that its targets depend on, as a text for the store's key."""
     codes = "none"
     if isinstance(family, TagFamily | ConcentricFamily):
         codes = family.name
@@ -147,7 +153,7 @@ def target_settings(settings: TargetSettings, family: TargetFamily | None) -> st
 
 
 def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFamily | None) -> Targets:
-    """Return the targets of a photograph (H, W) that was read in the channel of the settings."""
+    """Return the targets of a photograph, (H, W), that was read in the channel of the settings."""
     return find_targets(
         take_back_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
@@ -157,10 +163,10 @@ def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFam
 
 
 def image_point_covariance(targets: Targets, sigma_px: float) -> FloatArray:
-    """Return the covariance of image points for the adjustment, px^2, shape (k, 2, 2).
+    """Return the covariance of image points for the adjustment, px^2, (k, 2, 2).
 
-    The fit of a target knows the noise of the photograph only. Errors that it cannot know (JPEG, print, lens,
-    a sheet that is not flat) are added by the survey's sigma of an image coordinate.
+    The fit of a target only contains the noise of the photograph. The survey's sigma of an image coordinate
+    adds the other errors: JPEG, print, lens, or a sheet that is not flat.
     """
     return np.asarray(targets.covariance + sigma_px**2 * np.eye(2))
 
@@ -173,21 +179,21 @@ def each_photograph(
     jobs: int = 1,
     progress: Progress = SILENT,
 ) -> tuple[dict[int, T], tuple[FailedImage, ...]]:
-    """Do something with every photograph, and return what came of each that could be read.
+    """Apply a function to every photograph, and return the results of those that could be read.
 
-    One that cannot be read does not stop the others; it is named with the reason, as is one whose file is a
-    copy of another.
+    A photograph that cannot be read does not stop the others. It is listed with the reason, and so is a copy
+    of another photograph.
 
     Args:
-        photographs: the files.
-        work: what is done with a file; PhotographError gives the reason why it cannot be read.
-        picture: what identifies the picture in its result, as a copy that was saved again
-            has other bytes; empty where nothing does.
-        jobs: how many photographs are worked on at a time.
-        progress: informed of every photograph.
+        photographs: files of the photographs.
+        work: function of a file; raises PhotographError with the reason if the file cannot be read.
+        picture: returns a key of the picture from the result, since a copy that was saved again has other
+            bytes; empty if nothing identifies it.
+        jobs: number of photographs processed in parallel.
+        progress: receives every photograph.
 
     Returns:
-        The results of the photographs by their number, and those without, in their order.
+        The results by the index of the photograph, and the failed photographs in their order.
 
     Raises:
         GeometryError: fewer than two readable photographs.
@@ -220,7 +226,7 @@ def each_photograph(
                         photographs.names[k], remark("photograph_unreadable", reason=reason)
                     )
                 progress.advance(photographs.names[k])
-        except BaseException:  # Ctrl-C among them: no one waits for photographs that are not begun
+        except BaseException:  # including Ctrl-C: do not wait for photographs not yet started
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     pictures: dict[bytes, int] = {}
@@ -241,7 +247,7 @@ def each_photograph(
 
 
 def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
-    """Return for every photograph the first one whose file has the same bytes, itself where there is none.
+    """Return for every photograph the first one whose file has the same bytes; itself if it is no copy.
 
     A copy is no second observation: it would only make the result look more precise than it is.
     """
@@ -251,27 +257,27 @@ def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
     number = Counter(sizes)
     for k, path in enumerate(photographs.paths):
         if sizes[k] and number[sizes[k]] > 1:
-            with suppress(PhotographError):  # a file that cannot be read is reported where it is measured
+            with suppress(PhotographError):  # an unreadable file is reported when it is measured
                 first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
     return tuple(first)
 
 
 def why_failed(error: PhotographError, path: Path) -> str:
-    """Return why a photograph cannot be read, without its name, which is beside the reason."""
+    """Return why a photograph cannot be read, without the photograph's name."""
     return str(error).removeprefix(f"{path.name}: ")
 
 
 def in_brackets(failed: Sequence[FailedImage]) -> str:
-    """Return which photographs could not be read and why, the first of many, to follow a message."""
+    """Return the first photographs that could not be read and why, in brackets for the end of a message."""
     if not failed:
         return ""
     named = (f"{one.image}: {one.reason.text.rstrip('.')}" for one in failed)
-    return f" ({listed(named, most=MAX_TOLD, separator='; ')})"
+    return f" ({listed(named, most=MAX_LISTED, separator='; ')})"
 
 
 @dataclass(frozen=True)
 class OtherSizes:
-    """A survey whose cameras have photographs of one size each."""
+    """A survey in which all photographs of a camera have the same size."""
 
     survey: Survey
     files: PhotographList
@@ -282,12 +288,12 @@ class OtherSizes:
 def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
     """Give photographs of another size than the others of their camera a separate camera.
 
-    A few of them, and those whose camera is held at values that another part of the sensor does not have, are
-    left out.
+    They are left out if they are few, or if their camera is held at values that do not apply to another part
+    of the sensor.
 
     Args:
-        survey: its cameras.
-        files: its photographs; those that cannot be read stay with their camera.
+        survey: states the cameras.
+        files: photographs of the survey; those that cannot be read stay with their camera.
     """
     sizes = [_size(path) for path in files.paths]
     cameras, owner = list(survey.cameras), files.camera.copy()
@@ -350,12 +356,15 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
 def _size(path: Path) -> Size | None:
     try:
         return read_metadata(path).size_px
-    except PhotographError:  # reported where it is measured
+    except PhotographError:  # reported when it is measured
         return None
 
 
 def _main_size(camera: CameraSettings, counted: dict[Size, list[int]]) -> Size | None:
-    """Return the size of a camera: that of the survey if a photograph has it, else the most frequent."""
+    """Return the size of a camera: the stated size if any photograph has it, else the most frequent size.
+
+    None if no photograph has the stated size, or none could be read.
+    """
     if camera.size_px in counted:
         return camera.size_px
     if camera.size_px is not None or not counted:
@@ -371,7 +380,7 @@ def _kind(size: Size, main: Size) -> str:
 
 
 def _held(camera: CameraSettings) -> bool:
-    """Return whether a camera is held at given values, which belong to its whole photograph."""
+    """Return whether a camera is held at given values, which apply to its whole format only."""
     return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 
 

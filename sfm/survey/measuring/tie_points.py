@@ -1,4 +1,8 @@
-"""The tie points of a survey without targets, and which photographs are near one another."""
+"""Tie points of a survey without targets, and the neighbours of each photograph.
+
+Natural texture is matched between photographs that are neighbours in position or sequence. Photographs with
+few tie points are searched again for more features.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +35,19 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.targets import each_photograph
 
-NONE = -1  # in place of a photograph
+NONE = -1  # no photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
-# their errors: errors alone make 1.5 (three axes).
+# their errors: errors alone give 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
-# Image points of a photograph: matches of a repeated pattern are wrong together, and few of them may fit.
+# Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
-# Image points of a photograph below which it is searched for more features: three photographs of a portal,
-# taken while walking towards it, have 36 in common of 2,000 features each, and 249 of 8,000.
+# A photograph with fewer image points is searched for more features. Three photographs of a portal, taken
+# while
+# walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
-# Photographs that must agree on a point: of two rays an error along the epipolar line is not found. Points of
-# two are taken where a photograph, or a part of it, has no others.
+# Photographs that must agree on a point: two rays do not reveal an error along the epipolar line. Points of
+# two
+# rays are used if a photograph, or a part of it, has no others.
 MIN_RAYS = 3
 
 
@@ -55,20 +61,19 @@ def tie_photographs(
 ) -> Measurements:
     """Read the photographs and measure the points of natural texture that they have in common.
 
-    Photographs are read when they are needed. One that cannot be read does not stop the others; it is named
-    with the reason, as is a copy of another.
+    Photographs are read when needed. A photograph that cannot be read does not stop the others. It is listed
+    with the reason, and so is a copy of another photograph.
 
     Args:
-        survey: gives detector and windows, what is known of the cameras, and the sigma of an image
-            coordinate.
-        photographs: the files.
-        jobs: how many photographs are worked on at a time.
-        store: keeps what single photographs show and spares finding it again; None to find everything.
-        progress: informed of every photograph.
+        survey: states detector and windows, camera data, and the sigma of an image coordinate.
+        photographs: files of the photographs.
+        jobs: number of photographs processed in parallel.
+        store: store of features of single photographs; None to detect all features anew.
+        progress: receives every photograph.
 
     Raises:
         GeometryError: fewer than two readable photographs, or no point that two of them have in common.
-        PhotographError: photographs of different size under one camera.
+        PhotographError: photographs of different sizes have the same camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
     settings = survey.tie_points or TiePointSettings()
@@ -122,7 +127,7 @@ def tie_photographs(
             "no texture that two photographs have in common; more overlap or "
             "smaller steps between the photographs are needed"
         )
-    # Control and scale bars name points of the result, which lie elsewhere: see `surface_points`
+    # These names differ from those of the result, which control and scale bars use: see `surface_points`.
     points = tuple(f"tie {j + 1}" for j in range(int(tied.point.max()) + 1))
     covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
     image_points = ImagePoints(tied.image, tied.point, tied.xy, covariance)
@@ -142,7 +147,7 @@ def tie_photographs(
 
 
 def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remark, ...]:
-    """Return which pairs of photographs were matched, where it is not all of them."""
+    """Return the remark on the pairs of photographs that were matched, if these are not all pairs."""
     m = len(neighbours[0])
     possible = m * (m - 1) // 2
     if pairs == possible:
@@ -156,12 +161,12 @@ def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remar
 
 
 def needed_rays(network: Network) -> IntArray:
-    """Return how many photographs each point needs: those that it has, up to MIN_RAYS, (n,)."""
+    """Return how many rays each point needs: as many as it has, up to MIN_RAYS, (n,)."""
     return np.minimum(network.rays(), MIN_RAYS)
 
 
 def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tuple[PhotographTargets, ...]:
-    """Return what the report draws into each photograph: circles as wide as the windows."""
+    """Return the overlays of each photograph in the report: circles as wide as the windows."""
     seen = network.image_points
     drawn = []
     of_image = rows_of(seen.image, len(network.images))
@@ -188,13 +193,13 @@ def natural_points_of(
     *,
     photograph: AnyArray | None = None,
 ) -> tuple[NaturalPoints, bool]:
-    """Return what one photograph shows of natural texture, and whether an earlier run has found it.
+    """Return the natural points of one photograph, and whether they were read from the store.
 
     Args:
         path: the photograph.
         settings: detector and number of features.
-        store: is asked first, and keeps what had to be found.
-        photograph: the content of the file, where it has been read.
+        store: is searched first, and stores new features.
+        photograph: pixels of the photograph, (H, W), if already read.
 
     Raises:
         PhotographError: the photograph cannot be read.
@@ -213,14 +218,14 @@ def natural_points_of(
 
 
 def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray:
-    """Return the photographs that are nearest to each, nearest first, NONE where there are no more, (m, k).
+    """Return the nearest photographs of each photograph, nearest first, padded with NONE, (m, k).
 
-    Positions in EXIF data are compared in their standard deviations. Where they differ by no more than their
-    errors they decide nothing, and no photograph has neighbours.
+    EXIF positions are compared in units of their standard deviations. If they differ by no more than their
+    errors, they say nothing, and no photograph has neighbours.
 
     Args:
-        metadata: of m photographs; some may state no position.
-        count: k, of neighbours.
+        metadata: metadata of m photographs; some may have no position.
+        count: number of neighbours, k.
     """
     found = np.full((len(metadata), count), NONE)
     rows = np.array([k for k, one in enumerate(metadata) if one.position is not None], dtype=np.int64)
@@ -243,15 +248,15 @@ def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray
 
 
 def neighbours_in_sequence(names: Sequence[str], metadata: Sequence[Metadata], count: int) -> IntArray:
-    """Return the photographs taken before and after each, NONE at the ends of a series, (m, k).
+    """Return the photographs taken before and after each photograph, NONE at the ends of a series, (m, k).
 
-    A series is of photographs with a time in their EXIF data or, without, of names that differ in nothing but
-    numbers. Photographs of the same time are in the order of the numbers in their names.
+    A series consists of photographs of one camera with an EXIF time. Without times it consists of photographs
+    whose names differ only in numbers. Photographs of the same time are sorted by the numbers in their names.
 
     Args:
-        names: of m photographs, different ones.
-        metadata: of them.
-        count: k, of neighbours, even: half of them before, half after; the nearest first.
+        names: unique names of m photographs.
+        metadata: metadata of these photographs.
+        count: number of neighbours, k, even: half of them before, half after; the nearest first.
     """
     series: dict[tuple[object, ...], list[int]] = {}
     for k, one in enumerate(metadata):

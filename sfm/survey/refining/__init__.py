@@ -1,1 +1,1 @@
-"""A model of another program made better: its key points measured anew, its targets added, adjusted again."""
+"""Refinement of another program's model: key points measured again, targets added, everything adjusted."""

@@ -1,4 +1,8 @@
-"""The orientation of a model from key points and coded targets measured anew."""
+"""Orientation of a model from key points and coded targets that were measured again.
+
+Only windows that do not overlap take part in the adjustment. The other points of the model are intersected
+afterwards. Coded targets with control or scale bars define the object frame.
+"""
 
 from __future__ import annotations
 
@@ -30,24 +34,24 @@ from sfm.survey.placing import MIN_CONTROL, object_scale
 from sfm.survey.refining.windows import MIN_RAYS, Windows, photograph_paths, read_of_size
 from sfm.survey.target_network import build_network, min_rays, name_coded
 
-PREFIX = "target "  # of the names of targets among the points of a model, which may have the same numbers
-SIGMA_PX = 0.02  # of a matched point, on top of what matching knows: surfaces are not plane over a window
+PREFIX = "target "  # of the names of targets, since points of the model may have the same numbers
+SIGMA_PX = 0.02  # of a matched point, added to the noise of matching: surfaces are not plane over a window
 
 
 @dataclass(frozen=True)
 class OrientedKeyPoints:
-    """Key points measured anew, and the orientation given by those whose windows do not overlap."""
+    """Key points measured again, and the orientation from those whose windows do not overlap."""
 
     windows: Windows
     window_px: int
-    network: Network  # of these image points and the targets
-    rows: IntArray  # image point of the model of each of them, targets behind
+    network: Network  # of these image points, followed by the targets
+    rows: IntArray  # image point of the model for each image point of the network but the targets
     rays: IntArray  # that each point needs
-    solved: Estimate  # of these points, NaN where they do not determine it
-    whole: Estimate  # the model in this orientation; see `whole_model`
+    solved: Estimate  # solution of the network, NaN where undetermined
+    whole: Estimate  # the whole model in this orientation; see `whole_model`
     accepted: BoolArray  # image points of the network that fit
-    spread_px: float  # of the residuals of the key points among these
-    lost: list[tuple[str, int]]  # why key points were not measured, and how many
+    spread_px: float  # robust standard deviation of the residuals of the key points
+    lost: list[tuple[str, int]]  # (reason why key points were not measured, number)
 
 
 def orient(
@@ -58,10 +62,10 @@ def orient(
     targets: ModelTargets | None,
     lost: list[tuple[str, int]],
 ) -> OrientedKeyPoints:
-    """Adjust what was measured with windows that do not overlap, and find what does not fit.
+    """Adjust the image points of windows that do not overlap, and find the ones that do not fit.
 
     Raises:
-        GeometryError: too few.
+        GeometryError: too few image points are left.
     """
     seen, came = network.image_points, estimate
     good = np.asarray(np.isfinite(windows.xy).all(axis=1))
@@ -98,7 +102,7 @@ def orient(
     v = np.abs(adjusted.residuals)
     fits = np.ones(len(v), dtype=bool)
     matched = part.image_points.point < int(points[: len(network.points)].sum())
-    for kind in (~matched, matched):  # targets are measured in another way, with other residuals
+    for kind in (~matched, matched):  # targets are measured differently and have other residuals
         if kind.any():
             spread = MAD_TO_SIGMA * float(np.median(v[kind]))
             fits[kind] = (v[kind] <= TOLERANCE_FACTOR * spread).all(axis=1)
@@ -113,7 +117,7 @@ def orient(
 
 
 def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[str, int]]) -> None:
-    """Refuse an adjustment that nothing checks: every measurement fits it.
+    """Refuse an adjustment without redundancy, since every measurement fits it.
 
     Raises:
         GeometryError: no redundancy.
@@ -130,13 +134,13 @@ def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[st
 
 
 def reasons_of(windows: Windows, rows: IntArray, *, few: int, masked: int) -> list[tuple[str, int]]:
-    """Return why key points were not measured, and how many.
+    """Return the reasons why key points were not measured, with their numbers.
 
     Args:
-        windows: what was measured.
-        rows: image points that were to be measured.
-        few: image points of points that too few photographs see.
-        masked: where the mask is black.
+        windows: the measured windows.
+        rows: image points that should be measured.
+        few: number of image points of points that too few photographs see.
+        masked: number of image points where the mask is black.
     """
     lost = [(in_words(LsmFlag, flag), int(((windows.flag & flag) != 0).sum())) for flag in LsmFlag if flag]
     templates = int(((windows.flag[rows] == 0) & ~np.isfinite(windows.xy[rows]).all(axis=1)).sum())
@@ -147,7 +151,7 @@ def reasons_of(windows: Windows, rows: IntArray, *, few: int, masked: int) -> li
 
 
 def by_count(reasons: list[tuple[str, int]]) -> tuple[tuple[str, int], ...]:
-    """Return why key points took no part, most frequent first, without what there was none of."""
+    """Return the reasons with a number above 0, the most frequent first."""
     return tuple((why, count) for why, count in sorted(reasons, key=lambda one: -one[1]) if count)
 
 
@@ -165,22 +169,22 @@ def whole_model(
     points: BoolArray,
     tolerance_px: float,
 ) -> tuple[Estimate, IntArray]:
-    """Return the whole model with an adjusted part in it, its other points intersected with what is new.
+    """Return the whole model with its adjusted part, and with its other points intersected.
 
-    Where three photographs or more measured such a point anew these rays meet in it, else all rays as they
-    came.
+    If at least three photographs measured such a point again, these rays are intersected. Otherwise all
+    original rays are.
 
     Args:
         network: the model.
-        estimate: as it came.
-        part: adjusted, targets behind the points of the model.
-        windows: image points measured anew.
+        estimate: the original solution of the model.
+        part: adjusted part; targets follow the points of the model.
+        windows: image points measured again.
         images: photographs of the part, (m,).
         points: points of the part, (n,).
-        tolerance_px: largest residual of a ray measured anew.
+        tolerance_px: largest residual of a ray measured again, px.
 
     Returns:
-        The estimate, and the image points measured anew that meet in points which were not adjusted.
+        The estimate, and the new image points whose rays meet in points that were not adjusted.
     """
     position, rotation, xyz = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
     position[images], rotation[images] = part.position, part.rotation
@@ -194,10 +198,8 @@ def whole_model(
     met = intersect_image_points(anew, network.camera, oriented, n_points=n, tolerance_px=tolerance_px)
     enough = met.rays >= MIN_RAYS
     xyz[enough] = met.points[enough]
-    as_it_came = seen.select(other & ~enough[seen.point])
-    found = intersect_image_points(
-        as_it_came, network.camera, oriented, n_points=n, tolerance_px=np.inf
-    ).points
+    original = seen.select(other & ~enough[seen.point])
+    found = intersect_image_points(original, network.camera, oriented, n_points=n, tolerance_px=np.inf).points
     again = np.isfinite(found).all(axis=1)
     xyz[again] = found[again]
     return replace(oriented, points=xyz), rows[met.used & enough[anew.point]]
@@ -206,13 +208,13 @@ def whole_model(
 def part_of(
     network: Network, estimate: Estimate, accepted: BoolArray, rays: IntArray
 ) -> tuple[Network, Estimate, BoolArray, BoolArray]:
-    """Return what accepted image points determine, and which photographs and points that are.
+    """Return the part of a network that accepted image points determine, and its photographs and points.
 
     Args:
-        network: the whole.
-        estimate: its solution.
-        accepted: image points, (k,).
-        rays: that each point needs, (n,).
+        network: the whole network.
+        estimate: solution of the network.
+        accepted: accepted image points, (k,).
+        rays: rays that each point needs, (n,).
     """
     images, points = determined(network, estimate, accepted, rays)
     part, start = reduce_network(network, estimate, images, points, accepted)
@@ -224,16 +226,16 @@ class ModelTargets:
     """The coded targets in the photographs of a model."""
 
     network: Network  # their image points, control and scale bars; photographs as in the model
-    points: FloatArray  # their coordinates by the orientation of the model, NaN where unknown, (t, 3)
-    min_rays: IntArray  # photographs that each of them needs, (t,)
+    points: FloatArray  # target coordinates in the frame of the model, NaN where unknown, (t, 3)
+    min_rays: IntArray  # photographs that each target needs, (t,)
     placement: Similarity  # object frame from that of the model
     datum: Datum
     unit: str  # object unit
-    contradicting: int  # image points that are not where their target is
-    remarks: tuple[Remark, ...]  # on what was given
+    contradicting: int  # number of image points that contradict their target
+    remarks: tuple[Remark, ...]  # on targets, control and scale bars
 
     def placed(self) -> ModelTargets:
-        """Return them in the object frame."""
+        """Return the targets in the object frame."""
         return replace(
             self,
             points=self.placement.apply(self.points),
@@ -250,20 +252,22 @@ def measure_model_targets(
     tolerance_px: float = 5.0,
     progress: Progress = SILENT,
 ) -> ModelTargets:
-    """Find and measure the coded targets in the photographs of a model, and where the object frame is.
+    """Find and measure the coded targets in the photographs of a model, and determine the object frame.
 
     Args:
-        survey: describes the targets, and gives control and scale bars; its cameras are not used.
+        survey: states targets, control and scale bars; its cameras are not used.
         network: the model.
-        estimate: its solution.
-        images_dir: folder of its photographs.
-        tolerance_px: of an image point from its intersected target; farther away it is another target's.
-        progress: receives photographs.
+        estimate: solution of the model.
+        images_dir: folder of the photographs.
+        tolerance_px: largest distance of an image point from its intersected target, px; beyond it the image
+            point belongs to another target.
+        progress: receives every photograph.
 
     Raises:
         SurveyFileError: the survey has no coded targets, or a photograph of the model is not in the folder.
-        PhotographError: a photograph that cannot be read, or of another size than its camera.
-        GeometryError: no target is seen by two photographs, or fewer of control and bars than are needed.
+        PhotographError: a photograph cannot be read, or has another size than its camera.
+        GeometryError: no two photographs see the same target, or too few control points or scale bars are
+            among the targets.
     """
     family = survey.family
     if family is None or survey.tie_points is not None or survey.observations is not None:
@@ -322,7 +326,7 @@ def measure_model_targets(
 
 
 def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) -> tuple[Network, Estimate]:
-    """Return a model with targets behind its points, and their control and scale bars."""
+    """Return a model with targets appended to its points, and with their control and scale bars."""
     n, added = len(network.points), targets.network
     first, second, control, bars = network.image_points, added.image_points, added.control, added.scale_bars
     joined = ImagePoints(
@@ -343,7 +347,7 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
 def _intersected(
     network: Network, estimate: Estimate, tolerance_px: float
 ) -> tuple[Network, FloatArray, int]:
-    """Return the network without image points that contradict their target, all targets, how many."""
+    """Return the network without contradicting image points, all targets, and the number of these points."""
     seen = network.image_points
     found = intersect_image_points(
         seen, network.camera, estimate, n_points=len(network.points), tolerance_px=tolerance_px
@@ -353,11 +357,11 @@ def _intersected(
 
 
 def _placement(survey: Survey, targets: Network, points: FloatArray) -> tuple[Similarity, tuple[Remark, ...]]:
-    """Return the object frame from that of the model, by control, else by scale bars, and remarks.
+    """Return the transformation from model to object frame, by control, else by scale bars, and remarks.
 
     Raises:
-        GeometryError: the datum is control, and fewer than three control points are among the targets; or
-            control or scale bars are given, and too few of them are among the targets to give the scale.
+        GeometryError: the datum is control but fewer than three control points are among the targets, or
+            control or scale bars are given but too few are among the targets to give the scale.
     """
     control = targets.control.complete
     known: BoolArray = np.isfinite(points.sum(axis=1))

@@ -1,8 +1,8 @@
-"""The key points of a model measured anew by least squares matching, and the model adjusted again.
+"""Refinement of a solved model: its key points are measured again, and the model is adjusted again.
 
-The last adjustment of a refined model, where its targets bring control and scale bars.
-
-Which interior parameters of a model are estimated anew, and which are held.
+Key points are measured by least squares matching. Windows that do not overlap give the orientation, and the
+other points are intersected in it. If coded targets bring control or scale bars, these take part in the final
+adjustment. `free_cameras` chooses the interior parameters that are estimated again.
 """
 
 from __future__ import annotations
@@ -56,25 +56,29 @@ from sfm.survey.refining.windows import (
     outside_masks,
 )
 
-# Sides of windows that are tried. Larger ones gain nothing where they cover a photograph, and where the
-# surface is curved they measure its mean depth over them, in all photographs alike, which no residual shows.
+# Sides of windows that are tried. Larger windows that cover a photograph gain nothing. On a curved surface
+# they
+# measure its mean depth, with the same error in all photographs, and no residual shows it.
 WINDOWS_PX = (15, 11)
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
-FOCAL_NAMES = ("f", "fx", "fy")  # each of which fixes both, where one of them is a camera's only one
-FIRST_RADIAL = {"k": "k1"}  # another name of the only coefficient
+FOCAL_NAMES = ("f", "fx", "fy")  # any of these names holds the only principal distance of a camera
+FIRST_RADIAL = {"k": "k1"}  # other name of a single radial coefficient
 
 GROUPS = ("key points", "targets")
 
-# Over larger windows no surface is a plane, and memory and time grow with the square of the side.
+# No surface is plane over larger windows, and memory and time grow with the square of the side.
 MAX_WINDOW_PX = 101
-# Off the axis tangents grow without bounds, and a pixel is worth less and less of them
+# Far off the axis tangents grow without bounds.
 MAX_OFF_AXIS_DEG = 85.0
-# Of the robust spread of the model's residuals, beyond which a key point was another one
+# Shift over the robust spread of the model's residuals, beyond which a match is another point.
 MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
-# Not only the key points are wrong if the RMS after is more than this part of that before, and sigma0 more
-# than twice what windows and surfaces explain; a model that was refined before has as low an RMS as after
+# If the RMS after refinement is more than this fraction of the RMS before, and sigma0 is more than twice the
+# value
+# that windows and surfaces explain, not only the key points are wrong. A model that was refined before also
+# has a
+# similar RMS before and after.
 HARDLY_BETTER = 0.5
 MAX_SIGMA0 = 2.0
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"
@@ -82,51 +86,49 @@ BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off t
 
 @dataclass(frozen=True)
 class Refinement:
-    """A model before and after its key points were measured anew."""
+    """A model before and after its key points were measured again."""
 
-    model: Network  # as it came
-    start: Estimate  # as it came, with the parameters freed that the adjustment estimates
-    before_px: float  # RMS per coordinate of the model as it came, px
-    readjusted: Adjustment  # the same points adjusted here, without rejection
-    adjustment: Adjustment  # of the points measured anew
-    estimate: Estimate  # of the whole model: adjusted, else as it came, points of few rays intersected anew
-    rows: IntArray  # image point of the model of each one of the adjustment, targets behind them, (k,)
-    further: IntArray  # image points measured anew of points that others cover, intersected afterwards
-    xy: FloatArray  # image points measured anew, NaN where they are not, px, (k, 2)
+    model: Network  # the original model
+    start: Estimate  # its original solution; the parameters to estimate are free
+    before_px: float  # RMS per coordinate of the original model, px
+    readjusted: Adjustment  # of the original key points, without rejection
+    adjustment: Adjustment  # of the new image points
+    estimate: Estimate  # the whole model: adjusted values, other points intersected, the rest original
+    rows: IntArray  # image point of the model for each one of the adjustment but the targets, (k,)
+    further: IntArray  # new image points that were not adjusted but intersected afterwards
+    xy: FloatArray  # new image points, NaN if not measured, px, (k, 2)
     window_px: int  # side of the windows
     images: BoolArray  # photographs of the model that were adjusted, (m,)
     points: BoolArray  # points of the model that were adjusted, (n,)
-    residuals_before: (
-        FloatArray  # computed minus measured in the model as it came, NaN if unknown, px, (k, 2)
-    )
-    reasons: tuple[tuple[str, int], ...]  # why key points took no part, and how many, most frequent first
-    targets: ModelTargets | None = None  # points of the adjustment behind those of the model
-    found: tuple[Remark, ...] = ()  # on what was given with them
+    residuals_before: FloatArray  # computed minus measured in the original model, px, NaN if unknown, (k, 2)
+    reasons: tuple[tuple[str, int], ...]  # (why key points took no part, number), most frequent first
+    targets: ModelTargets | None = None  # they follow the points of the model in the adjustment
+    found: tuple[Remark, ...] = ()  # on targets, control and scale bars
 
     @property
     def key_points(self) -> int:
-        """Image points of the model."""
+        """Number of image points of the model."""
         return len(self.model.image_points)
 
     @property
     def refined(self) -> int:
-        """Of these, measured anew in agreement with the adjustment."""
+        """Number of image points that were measured again and agree with the adjustment."""
         return int(self.accepted.sum())
 
     @property
     def readjusted_px(self) -> float:
-        """RMS per coordinate of the model's key points adjusted here, px."""
+        """RMS per coordinate of the original key points after adjustment, px."""
         return self.readjusted.rms_px
 
     @property
     def after_px(self) -> float:
-        """RMS per coordinate of the key points measured anew and adjusted, px."""
+        """RMS per coordinate of the new key points after adjustment, px."""
         v = self.adjustment.residuals[: len(self.rows)]
         return float(np.sqrt((v[~self.adjustment.rejected[: len(self.rows)]] ** 2).mean()))
 
     @property
     def accepted(self) -> BoolArray:
-        """Image points of the model that are measured anew and agree with the adjustment, (k,)."""
+        """Image points of the model that were measured again and agree with the adjustment, (k,)."""
         accepted = np.zeros(self.key_points, dtype=bool)
         accepted[self.rows[~self.adjustment.rejected[: len(self.rows)]]] = True
         accepted[self.further] = True
@@ -134,7 +136,7 @@ class Refinement:
 
     @property
     def dependable(self) -> bool:
-        """Whether the adjustment converged and determines all but the datum."""
+        """Whether the adjustment converged and determines everything except the datum."""
         return self.adjustment.converged and self.adjustment.defect <= self.adjustment.expected_defect
 
     @property
@@ -162,33 +164,33 @@ class Refinement:
 
     @property
     def points_anew(self) -> BoolArray:
-        """Points of the model from image points measured anew, adjusted or intersected, (n,)."""
+        """Points of the model from new image points, adjusted or intersected, (n,)."""
         anew = self.points.copy()
         anew[self.model.image_points.point[self.further]] = True
         return anew
 
     @property
     def target_points(self) -> IntArray:
-        """Points of the adjustment that are targets."""
+        """Indices of the targets among the points of the adjustment."""
         return np.arange(int(self.points.sum()), len(self.adjustment.network.points))
 
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """How image points are measured anew.
+    """Settings for measuring the image points of a model again.
 
     Raises:
         GeometryError: an impossible window or correlation.
     """
 
-    window_px: int | None = None  # odd side of the windows, at most MAX_WINDOW_PX; the best of some if None
+    window_px: int | None = None  # odd side of the windows, at most MAX_WINDOW_PX; None: chosen by trial
     min_correlation: float = 0.7  # smallest coefficient r of a window and its template, 0 to 1
-    fixed: tuple[str, ...] = ()  # interior parameters that are held at the model's values, as fx, cx or k1
+    fixed: tuple[str, ...] = ()  # interior parameters held at the values of the model, such as fx, cx or k1
     masks_dir: Path | None = None
-    """folder of masks, named as their photographs with .png behind; black key points take no part"""
+    """folder of masks, named like their photographs plus .png; key points on black take no part"""
 
     def __post_init__(self) -> None:
-        """Refuse what is impossible before a photograph is read."""
+        """Refuse impossible settings before any photograph is read."""
         if self.window_px is not None and odd_window("refine", self.window_px) > MAX_WINDOW_PX:
             raise GeometryError(f"refine: window is {self.window_px} px, needed at most {MAX_WINDOW_PX} px")
         if not 0 <= self.min_correlation <= 1:
@@ -204,23 +206,23 @@ def refine_model(
     targets: ModelTargets | None = None,
     progress: Progress = SILENT,
 ) -> Refinement:
-    """Measure all image points of a solved model by least squares matching and adjust it again.
+    """Measure all image points of a solved model by least squares matching, and adjust the model again.
 
-    Windows that overlap measure the same pixels. The orientation is adjusted from points whose windows do
-    not, so that its precision is not stated too good; the others are intersected afterwards.
+    Windows that overlap measure the same pixels, and would make the precision look too good. Therefore only
+    windows that do not overlap give the orientation. The other points are intersected afterwards.
 
     Args:
-        network: a solved model, as `adapters.colmap.camera_models.read_model` gives it.
-        estimate: its solution.
-        images_dir: folder of its photographs.
-        settings: windows, and what is held.
-        targets: of its photographs, in the frame of the estimate; see `measure_model_targets`.
-        progress: receives stages and parts.
+        network: a solved model, as returned by `adapters.colmap.camera_models.read_model`.
+        estimate: solution of the model.
+        images_dir: folder of the photographs.
+        settings: windows, and the parameters to hold.
+        targets: targets in the photographs, in the frame of the estimate; see `measure_model_targets`.
+        progress: receives stages and their steps.
 
     Raises:
         SurveyFileError: a photograph of the model is not in the folder.
-        PhotographError: a photograph that cannot be read, or of another size than its camera.
-        GeometryError: an impossible name to hold, or too little is left to adjust.
+        PhotographError: a photograph cannot be read, or has another size than its camera.
+        GeometryError: no camera has a parameter of a name to hold, or too little is left to adjust.
     """
     window_px = settings.window_px
     seen = network.image_points
@@ -323,7 +325,7 @@ def refine_model(
 
 
 def _off_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
-    """Return the larger residual of each image point measured anew, px; NaN where its point has few, (k,)."""
+    """Return the larger residual of each new image point, px, NaN if its point has few rays, (k,)."""
     seen = network.image_points
     measured = np.isfinite(windows.xy).all(axis=1)
     rays = np.bincount(seen.point[measured], minlength=len(network.points))
@@ -349,7 +351,7 @@ def refinement_text(result: Refinement) -> str:
 
 
 def _describe_targets(result: Refinement) -> str:
-    """Return the line of targets, control and scale bars; none where they were not asked for."""
+    """Return the line on targets, control and scale bars; empty without targets."""
     if result.targets is None:
         return ""
     measured, a = result.targets.network, result.adjustment
@@ -366,7 +368,7 @@ def _describe_targets(result: Refinement) -> str:
 
 
 def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntArray:
-    """Return the row of each point that sees it at its middle scale, -1 for points with few rays, (n,)."""
+    """Return the image point of each point with its median scale, -1 for points with few rays, (n,)."""
     seen = network.image_points
     depth, distance = _lengths(network, estimate)
     of = network.camera[seen.image]
@@ -393,17 +395,17 @@ def _lengths(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArr
 def adjust_finally(
     part: Network, start: Estimate, datum: Datum, *, matched: int, unit: str
 ) -> tuple[Adjustment, tuple[Remark, ...]]:
-    """Return the last adjustment with its covariance, and what of control and bars was left out.
+    """Return the final adjustment with its covariance, and remarks on control and scale bars left out.
 
-    Where control or scale bars take part, key points and targets are weighted by their variance
-    components, so that these keep the standard deviations that were stated for them. Control or a bar that
-    the key points and targets contradict is left out.
+    If control or scale bars take part, key points and targets are weighted by their variance components.
+    Control and bars then keep their stated standard deviations. Control or a bar that contradicts the key
+    points and targets is left out.
 
     Args:
         part: accepted image points, with control and scale bars.
-        start: its solution in a free datum, near that of the control.
-        datum: how position, attitude and scale are decided.
-        matched: points before the targets.
+        start: solution in a free datum, near that of the control.
+        datum: datum of position, attitude and scale.
+        matched: number of points before the targets.
         unit: object unit.
     """
     alpha = level_of_single(FALSE_ALARM, 2 * len(part.image_points))
@@ -447,10 +449,10 @@ def adjust_finally(
 
 
 def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
-    """Return the cameras with what is to be estimated freed; see `_freed`.
+    """Return the cameras with the parameters to estimate free; see `_freed`.
 
     Raises:
-        GeometryError: a name to hold that is no parameter of any camera.
+        GeometryError: a name to hold is not a parameter of any camera.
     """
     known = dict.fromkeys(name for camera in estimate.cameras for name in camera.names)
     for name in fixed:
@@ -465,22 +467,20 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
 
 
 def _other_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return what parameters are called in models with more of them."""
+    """Return the names of the parameters in models with more parameters."""
     return tuple(FIRST_RADIAL.get(name, name) for name in names)
 
 
 def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
-    """Free what the image points of a model determine, but for what is to be held.
+    """Free the parameters that the image points of a model determine, except for those to hold.
 
-    Principal distances and principal point, and the distortion that the model has. COLMAP fixes the
-    principal point unless asked otherwise; held at a wrong place all photographs are turned to make up for
-    it.
+    These are the principal distances, the principal point, and the distortion that the model has. COLMAP
+    fixes the principal point unless asked otherwise. If it is held at a wrong position, rotations of all
+    photographs compensate for it.
 
-    Args:
-        camera: of the model.
-        photographs: oriented ones of it; fewer than MIN_PHOTOGRAPHS do not separate the principal point from
-            a rotation.
-        fixed: names of parameters to hold; f is fx and fy, too, and either of these the only f.
+    photographs: number of oriented photographs of the camera; fewer than MIN_PHOTOGRAPHS do not separate the
+    principal point from a rotation.
+    fixed: names of parameters to hold; f also stands for fx and fy, and fx or fy for a single f.
     """
     free = camera.free
     if not free.any():

@@ -1,4 +1,8 @@
-"""Key points of a model measured anew in its photographs."""
+"""Key points of a model, measured again in its photographs by least squares matching.
+
+Every key point is matched from the reference photograph of its object point. Trials on a few photographs
+choose the size of the windows. Blurred or noisy photographs are reduced before matching.
+"""
 
 from __future__ import annotations
 
@@ -24,50 +28,51 @@ from sfm.runtime.progress import SILENT, Progress
 
 TRIAL_PHOTOGRAPHS = 3  # whose points choose the window
 MIN_RAYS = 3  # of a point that is measured
-SHRINKS = (1, 2, 4)  # pixels of a photograph along a side of one, of photographs that are reduced
-# Ratio of precisions up to which finer pixels are taken: over large windows surfaces are not plane, which
-# shifts the matches of all photographs alike, and no residual shows it.
+SHRINKS = (1, 2, 4)  # pixels of the photograph along the side of one pixel of the reduced photograph
+# Ratio of precisions up to which finer pixels are preferred. Surfaces are not plane over large windows, which
+# shifts
+# the matches of all photographs alike, and no residual shows it.
 MAX_REDUCED_RATIO = 1.5
-TRIAL_RAYS = 100  # with fewer the window stays as it is
+TRIAL_RAYS = 100  # with fewer rays the window stays as it is
 
 
 class Size(NamedTuple):
-    """Of windows: pixels of the photographs, which may be reduced."""
+    """Size of windows in photographs that may be reduced."""
 
     window_px: int  # odd side, in pixels of the reduced photographs
-    shrink: int = 1  # pixels of a photograph along a side of one of these
+    shrink: int = 1  # pixels of the photograph along the side of a reduced pixel
 
     @property
     def side_px(self) -> int:
-        """Side in px of the model."""
+        """Side in pixels of the model."""
         return self.window_px * self.shrink
 
 
 class Limits(NamedTuple):
-    """Limits beyond which a place is no match."""
+    """Limits of an accepted match."""
 
-    shift_px: float  # farther from the key point
-    correlation: float  # below it a window is not alike
+    shift_px: float  # largest distance from the key point
+    correlation: float  # smallest correlation coefficient
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Image points measured anew."""
+    """Image points measured again."""
 
-    xy: FloatArray  # px, NaN with the reason in the flag, (k, 2)
+    xy: FloatArray  # px, NaN if not measured, with the reason in the flag, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
     flag: IntArray  # see LsmFlag, (k,)
 
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """Image points of a model that can be measured anew, and where they are matched."""
+    """Image points of a model that can be measured again, with their templates."""
 
     folder: Path  # of the photographs
     network: Network  # the model
     rows: IntArray  # image points that can be measured, (k,)
-    reference: IntArray  # the row of each point that is its template, -1 for points not measured, (n,)
-    limits: Limits  # what is a match no more, in pixels of the photographs
+    reference: IntArray  # image point that is the template of each point, -1 for points not measured, (n,)
+    limits: Limits  # of a match, in pixels of the photographs
 
 
 def match_windows(
@@ -80,20 +85,20 @@ def match_windows(
 ) -> Windows:
     """Measure image points by least squares matching from the reference photograph of their point.
 
-    The window is seen in perspective on the plane through the points around it. In the reference it is moved
-    to a whole pixel, which needs no resampling. Half of the noise of a match is that of the template and goes
-    to the reference. All is matched in the pixels of the photographs, which may be reduced, and returned in
-    px of the model.
+    The window is projected in perspective on the plane through the points around it. In the reference it is
+    moved to a whole pixel, which avoids resampling. Half of the noise of a match is that of the template, and
+    is assigned to the reference. Matching uses the pixels of the photographs, which may be reduced. The
+    result is in pixels of the model.
 
     Args:
         keys: key points of the model.
-        estimate: its solution.
-        size: of the windows.
-        rows: image points to measure, all of the key points if not given.
-        progress: receives reference photographs.
+        estimate: solution of the model.
+        size: size of the windows.
+        rows: image points to measure; all key points if not given.
+        progress: receives the reference photographs.
 
     Raises:
-        PhotographError: a photograph that cannot be read, or of another size than its camera.
+        PhotographError: a photograph cannot be read, or has another size than its camera.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
@@ -147,7 +152,7 @@ def match_windows(
 
 
 def _reduced(network: Network, estimate: Estimate, shrink: int) -> tuple[Network, Estimate]:
-    """Return a model in the pixels of photographs that are reduced."""
+    """Return a model in the pixels of reduced photographs."""
     seen = network.image_points
     small = replace(seen, xy=(seen.xy + 0.5) / shrink - 0.5, covariance=seen.covariance / shrink**2)
     cameras = tuple(camera.reduced(shrink) for camera in estimate.cameras)
@@ -162,17 +167,18 @@ def best_size(
     alike: float = MAX_COST_RATIO,
     tolerance_px: float,
 ) -> Size:
-    """Return the windows that determine the most together.
+    """Return the size of windows that together give the best precision.
 
-    By the spread of the rays that meet over the root of their number, of windows that do not overlap: where
-    small windows are too small to be found, there are few. A few photographs show it.
+    The criterion is the spread of the rays that meet, over the square root of the number of windows that do
+    not overlap. If windows are too small to be matched, few rays meet. A few photographs are enough for the
+    test.
 
     Args:
         keys: key points of the model.
-        estimate: its solution.
-        sizes: that are tried.
-        alike: ratio of precisions up to which the first size is taken in place of the best.
-        tolerance_px: largest residual of a ray that counts.
+        estimate: solution of the model.
+        sizes: sizes to try.
+        alike: ratio of precisions up to which the first size is preferred to the best one.
+        tolerance_px: largest residual of a ray that counts, px.
     """
     network, rows = keys.network, keys.rows
     seen = network.image_points
@@ -193,17 +199,17 @@ def best_size(
 def match_reduced(
     keys: KeyPoints, estimate: Estimate, windows: Windows, *, size: Size, tolerance_px: float
 ) -> Windows:
-    """Measure the points that are not found in all of their photographs again, in reduced photographs.
+    """Measure points that were not matched in all of their photographs again, in reduced photographs.
 
-    Where a photograph is blurred or its noise is smoothed, as telephones do, single pixels have no texture,
-    and matching diverges. Each point takes the finest pixels in which most of its rays meet.
+    If a photograph is blurred, or its noise is smoothed as in telephones, single pixels have no texture, and
+    matching diverges. Each point uses the finest pixels in which most of its rays meet.
 
     Args:
         keys: key points of the model.
-        estimate: adjusted with what was measured so far.
-        windows: this.
-        size: of the windows so far; the coarser ones have as many pixels.
-        tolerance_px: largest residual of a ray that counts.
+        estimate: adjusted with the image points measured so far.
+        windows: image points measured so far.
+        size: size of these windows; windows in reduced photographs have the same number of pixels.
+        tolerance_px: largest residual of a ray that counts, px.
     """
     network, rows = keys.network, keys.rows
     seen, n = network.image_points, len(network.points)
@@ -230,7 +236,7 @@ def match_reduced(
 def _meeting(
     network: Network, estimate: Estimate, windows: Windows, tolerance_px: float
 ) -> tuple[BoolArray, FloatArray]:
-    """Return which rays meet in their points, (k,), and the residuals of these, tangents, (r, 2)."""
+    """Return which rays meet in their points, (k,), and the residuals of these rays, tangents, (r, 2)."""
     seen = network.image_points
     good = np.isfinite(windows.xy).all(axis=1)
     rays = ImagePoints(seen.image[good], seen.point[good], windows.xy[good], windows.covariance[good])
@@ -252,7 +258,10 @@ def _planes(
     rows_seen: IntArray,
     seen: ImagePoints,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return object points and normals of places of a photograph; it is faced where no plane is known."""
+    """Return object points and normals at positions of a photograph.
+
+    Without a known plane, the normal is the viewing direction of the photograph.
+    """
     points, normal = planes_at(estimate, camera, i, place, seen.point[rows_seen])
     unknown = ~np.isfinite(points).all(axis=1)
     points[unknown] = estimate.points[point[unknown]]
@@ -261,7 +270,7 @@ def _planes(
 
 
 class Photographs:
-    """The photographs of a model, read when they are needed; the oldest are forgotten."""
+    """The photographs of a model, read when needed; the oldest are removed from memory."""
 
     def __init__(
         self,
@@ -272,7 +281,7 @@ class Photographs:
         shrink: int = 1,
         memory_bytes: int = MEMORY_BYTES,
     ) -> None:
-        """Begin with none; `shrink` pixels along each side of a photograph become one."""
+        """Start with no photograph read; `shrink` pixels along each side are averaged into one."""
         self._paths = photograph_paths(network, estimate, folder)
         self._names = network.images
         self._sizes = [estimate.cameras[camera].size_px for camera in network.camera]
@@ -289,14 +298,19 @@ class Photographs:
 
 
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
-    """Return which image points are where the mask of their photograph is black, (k,).
+    """Return which image points are in the black part of their photograph's mask, (k,).
 
-    Masks have the name of their photograph with .png behind it, as COLMAP has them; photographs without one
-    are seen whole.
+    The name of a mask is the name of its photograph plus .png, as in COLMAP. Photographs without a mask are
+    used whole.
+
+    Args:
+        network: the model.
+        estimate: solution of the model.
+        folder: folder of the masks.
 
     Raises:
-        SurveyFileError: no mask at all in the folder.
-        PhotographError: a mask that cannot be read or has another size than its photograph.
+        SurveyFileError: the folder has no mask of any photograph.
+        PhotographError: a mask cannot be read or has another size than its photograph.
     """
     seen = network.image_points
     masked = np.zeros(len(seen), dtype=bool)
@@ -324,7 +338,7 @@ def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list
     """Return the paths of all photographs of a model.
 
     Raises:
-        SurveyFileError: one with an orientation is not in the folder, or outside of it.
+        SurveyFileError: an oriented photograph is not in the folder, or a path leads out of the folder.
     """
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}; the photographs of the model were needed")
@@ -347,7 +361,7 @@ def read_of_size(path: Path, name: str, size_px: tuple[int, int], *, channel: st
     (width, height), short = size_px, f"{path.name}: "
     try:
         photograph = read_photograph(path, channel=channel)
-    except PhotographError as error:  # of the photographs of a rig, each folder has one of that name
+    except PhotographError as error:  # folders of a rig contain photographs of equal names
         raise PhotographError(f"{name}: {str(error).removeprefix(short)}") from error
     if photograph.shape != (height, width):
         raise PhotographError(

@@ -1,4 +1,4 @@
-"""Settings that are fine one by one and do not go together, in survey files and in surveys from Python."""
+"""Checks for settings that are valid one by one but contradict each other."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from sfm.survey.inputs.survey import Survey
     from sfm.survey.inputs.survey_file import SurveyFile
 
-MAX_REPEATS = 3  # in the expression that finds a moment; a name of 255 characters is searched in 255^3 steps
+MAX_REPEATS = 3  # in the expression for a moment: searching a name of 255 characters takes 255^3 steps
 CALIBRATION_KEYS = {"calibration", "calibration_use"}
 
 
 def refuse_contradictions(survey: Survey | SurveyFile) -> None:
-    """Raise SurveyFileError where settings that are fine one by one do not go together."""
+    """Raise SurveyFileError if settings of a survey contradict each other."""
     where = survey.source
     if survey.tie_points is not None:
         if survey.targets.codes != "none":
@@ -116,7 +116,7 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
 
 
 def _refuse_contradicting_exterior(survey: Survey | SurveyFile) -> None:
-    """Raise SurveyFileError where exterior orientation is observed in no way or in two."""
+    """Raise SurveyFileError unless exterior orientation is observed in exactly one way."""
     table = survey.exterior.file if isinstance(survey.exterior, ExteriorSettings) else survey.exterior
     if survey.exterior is not None and (table is None) == (survey.exif_sigma_m is None):
         found = "neither is" if table is None else "both are"
@@ -131,7 +131,7 @@ def _refuse_contradicting_exterior(survey: Survey | SurveyFile) -> None:
 
 
 def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) -> None:
-    """Raise SurveyFileError where sizes of tags or rings do not go with the codes or with one another."""
+    """Raise SurveyFileError if sizes of tags or rings contradict the codes or each other."""
     if targets.tag_size is not None and targets.codes not in (*DICTIONARIES, *TAGGED):
         raise SurveyFileError(
             f"{where}: targets.tag_size is the size of tags, codes = '{targets.codes}' has none; "
@@ -159,7 +159,7 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
 
 
 def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
-    """Raise SurveyFileError where a camera in AICON's form is incomplete or is beside other values."""
+    """Raise SurveyFileError if a camera in AICON's form is incomplete or has other values too."""
     given = dict(camera.balanced)
     if camera.model != BALANCED_MODEL:
         raise SurveyFileError(f"{at}: balanced is given, model {camera.model}, expected {BALANCED_MODEL}")
@@ -186,7 +186,7 @@ def _refuse_contradictions_of_balanced(camera: CameraSettings, at: str) -> None:
 
 
 def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
-    """Raise SurveyFileError where the settings of a camera do not go together."""
+    """Raise SurveyFileError if the settings of a camera contradict each other."""
     known = MODELS[camera.model].names
     if camera.balanced:
         _refuse_contradictions_of_balanced(camera, at)
@@ -253,7 +253,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
 def _refuse_contradictions_of_rigs(
     rigs: Sequence[RigSettings], cameras: Sequence[CameraSettings], where: str
 ) -> None:
-    """Raise SurveyFileError for rigs of unknown or shared cameras, or moments that nothing finds."""
+    """Raise SurveyFileError for rigs with unknown or shared cameras, or with contradicting settings."""
     known = {camera.name: camera for camera in cameras}
     owner: dict[str, str] = {}
     for rig in rigs:
@@ -288,7 +288,7 @@ def _refuse_contradictions_of_rigs(
 
 
 def _refuse_pattern(pattern: str, where: str) -> None:
-    """Raise SurveyFileError for an expression without one group, or that could take forever on a name."""
+    """Raise SurveyFileError unless an expression has exactly one group and is fast on any name."""
     try:
         groups = re.compile(pattern).groups
     except (re.error, OverflowError, RecursionError) as error:
@@ -298,7 +298,7 @@ def _refuse_pattern(pattern: str, where: str) -> None:
             f"{where}: moment = '{pattern}' has {counted(groups, 'group')}, needed 1, such as "
             "'left_([0-9]+)', or moment = 'order'"
         )
-    bare = re.sub(r"\\.|\[[^\]]*\]", "x", pattern)  # without escaped characters and sets of them
+    bare = re.sub(r"\\.|\[[^\]]*\]", "x", pattern)  # without escaped characters and character sets
     if len(re.findall(r"[*+{]", bare)) > MAX_REPEATS or re.search(r"\)[*+{]", bare):
         raise SurveyFileError(
             f"{where}: moment = '{pattern}' repeats more than {MAX_REPEATS} parts, or a group, which could "

@@ -1,15 +1,16 @@
-"""Photographs whose errors are those of another: copies that were saved again or compressed.
+"""Copies of photographs that were saved again or compressed, found by their errors.
 
-A copy is no second observation: it would only make the result look more precise than it is. One whose
-compression makes errors larger than those of its original has other errors, and is one. Two photographs
-from one place have the residuals r_i and r_j and differ by d = r_i - r_j. With independent errors the square
-sum of d is that of both residuals together, with the same errors it is 0:
+A copy is no second observation: it would only make the result look more precise than it is. However, if
+compression causes larger errors than the original has, the errors differ, and the copy counts as an
+observation. Two photographs from one position have the residuals r_i and r_j, which differ by d = r_i - r_j.
+With independent errors the square sum of d equals that of both residuals together. With identical errors it
+is 0:
 
     |d|^2 / (|r_i|^2 + |r_j|^2) = 1 - rho.
 
-Copies by their bytes are found before, see `sfm.survey.measuring.targets`, and so are those by identical
-image points: no two exposures have the same noise, so that image points which are the same to the last digit
-were measured in one picture.
+Copies with the same bytes are found earlier, see `sfm.survey.measuring.targets`. So are copies with identical
+image points: no two exposures have the same noise, so image points that agree to the last digit come from one
+picture.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, sec. 2.7 (F distribution).
 """
@@ -32,18 +33,18 @@ from sfm.remarks.remark import remark
 from sfm.result import FailedImage
 from sfm.survey.inputs.measurements import Measurements
 
-ALPHA = 0.001  # probability of taking two exposures for one, of all pairs together
-MIN_CORRELATION = 0.7  # of the errors; 0.99 of real photographs saved as JPEG of quality 40
-SAME_PLACE = 1e-3  # of the distance, and rad: two photographs that are farther apart are no copies
-MIN_COMMON = 4  # image points that must be the same
-DIGIT_PX = 1e-6  # differences below it are of writing, not of measuring, px
+ALPHA = 0.001  # probability of taking two exposures for one, over all pairs
+MIN_CORRELATION = 0.7  # of the errors; it is 0.99 for real photographs saved as JPEG of quality 40
+SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are no copies
+MIN_COMMON = 4  # image points that must agree
+DIGIT_PX = 1e-6  # smaller differences are from writing, not from measuring, px
 
 
 def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
-    """Return for each photograph with the errors of an earlier one which that is, and their correlation.
+    """Return the copies by name, each with its original and the correlation of their errors.
 
     Args:
-        adjustment: of all photographs.
+        adjustment: adjustment of all photographs.
     """
     network, estimate = adjustment.network, adjustment.estimate
     seen = network.image_points
@@ -66,7 +67,7 @@ def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
 
 
 def _correlation(adjustment: Adjustment, rows_i: IntArray, rows_j: IntArray) -> tuple[float, float]:
-    """Return the correlation of the errors of two photographs, and its probability if there is none."""
+    """Return the correlation of the errors of two photographs, and its probability for independent errors."""
     seen = adjustment.network.image_points
     used_i, used_j = (rows[~adjustment.rejected[rows]] for rows in (rows_i, rows_j))
     _, a, b = np.intersect1d(seen.point[used_i], seen.point[used_j], return_indices=True)
@@ -81,11 +82,11 @@ def _correlation(adjustment: Adjustment, rows_i: IntArray, rows_j: IntArray) -> 
 
 
 def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]]) -> Measurements:
-    """Return measurements without the copies, which are named among the photographs that failed.
+    """Return measurements without the copies, which are listed among the failed photographs.
 
     Args:
-        measured: all photographs.
-        copies: by `find_copies`.
+        measured: measurements of all photographs.
+        copies: result of `find_copies`.
 
     Raises:
         GeometryError: fewer than two photographs are left.
@@ -130,13 +131,13 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
 
 
 def same_photographs(image: IntArray, point: IntArray, xy: FloatArray, camera: IntArray) -> dict[int, int]:
-    """Return for each photograph that is a copy which earlier one it is a copy of.
+    """Return the copies with identical image points, each with its original, as indices.
 
     Args:
         image: photograph of each image point, (k,).
-        point: its object point, (k,).
-        xy: its position, px, (k, 2).
-        camera: of each photograph, (m,).
+        point: object point of each image point, (k,).
+        xy: position of each image point, px, (k, 2).
+        camera: camera of each photograph, (m,).
     """
     seen: dict[tuple[int, bytes], int] = {}
     copies: dict[int, int] = {}
