@@ -1,11 +1,10 @@
 """Comparison of solutions: two adjusters on one network, a survey with a baseline, two results of one object.
 
-- `compare_results`: begin here; two results by names, aligned and tested.
-- `compare`: two solutions of one network, as `sfm.compare` and the report have them.
-- `find_stable_points`, `robust_weights`: points that did not move between two epochs.
+- `compare_results`: begin here; aligns two results by names and tests them.
+- `compare`: compares two solutions of one network, as in `sfm.compare` and the report.
+- `find_stable_points`, `robust_weights`: find points that did not move between two epochs.
 
-`two_adjusters` puts the same problem to both: equal weights, one camera model, image points without
-distortion.
+`two_adjusters` gives two adjusters the same problem: equal weights, and cameras in one distortion model.
 
     >>> import numpy as np
     >>> from sfm.comparison import robust_weights

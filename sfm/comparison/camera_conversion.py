@@ -1,13 +1,13 @@
 """Conversion of a camera from one distortion model to another, and image points without distortion.
 
-`brown` corrects the measured point and the other models distort the ideal one, so no conversion is exact:
-the parameters of the target model are fitted to the rays of the source over a grid of pixels, and what is
-left is stated. Principal distance and principal point take part in the fit, the rays do not turn.
+`brown` corrects the measured point, and the other models distort the ideal point, so no conversion is exact.
+The parameters of the target model are fitted to the rays of the source model over a grid of pixels, and the
+remaining misfit is stated. Principal distance and principal point take part in the fit. The rays are not
+rotated.
 
-Image points corrected for distortion, for programs that know none.
-
-The measured points are moved to where a camera without distortion and with square pixels sees the same rays.
-Nothing is lost but the raw coordinates; the way back needs the camera that they were measured with.
+For programs without distortion models, `undistort` corrects the image points. It moves them to the position
+at which a camera without distortion and with square pixels sees the same rays. Only the raw coordinates are
+lost, and the original camera restores them.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.kernels.compiling import compiled
 from sfm.network import Estimate, Network, rows_of
 
-PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts that a camera without distortion has
-GRID_STEPS = 32  # fit points along the longer side: the misfit varies as r^9 at most, four of them per period
-FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the end of double precision
-_OF_ONE = {"f": "fx", "k": "k1"}  # where a model has one focal length or one coefficient
+PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts of a camera without distortion
+GRID_STEPS = 32  # fit points along the longer side: four per period of a misfit that varies as r^9 at most
+FIT_TOLERANCE = 1e-15  # relative; the fit is small, so it runs to the limit of double precision
+_OF_ONE = {"f": "fx", "k": "k1"}  # for models with a single focal length or radial coefficient
 
 
 @dataclass(frozen=True)
 class Conversion:
-    """A camera in another model, and how well that model can describe the same."""
+    """A camera in another model, and the misfit of that model."""
 
-    camera: Camera  # in the target model; free where the source was
+    camera: Camera  # in the target model; parameters corresponding to free ones are free
     source_model: str  # model converted from
     rms_px: float  # root mean square misfit per coordinate over the region, px
     max_px: float  # longest misfit vector over the region, px
@@ -48,10 +48,10 @@ def convert_camera(
     Args:
         camera: interior orientation to convert.
         model: a name in sfm.distortion.models.CONVERTIBLE.
-        region_px: x_min, y_min, x_max, y_max of the region that matters, px, shape (4,); the whole
-            photograph if not given.
-        held: parameters of the model that must be 0, others take over what they can; where b1 is one of
-            them affinity becomes the ratio of the sides of a pixel.
+        region_px: x_min, y_min, x_max, y_max of the region of the fit, px, (4,); the whole photograph if not
+            given.
+        held: parameters of the model that must be 0; others compensate as far as possible. If b1 is held,
+            affinity becomes the ratio of the sides of a pixel.
 
     Raises:
         SurveyFileError: unknown model.
@@ -76,9 +76,9 @@ def convert_camera(
     start = start_values(_affinity_in_pixels(camera) if "b1" in held else camera, model)
     fitted = np.array([name not in held for name in start.names])
     start = start.with_parameters(np.where(fitted, start.parameters, 0.0))
-    from scipy.optimize import least_squares  # takes half a second, which most commands never need
+    from scipy.optimize import least_squares  # importing takes half a second, and most commands never need it
 
-    # The start is scaled by the effect of each parameter in px, so that the tolerance means the same to all.
+    # Parameters are scaled by their effect in px, so that the tolerance has the same meaning for all.
     fit = least_squares(
         lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[0].ravel(),
         start.parameters[fitted],
@@ -111,15 +111,15 @@ def convert_camera(
 def convert_cameras(
     estimate: Estimate, models: tuple[str, ...], *, held: tuple[str, ...] = ()
 ) -> tuple[Estimate, tuple[Conversion, ...]]:
-    """Return the estimate with every camera in one of some models, and what that cost.
+    """Return the estimate with every camera in one of the given models, and the conversions.
 
-    A camera that is in one of them already, and in need of nothing held, stays as it is; any other goes
-    into the first.
+    A camera in one of these models whose held parameters are 0 stays as it is. Any other camera is converted
+    into the first model.
 
     Args:
         estimate: a solution.
-        models: models that are wanted, the best first.
-        held: their parameters that must be 0.
+        models: accepted models, the best first.
+        held: parameters of these models that must be 0.
     """
     conversions = tuple(
         convert_camera(
@@ -133,15 +133,15 @@ def convert_cameras(
 
 
 def needs_less(camera: Camera, held: tuple[str, ...]) -> bool:
-    """Return whether a camera has a parameter other than 0 that must be 0."""
+    """Return whether a camera has a held parameter other than 0."""
     return any(camera.value(name) != 0 for name in held if name in camera.names)
 
 
 def _affinity_in_pixels(camera: Camera) -> Camera:
-    """Return the camera with its affinity in the ratio of the sides of a pixel.
+    """Return the camera with its affinity expressed as the ratio of the sides of a pixel.
 
-    It is the same camera for `brown` without shear, whose affinity is that of the measured point, and for
-    the opencv models, whose parameters are in px; for others it is a start.
+    The result is exact for `brown` without shear, whose affinity applies to the measured point, and for the
+    opencv models, whose parameters are in px. For other models it is an approximation.
     """
     sx, sy = camera.pixel_mm
     if not camera.in_mm:
@@ -155,18 +155,18 @@ def _affinity_in_pixels(camera: Camera) -> Camera:
 
 
 def _filled(p: FloatArray, fitted: BoolArray) -> FloatArray:
-    """All parameters of a model, those that are not fitted 0."""
+    """Return all parameters of a model, with 0 for those that are not fitted."""
     values = np.zeros(len(fitted))
     values[fitted] = p
     return values
 
 
 def start_values(camera: Camera, model: str) -> Camera:
-    """Return the camera in another model by the first terms of the reversed series.
+    """Return the camera in another model from the first terms of the reversed series.
 
-    Between `brown` and the opencv models they are p1 = c P2, p2 = -c P1, k1 = -c^2 K1,
-    k2 = c^4 (3 K1^2 - K2), k3 = c^6 (8 K1 K2 - 12 K1^3 - K3), and the same read the other way;
-    between other models distortion starts at 0, or at the same values where the parameters are the same.
+    Between `brown` and the opencv models they are p1 = c P2, p2 = -c P1, k1 = -c^2 K1, k2 = c^4 (3 K1^2 -
+    K2), k3 = c^6 (8 K1 K2 - 12 K1^3 - K3), and correspondingly in the other direction. Between other models
+    distortion starts at 0, or at the same values if the parameters are the same.
     """
     pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
     backward = MODELS[camera.model].corrects
@@ -191,7 +191,7 @@ def start_values(camera: Camera, model: str) -> Camera:
     else:
         fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
         c = fy * pixel[1]
-        same = camera.model in CONVERTIBLE  # others have coefficients of another kind
+        same = camera.model in CONVERTIBLE  # other models have coefficients of another kind
         if to_opencv:
             values |= (
                 _as_full_opencv(camera) if same else {"cx": camera.value("cx"), "cy": camera.value("cy")}
@@ -214,11 +214,11 @@ def start_values(camera: Camera, model: str) -> Camera:
 
 
 def corresponding_free(camera: Camera, model: str) -> BoolArray:
-    """Return which parameters of another model take over the part of the free ones of the camera, (n,).
+    """Return the parameters of another model that correspond to the free parameters of the camera, (n,).
 
-    A parameter is free when one that plays the same part is: a free K1 frees every radial term, since a
-    series cut short on one side is not cut short on the other. Where a model has two focal lengths in place
-    of one and an affinity, each covers both.
+    A parameter is free if a parameter of the same role is free in the camera. A free K1 frees every radial
+    term, since the inverse of a truncated series is not truncated. If a model has two focal lengths in place
+    of one focal length and an affinity, each of these corresponds to both.
     """
     source, target = MODELS[camera.model], MODELS[model]
     free = {one.role for one, is_free in zip(source.parameters, camera.free, strict=True) if is_free}
@@ -226,7 +226,7 @@ def corresponding_free(camera: Camera, model: str) -> BoolArray:
 
 
 def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:
-    """Parts in a source model that a parameter of a target model takes over."""
+    """Return the roles in the source model that correspond to a role in the target model."""
     radial = {Role.RADIAL, Role.DENOMINATOR}
     if role in radial:
         return radial
@@ -238,18 +238,18 @@ def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:
 
 
 def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:
-    """Coefficients of the inverse of r (1 + a r^2 + b r^4 + c r^6) to the same order."""
+    """Return the coefficients of the inverse of r (1 + a r^2 + b r^4 + c r^6) to the same order."""
     return -a, 3 * a**2 - b, 8 * a * b - 12 * a**3 - c
 
 
 def _as_full_opencv(camera: Camera) -> dict[str, float]:
-    """Parameters of full_opencv, 0 where a camera in a model with a part of them has none."""
+    """Return the parameters of full_opencv, 0 for those that the camera's model does not have."""
     values = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
     return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | values
 
 
 def _power_series(values: dict[str, float]) -> tuple[float, float, float]:
-    """First three coefficients of the radial term of full_opencv, the fraction divided out."""
+    """Return the first three series coefficients of the rational radial term of full_opencv."""
     k1, k2, k3, d1, d2, d3 = (values[f"k{i}"] for i in range(1, 7))
     s1 = k1 - d1
     s2 = k2 - d2 - d1 * s1
@@ -257,7 +257,7 @@ def _power_series(values: dict[str, float]) -> tuple[float, float, float]:
 
 
 def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
-    """Pixels spread evenly over the region, its border included, (k, 2)."""
+    """Return pixels spread evenly over the region, including its border, (k, 2)."""
     width, height = camera.size_px
     region = np.array([-0.5, -0.5, width - 0.5, height - 0.5]) if region_px is None else region_px
     extent = region[2:] - region[:2]
@@ -271,7 +271,7 @@ def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
 def _residuals(
     model: int, frame: FloatArray, p: FloatArray, xy: FloatArray, uv: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (k, 2) and their derivatives by the parameters (k, 2, n) at given pixels and rays."""
+    """Return residuals, (k, 2), and their derivatives by the parameters, (k, 2, n), at pixels and rays."""
     r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
     residuals = np.empty((len(xy), 2))
     jacobian = np.empty((len(xy), 2, len(p)))
@@ -283,17 +283,18 @@ def _residuals(
 
 
 def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> tuple[Network, Estimate]:
-    """Return image points without distortion and the ideal cameras that see them.
+    """Return image points without distortion, and the ideal cameras that see them.
 
-    The rays are the same to rounding; covariances of image points follow.
+    The rays are the same except for rounding. The covariances of image points are propagated.
 
     Args:
-        network: measured image points.
-        estimate: cameras they were measured with.
-        models: that the ideal cameras may be in, with all distortion 0; brown or opencv must be one of them.
+        network: has the measured image points.
+        estimate: has the cameras that they were measured with.
+        models: allowed models of the ideal cameras, with all distortion 0; brown or opencv must be one of
+            them.
 
     Raises:
-        GeometryError: a distortion that cannot be inverted at a measured point.
+        GeometryError: a distortion cannot be inverted at a measured point.
     """
     seen = network.image_points
     xy, covariance = seen.xy.copy(), seen.covariance.copy()
@@ -323,7 +324,7 @@ def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> 
 
 
 def ideal_camera(camera: Camera, models: tuple[str, ...]) -> Camera:
-    """Return the camera without distortion: its principal distance and principal point, square pixels."""
+    """Return the camera without distortion: with its principal distance and point, and square pixels."""
     sx, sy = (float(side) for side in camera.pixel_mm)
     centre = (np.asarray(camera.size_px) - 1) / 2
     if camera.in_mm:

@@ -1,26 +1,27 @@
-"""Why the coordinates of the same points differ in two results: alternatives tested by one rule.
+"""Causes of the differences between the coordinates of the same points in two results: tests of alternatives.
 
-An alternative is a row: what of one result may be another in the second one. It is the scale, the handedness,
-the names of the points, a strain or a bending of the whole. With it the differences are formed anew and
-tested for congruency. A row explains the differences if a majority of the points then agrees. It wins if its
-likelihood
+An alternative is a row. It states what may differ between the two results: the scale, the handedness, the
+names of the points, a strain, or a bending of the whole object. Under each row the differences are computed
+again and tested for congruency. A row explains the differences if the majority of the points then agrees. It
+wins if its likelihood
 
     L = ln p(d) - moved ln(extent / sigma)^3 - ln C(n, moved) - q/2 ln(3 n) - S
 
-exceeds that of the assumption that nothing but single points changed by ln(rows / alpha); p is Student's
-density of the stable points, q the row's parameters and S the logarithm of the choices searched inside it.
-Simple rows come first, and a later row must exceed them as much: a bending of the second degree also
-imitates a strain, and a strain a scale and a mirror. Where no row explains the differences, a permutation
-test asks whether the points have anything to do with one another.
+exceeds that of the assumption that only single points changed by ln(rows / alpha). Here p is Student's
+density of the stable points, q the number of parameters of the row, and S the logarithm of the number of
+choices searched inside it. Simple rows come first, and a later row must exceed them by the same margin: a
+bending of the second degree also imitates a strain, and a strain imitates a scale and a mirror. If no row
+explains the differences, a permutation test decides whether the points are related at all.
 
-Two sets of points brought onto one another by their geometry alone, whatever their names. Triangles of
-neighbouring points are compared by their sides, or by the ratios of these where the scale is not known. Each
-pair of triangles of one shape proposes a similarity, and the one that brings most points of one set onto
+`find_pattern` aligns two sets of points by their geometry alone, whatever their names. It compares triangles
+of neighbouring points by their sides, or by the ratios of the sides if the scale is unknown. Each pair of
+triangles of the same shape proposes a similarity. The similarity that brings most points of one set onto
 points of the other wins.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Schwarz (1978),
 Estimating the dimension of a model, for q/2 ln n; Jackson (1995), PROTEST: a Procrustean randomization test,
-Ecoscience 2, 297-303, for the last; Groth (1986), A pattern-matching algorithm for two-dimensional coordinate
+Ecoscience 2, 297-303, for the permutation test; Groth (1986), A pattern-matching algorithm for
+two-dimensional coordinate
 lists, Astronomical Journal 91, 1244-1248, with triangles in space; Fischler, Bolles (1981), Random sample
 consensus.
 """
@@ -48,20 +49,20 @@ from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray, UnitFacto
 from sfm.errors import GeometryError
 from sfm.similarity import MAX_COLLINEAR_RATIO, Similarity, extended_axes, fit_similarity, mean_distance
 
-NEIGHBOURS = 6  # of each point, that make triangles with it
+NEIGHBOURS = 6  # of each point, which form triangles with it
 TRIANGLES = 100  # of the first set that are tried
-SIMILAR_TRIANGLES = 5  # triangles of the second set that are tried for each
+SIMILAR_TRIANGLES = 5  # triangles of the second set that are tried for each triangle of the first
 ROUNDS = 5  # of pairing and fitting after a proposal
-ENOUGH_FRACTION = 0.9  # of the points: no better proposal is looked for
-ALPHA = 0.001  # probability of a cause where there is none, of all rows together
-PERMUTATIONS = 999  # of the names; with as many the level of the permutation test is 0.001
-MIN_PERMUTED = 7  # points whose permutations are more than PERMUTATIONS
+ENOUGH_FRACTION = 0.9  # of the points; if so many match, the search ends
+ALPHA = 0.001  # probability of finding a cause where there is none, over all rows
+PERMUTATIONS = 999  # of the names; the level of the permutation test is then 0.001
+MIN_PERMUTED = 7  # points; fewer have no more than PERMUTATIONS permutations
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True)
 class Row:
-    """Attributes of the second result that may differ."""
+    """Properties of the second result that may differ."""
 
     scale: bool = False
     mirror: bool = False
@@ -81,7 +82,7 @@ ROWS = (  # the simple ones first
 
 @dataclass(frozen=True)
 class Stretch:
-    """Lengths of the second result over those of the first along a principal axis of a strain."""
+    """Ratio of lengths, second over first result, along a principal axis of a strain."""
 
     axis: FloatArray  # in the frame of the first, (3,)
     lengths: float
@@ -93,15 +94,15 @@ class Cause:
     """Explanation of the differences of two results."""
 
     row: Row
-    other_object: bool = False  # nothing does: the points have nothing to do with one another
-    lengths: float = 1.0  # of the second result over those of the first, if the scale is another
+    other_object: bool = False  # no explanation: the points are unrelated
+    lengths: float = 1.0  # ratio of lengths, second over first result, if the scale differs
     lengths_sigma: float = 0.0
-    unit: UnitFactor | None = None  # that lengths of the whole are given in another unit, if they are
-    rest: bool = False  # whether lengths differ beyond the unit, if the scale is another
-    stretches: tuple[Stretch, ...] = ()  # significant ones, the largest first, if there is a strain
-    renamed: tuple[tuple[str, str], ...] = ()  # name in the first result and name of the same in the second
-    moved: tuple[str, ...] = ()  # points that differ besides
-    gain: float = math.inf  # logarithm of the likelihood over that of points that moved
+    unit: UnitFactor | None = None  # the two units, if the second result has another length unit
+    rest: bool = False  # whether lengths also differ beyond the unit, if the scale differs
+    stretches: tuple[Stretch, ...] = ()  # significant stretches, the largest first, if there is a strain
+    renamed: tuple[tuple[str, str], ...] = ()  # (name in the first result, name in the second)
+    moved: tuple[str, ...] = ()  # points that still differ
+    gain: float = math.inf  # log-likelihood ratio against the assumption that single points moved
 
 
 @dataclass(frozen=True)
@@ -114,22 +115,22 @@ class _Fit:
     L: float
     agreed: bool  # whether a majority of the points agrees
     stable: BoolArray
-    lengths: tuple[float, float]  # of b over those of a, and the standard deviation
-    unit: UnitFactor | None  # of lengths
+    lengths: tuple[float, float]  # ratio of lengths b over a, and its standard deviation
+    unit: UnitFactor | None  # of the ratio of lengths
     stretches: tuple[Stretch, ...]
-    other: IntArray | None  # point of b that is each of a, -1 for none; None where names are as given
+    other: IntArray | None  # point of b for each point of a, -1 for none; None with the given names
 
 
 def find_cause(
     pairs: PointPairs, *, reference: BoolArray | None = None, changed: bool = True
 ) -> Cause | None:
-    """Return what explains the differences of two results; None where single points do, or nothing.
+    """Return the cause of the differences of two results; None if single points moved, or without a cause.
 
     Args:
-        pairs: the same points of both.
+        pairs: the same points of both results.
         reference: points that may carry the datum, (n,); all if not given.
-        changed: whether the points differ significantly by a test of all of them. If not, only the scale is
-            tested, which one parameter does more sharply.
+        changed: whether a test of all points shows a significant difference. If not, only the scale is
+            tested, since a test of one parameter is sharper.
     """
     if len(pairs.a) < MIN_STABLE:
         return None
@@ -143,12 +144,12 @@ def find_cause(
     limit = math.log(len(rows) / ALPHA)
     if not changed:
         rows = [row for row in rows if row == Row(scale=True)]
-    elif nothing.agreed:  # a majority agrees as it is
+    elif nothing.agreed:  # a majority agrees without any cause
         rows = [row for row in rows if not row.mirror]
     best = nothing
     for row in rows:
         if row.names and best.agreed and best.stable.sum() == reference.sum():
-            continue  # all points agree by the names that they have
+            continue  # all points agree with their given names
         with suppress(GeometryError):
             fit = _fit(pairs, row, nothing, reference, cost)
             if fit is not None and fit.agreed and best.L + limit < fit.L:
@@ -164,8 +165,8 @@ def is_unrelated(a: FloatArray, b: FloatArray) -> bool:
     """Return whether a similarity fits the points by their names no better than with the names shuffled.
 
     Args:
-        a: coordinates, (n, 3).
-        b: of the same points in another frame, (n, 3).
+        a: coordinates of the points, (n, 3).
+        b: coordinates of the same points in another frame, (n, 3).
 
     Source: Jackson (1995), PROTEST: a Procrustean randomization test.
     """
@@ -179,12 +180,12 @@ def is_unrelated(a: FloatArray, b: FloatArray) -> bool:
 
 
 def _fit(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost: float) -> _Fit | None:
-    """Return the differences under a row; None where its names cannot be assigned."""
+    """Return the differences under a row; None if its names cannot be assigned."""
     if not row.names:
         return _fitted(pairs, row, reference, cost)
     plain = replace(row, names=False)
     given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
-    if given.agreed:  # what most names show: others are exchanged among themselves
+    if given.agreed:  # most names are correct, and the others are exchanged among themselves
         found: Similarity | None = given.a_from_b
     else:
         found = find_pattern(pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror)
@@ -198,7 +199,7 @@ def _fit(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost:
 
 
 def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntArray:
-    """Return which point of b each point of a is: by its name where that fits, else by its place, (n,)."""
+    """Return the point of b for each point of a: by its name if that fits, else by its position, (n,)."""
     every = np.ones(len(pairs.a), dtype=bool)
     rows = np.flatnonzero(given)
     found = nearest_places((pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1))
@@ -210,7 +211,7 @@ def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntA
 def _fitted(
     pairs: PointPairs, row: Row, reference: BoolArray, cost: float, other: IntArray | None = None
 ) -> _Fit:
-    """Form and test the differences under a row."""
+    """Compute and test the differences under a row."""
     n = len(pairs.a)
     whole = row.strain or row.bending
     estimated = row.scale or whole or pairs.scale is None
@@ -218,7 +219,7 @@ def _fitted(
     T = fit_robustly(source[reference], pairs.a[reference], scale=None if estimated else pairs.scale)
     if row.mirror:
         T = replace(T, rotation=T.rotation @ MIRROR)
-    if whole:  # large ones too
+    if whole:  # also for large deformations
         T = fit_affinity(T, pairs.a, pairs.b, reference)
     d, Q = pairs.differences(T)
     similarity = motions(pairs.a)
@@ -235,7 +236,7 @@ def _fitted(
     none_stable = np.zeros(n, dtype=bool)
     failed = _Fit(row, pairs, T, -(n * cost + penalty), False, none_stable, (1.0, 0.0), None, (), other)
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
-    if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too few points to be explained by so much
+    if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too many parameters for so few points
         return failed
     single = critical_value(ALPHA / max(1, int(reference.sum())), 3, pairs.redundancy)
     weight = robust_weights(d, G, reference)
@@ -259,21 +260,21 @@ def _fitted(
     if pairs.scale is not None:
         size, sigma = lengths if row.scale else (pairs.scale / T.scale, 0.0)
         beside = max(SWELLING, math.sqrt(critical_value(ALPHA, 1, r)) * sigma / size)
-        unit = find_unit(size, beside)  # what is beside it is reported
+        unit = find_unit(size, beside)  # the remaining difference is reported
     factor = unit.factor if unit else 1.0
     stretches = _stretches(pairs, T, d, Q, similarity, found.stable, factor) if row.strain else ()
     return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, unit, stretches, other)
 
 
 def _relative_sigma(pairs: PointPairs) -> float:
-    """Return the standard deviation of a coordinate over the extent of the object, at most 1."""
+    """Return the standard deviation of a coordinate, divided by the extent of the object, at most 1."""
     parts = ((pairs.a, pairs.Q_a), (pairs.b, pairs.Q_b))
     sizes = [float(np.median(np.diagonal(Q))) / mean_distance(xyz) ** 2 for xyz, Q in parts]
     return min(1.0, math.sqrt(sum(sizes) + ROUNDING**2))
 
 
 def _independent(columns: FloatArray, rows: int) -> FloatArray:
-    """Return an orthogonal basis of what columns span, scaled as their entries are."""
+    """Return an orthogonal basis of the span of columns, with entries of about the same size."""
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, size > 1e-6 * size[0]] * math.sqrt(rows))
 
@@ -281,12 +282,12 @@ def _independent(columns: FloatArray, rows: int) -> FloatArray:
 def _lengths(
     pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, whole: FloatArray, stable: BoolArray
 ) -> tuple[float, float]:
-    """Return lengths of b over those of a, and the standard deviation, by the stable points."""
+    """Return the ratio of lengths b over a from the stable points, and its standard deviation."""
     assert pairs.scale is not None
     among = candidates_of(d, Q, whole[:, : MOTIONS["rigid"]], stable)
     g = whole[np.repeat(stable, 3), 6]
     weight = float(g @ among.P @ g)
-    size = mean_distance(pairs.a)  # by which the column of the scale is divided
+    size = mean_distance(pairs.a)  # the column of the scale is divided by it
     left = float(g @ among.P @ among.d) / weight / size
     lengths = pairs.scale / T.scale * (1 + left)
     return lengths, lengths / math.sqrt(weight) / size
@@ -301,10 +302,10 @@ def _stretches(
     stable: BoolArray,
     unit: float,
 ) -> tuple[Stretch, ...]:
-    """Return the largest principal strain, and others that are significant, by the stable points.
+    """Return the largest principal stretch and other significant ones, from the stable points.
 
-    Lengths of the second are taken as so many times too large, by their unit. Where the scale is not known
-    to both, they are relative to the middle one.
+    Lengths of the second result are divided by the unit factor `unit`. If not both results have a scale, the
+    stretches are relative to the median one.
     """
     among = candidates_of(d, Q, whole[:, : MOTIONS["similarity" if pairs.scale is None else "rigid"]], stable)
     axes, along = extended_axes(pairs.a)
@@ -314,7 +315,7 @@ def _stretches(
         tensors[k] = np.outer(u, v) + np.outer(v, u)
     S = np.einsum("kxy,ny->nxk", tensors, along[stable] @ axes).reshape(-1, len(i))
     N = S.T @ among.P @ S
-    if pairs.scale is None:  # nothing but the trace is undetermined
+    if pairs.scale is None:  # only the trace is undetermined
         N += np.trace(N) * np.outer(i == j, i == j)
     covariance = np.linalg.inv(N)
     left = np.tensordot(covariance @ (S.T @ (among.P @ among.d)), tensors, 1)
@@ -335,7 +336,7 @@ def _stretches(
 
 
 def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
-    """Put in words of the field what a row found."""
+    """Return the cause that a fitted row stands for."""
     row, (lengths, sigma), unit = fit.row, fit.lengths, fit.unit
     limit = math.sqrt(critical_value(ALPHA, 1, pairs.redundancy))
     rest = row.scale and (unit is None or abs(lengths - unit.factor) > limit * sigma)
@@ -361,12 +362,12 @@ def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
 def find_pattern(
     a: FloatArray, b: FloatArray, *, scale: float | None = None, mirrored: bool = False
 ) -> Similarity | None:
-    """Return the similarity that brings most points of b onto points of a; None if none brings four.
+    """Return the similarity that brings most points of b onto points of a; None if it brings fewer than four.
 
     Args:
         a: points, (n, 3).
         b: points in another frame, (m, 3).
-        scale: of a over b; found too if not given.
+        scale: scale of a over b; estimated if not given.
         mirrored: whether the similarity has a reflection.
     """
     if min(len(a), len(b)) < 4:
@@ -405,7 +406,7 @@ def find_pattern(
 def _refined(
     a: FloatArray, b: FloatArray, proposed: Similarity, scale: float | None
 ) -> tuple[Similarity, int]:
-    """Return the similarity by all points that it brings onto others, and how many these are."""
+    """Return the similarity fitted to all points that it brings onto others, and their number."""
     none = np.empty((0, 2), dtype=np.int64)
     every_a, every_b = np.ones(len(a), dtype=bool), np.ones(len(b), dtype=bool)
     found, count = proposed, 0
@@ -419,7 +420,10 @@ def _refined(
 
 
 def _triangles(xyz: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return triangles of neighbours, vertices opposite to rising sides, (t, 3), and their sides, (t, 3)."""
+    """Return triangles of neighbours, (t, 3), and their sides in rising order, (t, 3).
+
+    Each vertex is opposite to the side in the same column.
+    """
     near = cKDTree(xyz).query(xyz, k=min(NEIGHBOURS + 1, len(xyz)))[1]
     corners = np.concatenate([near[:, [0, i, j]] for i, j in combinations(range(1, near.shape[1]), 2)])
     p = xyz[corners]

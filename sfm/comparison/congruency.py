@@ -1,15 +1,15 @@
-"""Congruency of two sets of coordinates of the same points: which of them moved, tested in one datum.
+"""Congruency test of two sets of coordinates of the same points, which finds the points that moved.
 
 The differences d of two independent solutions are projected with the S-transformation of the points F that
-are taken as stable,
+are assumed to be stable,
 
     S = I - G (G_F' G_F)^-1 G_F',  d_S = S d,  Q_S = S (Q_a + Q_b) S',
 
-G being the translations, small rotations and, where the scale is not defined by both, the scale of the whole.
-Whatever the datum of either solution fixes or leaves undefined drops out. Under no change
-Omega = d' Q_S^+ d over F follows chi-square with 3 n_F - u degrees of freedom, Omega / (3 n_F - u) Fisher's F
-where the variances are estimated. The point whose removal from F lowers Omega most is taken to have moved,
-until the rest agrees.
+where G has the translations, the small rotations and, unless both solutions have a scale, the scale of the
+whole. The result does not depend on what the datum of either solution fixes or leaves undefined. Without any
+change, Omega = d' Q_S^+ d over F follows chi-square with 3 n_F - u degrees of freedom. If the variances are
+estimated, Omega / (3 n_F - u) follows Fisher's F. The point whose removal from F lowers Omega most is
+considered as moved and removed, until the rest agrees.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Pelzer (1971), Zur
 Analyse geodaetischer Deformationsmessungen; Baarda (1973), S-transformations and criterion matrices.
@@ -38,37 +38,37 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.similarity import extended_axes, mean_distance, similarity_motions
 
-MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # parameters of what is no change
-MIN_STABLE = 4  # points that a datum needs to be checked by at least one more than it takes
-STABLE_FRACTION = 0.5  # of the points that must agree for the others to be called moved
-RANK = 1e-6  # of the largest singular value below which the points of reference are on a line
+MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # number of parameters of motions that are no change
+MIN_STABLE = 4  # points of a datum: three define it, and one more checks it
+STABLE_FRACTION = 0.5  # of the points must agree before others are reported as moved
+RANK = 1e-6  # of the largest singular value; below it the reference points are on a line
 
 
 @dataclass(frozen=True)
 class Congruency:
-    """Differences of the points in the datum of those that did not move, and how these were found."""
+    """Differences of the points in the datum of the stable points, and the search for these."""
 
     reference: BoolArray  # points that may carry the datum, (n,)
-    search: StablePoints  # from all points of reference
-    robust: StablePoints | None  # from those that a robust alignment leaves; None where all agree, or too few
-    stable: BoolArray  # points that carry the datum, (n,); all of reference where no majority of them agrees
+    search: StablePoints  # search from all reference points
+    robust: StablePoints | None  # search from points that fit a robust alignment; None if all or too few fit
+    stable: BoolArray  # points that carry the datum, (n,); all reference points if no majority agrees
     agreed: bool  # whether the stable points agree; else no majority does
     difference: FloatArray  # d_S, (n, 3)
-    covariance: FloatArray  # Q_S of all coordinates together, (3 n, 3 n)
-    motions: FloatArray  # G: what is no change, (3 n, u)
-    statistic: FloatArray  # T of each point, its drop of Omega (stable) or its separate test, over 3, (n,)
+    covariance: FloatArray  # Q_S of all coordinates, (3 n, 3 n)
+    motions: FloatArray  # G: motions that are no change, (3 n, u)
+    statistic: FloatArray  # T of each point: its drop of Omega if stable, else its own test, over 3, (n,)
     level: FloatArray  # alpha of the test of each point, (n,)
-    critical: FloatArray  # of T, (n,)
-    weights: FloatArray  # P_kk of each stable point, from which its drop is, 0 of the others, (n, 3, 3)
+    critical: FloatArray  # critical value of T, (n,)
+    weights: FloatArray  # P_kk of each stable point, which gives its drop, 0 for others, (n, 3, 3)
 
     @property
     def moved(self) -> BoolArray:
-        """Points that do not agree with the stable ones, (n,); none where it is not known which."""
+        """Points that do not agree with the stable ones, (n,); none if no majority agrees."""
         return np.asarray(self.agreed & ~self.stable & (self.critical < self.statistic))
 
     @property
     def first_test(self) -> Step:
-        """The test of all points of reference together."""
+        """The global test of all reference points."""
         return self.search.steps[0]
 
 
@@ -82,21 +82,21 @@ def congruency(
     reference: BoolArray | None = None,
     alpha: float = 0.05,
 ) -> Congruency:
-    """Test whether points have moved, and find those that have.
+    """Test whether points have moved, and find these points.
 
-    Half of alpha is spent on the test of all points together and half on the largest of the single points.
-    Points that moved are removed one by one, once from all of reference and once from those that a robust
-    alignment leaves; the larger set that agrees is taken.
+    Half of alpha is spent on the global test of all points, and half on the largest test of single points.
+    Points that moved are removed one by one. One search starts from all reference points, and another from
+    the points that fit a robust alignment. The larger set that agrees is the result.
 
     Args:
         difference: second minus first coordinates after any alignment, (n, 3).
-        covariance: Q_a + Q_b of all coordinates together, (3 n, 3 n).
+        covariance: Q_a + Q_b of all coordinates, (3 n, 3 n).
         xyz: coordinates, (n, 3).
-        motion: what of the whole is no change: rigid (translation and rotation), similarity (the scale too,
-            where not both have one), or none (both in the datum of control).
-        redundancy: of both adjustments together; None if the variances are known.
+        motion: motion of the whole that is no change: rigid (translation and rotation), similarity (also
+            scale, unless both have one), or none (both in the datum of control).
+        redundancy: redundancy of both adjustments together; None if the variances are known.
         reference: points that may carry the datum, (n,); all if not given.
-        alpha: probability of calling something a change that is none.
+        alpha: probability of reporting a change if there is none.
 
     Raises:
         GeometryError: too few points, points on a line, or a covariance that is singular beyond the datum.
@@ -157,16 +157,16 @@ def congruency(
 
 
 def motions(xyz: FloatArray) -> FloatArray:
-    """Return G: how coordinates change with translations, small rotations and the scale, (3 n, 7)."""
+    """Return G: the changes of coordinates by translations, small rotations and the scale, (3 n, 7)."""
     G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=mean_distance(xyz))
     return G.reshape(3 * len(xyz), 7)
 
 
 def bending(xyz: FloatArray) -> FloatArray:
-    """Return how coordinates change with a bending of the whole, of the second degree, (3 n, k).
+    """Return the changes of coordinates by a bending of the whole of second degree, (3 n, k).
 
-    Effects of a wrong camera model on all points together: a dome, a saddle, an affinity; the
-    polynomials are of the axes along which the object extends.
+    A wrong camera model has such effects on all points: a dome, a saddle, an affinity. The polynomials are in
+    the axes along which the object extends.
 
     Args:
         xyz: coordinates, (n, 3).
@@ -181,7 +181,7 @@ def bending(xyz: FloatArray) -> FloatArray:
 
 
 def strain(xyz: FloatArray) -> FloatArray:
-    """Return how coordinates change with a homogeneous deformation and rotations, (3 n, k).
+    """Return the changes of coordinates by a homogeneous deformation and rotations, (3 n, k).
 
     Args:
         xyz: coordinates, (n, 3).
@@ -190,6 +190,6 @@ def strain(xyz: FloatArray) -> FloatArray:
 
 
 def _in_every_direction(terms: FloatArray) -> FloatArray:
-    """Return how coordinates change with each of the terms (n, k), (3 n, 3 k)."""
+    """Return the changes of coordinates by each term, (n, k), in each direction, (3 n, 3 k)."""
     shapes: FloatArray = np.einsum("nk,xy->nxky", terms, np.eye(3))
     return shapes.reshape(3 * len(terms), -1)

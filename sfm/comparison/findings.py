@@ -22,21 +22,21 @@ HEADLINES: Mapping[Level, str] = {
 
 
 def verdict_of_comparison(found: ResultComparison) -> Verdict:
-    """Return the verdict on a comparison with its remarks."""
+    """Return the verdict on a comparison, with its remarks."""
     return judge(_remarks(found), HEADLINES)
 
 
 def remarks_of_cause(
     cause: Cause, first: str, second: str, points: int, largest: tuple[float, str]
 ) -> Iterator[Remark]:
-    """Yield what explains that two results differ, a remark for each part of it.
+    """Yield the remarks on the cause of the differences of two results, one for each part of it.
 
     Args:
-        cause: what does.
+        cause: cause of the differences.
         first: name of the first result.
-        second: name of the second.
-        points: how many were compared.
-        largest: the largest difference of one, and its unit.
+        second: name of the second result.
+        points: number of compared points.
+        largest: largest difference of a point, and its unit.
     """
     row, between = cause.row, {"first": first, "second": second}
     moved = cause.moved or None
@@ -69,7 +69,7 @@ def remarks_of_cause(
 
 
 def _words(axis: FloatArray) -> str:
-    """Return a direction, its largest component positive."""
+    """Return a direction as text, with its largest component positive."""
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
     return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
 
@@ -86,7 +86,7 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
         yield _differences(found, longest, unit)
     tested = int(np.isfinite(found.statistic).sum())
     if found.untested is not None:
-        if found.cause is None or found.untested.kind != "untestable":  # its cause was found and tested
+        if found.cause is None or found.untested.kind != "untestable":  # a cause was found and tested
             yield found.untested
     elif found.approximate:
         yield remark("tested_singly")
@@ -97,7 +97,7 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
 
 
 def _differences(found: ResultComparison, longest: FloatArray, unit: str) -> Remark:
-    """Return the remark on points that differ with no other cause than that they moved."""
+    """Return the remark on differences without any other cause than that points moved."""
     if not found.majority:
         return remark("no_majority_agrees", first=found.names[0], second=found.names[1])
     names = [name for name, differs in zip(found.points, found.significant, strict=True) if differs]
@@ -113,7 +113,7 @@ def _differences(found: ResultComparison, longest: FloatArray, unit: str) -> Rem
 
 
 def _interior(found: ResultComparison) -> Iterator[Remark]:
-    """Yield the cameras whose interior orientation is another one: it shows that a lens moved."""
+    """Yield remarks on cameras whose interior orientation differs, which shows that a lens moved."""
     for one in found.interior:
         with np.errstate(invalid="ignore", divide="ignore"):
             sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)

@@ -1,10 +1,9 @@
-"""Points and photographs that two results have in common, and the covariance of their differences.
+"""Pairs of points and photographs that two results have in common, and the covariance of their differences.
 
-Names are believed where they identify something: codes, control, given observations, file names. Uncoded
-targets and tie points are numbered anew in every run, and some formats have no names at all; a point with
-such a number is recognised by its image points, where both results have the same photographs, or else by its
-place, after an alignment on what is already paired. A number that identifies nothing is never compared with
-another.
+Names are used if they identify something: codes, control, given observations, or file names. Uncoded targets
+and tie points get new numbers in every run, and some formats have no names at all. If both results have the
+same photographs, such a point is recognised by its image points. Otherwise it is recognised by its position,
+after an alignment on the pairs found so far. Numbers that identify nothing are never compared.
 """
 
 from __future__ import annotations
@@ -22,21 +21,21 @@ from sfm.network import rows_of
 from sfm.similarity import Similarity, extended_axes, fit_similarity, mean_distance
 from sfm.solution import Solution
 
-ROUNDING = 1e-9  # of the extent of the object: what computing in double precision and writing cost at most
-MAX_HELD_VARIANCE = 1e-12  # variance over the mean one below which a coordinate is held
-SAME_PX = 1e-2  # image points closer than this are one measurement, as files round it
-SAME_RAY_PX = 0.1  # likewise of directions, which differ by what the conversion of a camera costs
-NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs lie closer than this
-MAJORITY = 0.5  # of the rays in common photographs on which two points must lie together
-# Of the distance to the next neighbour: what is farther away is not recognised by place.
+ROUNDING = 1e-9  # of the extent of the object: largest error of double precision and of written digits
+MAX_HELD_VARIANCE = 1e-12  # of the mean variance; a coordinate with less is held fixed
+SAME_PX = 1e-2  # closer image points are one measurement, rounded in files
+SAME_RAY_PX = 0.1  # the same for directions, which differ by the conversion of the camera
+NEAR_PX = 1.0  # measurements of one target or one piece of texture by two programs are closer than this
+MAJORITY = 0.5  # of the rays in common photographs on which two points must coincide
+# Largest distance of two positions of one point, over the distance to the next neighbour.
 MAX_PLACE_FRACTION = 0.3
 ROUNDS = 20  # of weighting
-SAME_PLACE = 0.5  # of the points that must coincide for two results to be in one frame as they are
+SAME_PLACE = 0.5  # of the points must coincide for two results to be in the same frame already
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Common points and photographs of two results, by index, and how each pair was recognised."""
+    """Common points and photographs of two results, by index, and how they were recognised."""
 
     points: IntArray  # of a and of b, (n, 2)
     images: IntArray  # of a and of b, (m, 2)
@@ -44,15 +43,13 @@ class Pairing:
     points_by_image_points: int
     points_by_place: int
     images_by_name: int
-    xy: tuple[
-        FloatArray, FloatArray
-    ]  # image points of a and of b in one frame, px, (k, 2) each: as they are,
-
-    # or as directions where one of them is corrected for distortion or counted from another origin
+    # Image points of a and of b in one frame, px, (k, 2) each. They are directions times c if one result is
+    # corrected for distortion or has another pixel origin.
+    xy: tuple[FloatArray, FloatArray]
 
 
 def pair_results(a: Solution, b: Solution) -> Pairing:
-    """Return which points and photographs of a are which of b.
+    """Pair the points and photographs of two results.
 
     Args:
         a: first result.
@@ -114,7 +111,7 @@ def _free(count: int, taken: IntArray) -> BoolArray:
 
 
 def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
-    """Return the pairs (i, j) with more votes than any other of i and of j, and with enough of them."""
+    """Return the pairs (i, j) with enough votes, and with more votes than any other pair of i or of j."""
     if not len(votes):
         return votes
     most_i = np.zeros(votes[:, 0].max() + 1)
@@ -130,7 +127,7 @@ def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
 def _images_by_image_points(
     a: Solution, b: Solution, images: IntArray
 ) -> tuple[IntArray, tuple[FloatArray, FloatArray]]:
-    """Pair photographs, (m, 2), by measurements at the same places, then by rays of the same direction."""
+    """Pair photographs, (m, 2), by measurements at the same positions, then by rays of the same direction."""
     as_they_are = a.network.image_points.xy, b.network.image_points.xy
     if a.images_named and b.images_named:
         return images, as_they_are
@@ -156,7 +153,7 @@ def directions(result: Solution) -> FloatArray:
 def _images_of_places(
     a: Solution, b: Solution, xy: tuple[FloatArray, FloatArray], images: IntArray, same_px: float
 ) -> IntArray:
-    """Pair photographs, of which none is paired yet, by image points that lie at the same places."""
+    """Pair the photographs that are not paired yet by image points at the same positions."""
     none = np.empty((0, 2), dtype=np.int64)
     ours, theirs = a.network.image_points, b.network.image_points
     free_a = (_free(len(a.network.images), images[:, 0]) & a.estimate.oriented)[ours.image]
@@ -177,7 +174,7 @@ def _images_of_places(
 def _points_by_image_points(
     a: Solution, b: Solution, xy: tuple[FloatArray, FloatArray], images: IntArray, points: IntArray
 ) -> IntArray:
-    """Pair points that lie on the same image points in most of the common photographs that see them."""
+    """Pair points that have the same image points in most of the common photographs that see them."""
     ours, theirs = a.network.image_points, b.network.image_points
     free_a = _free(len(a.network.points), points[:, 0]) & a.estimate.determined
     free_b = _free(len(b.network.points), points[:, 1]) & b.estimate.determined
@@ -205,7 +202,7 @@ def _points_by_image_points(
 
 
 def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Similarity | None:
-    """Return a_from_b by what is paired so far, or as they are if they coincide; None in any other case."""
+    """Return a_from_b from the pairs so far, or the identity if the results coincide; else None."""
     for pairs, ours, theirs in (
         (points, a.estimate.points, b.estimate.points),
         (images, a.estimate.position, b.estimate.position),
@@ -229,7 +226,7 @@ def fit_robustly(source: FloatArray, target: FloatArray, *, scale: float | None 
     Args:
         source: points in the source frame, source unit, (n, 3).
         target: the same points in the target frame, target unit, (n, 3).
-        scale: scale to keep; fitted too if not given.
+        scale: scale to keep; estimated if not given.
 
     Raises:
         GeometryError: fewer than three points, or all points on a line.
@@ -247,12 +244,12 @@ def fit_robustly(source: FloatArray, target: FloatArray, *, scale: float | None 
 
 
 def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: BoolArray) -> Similarity:
-    """Return a similarity made an affinity that most of the points agree on: its rotation is any matrix.
+    """Return the affinity that most of the points agree on, as a similarity whose rotation is any matrix.
 
-    The object is sheared and stretched along the axes along which it extends, by the L1 norm.
+    The object is sheared and stretched along the axes along which it extends. The L1 norm is minimised.
 
     Args:
-        start: from b to a.
+        start: similarity from b to a.
         a: points, (n, 3).
         b: the same points in the other frame, (n, 3).
         reference: points that take part, (n,).
@@ -279,12 +276,12 @@ def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: Boo
 def nearest_places(
     a: tuple[FloatArray, BoolArray], b: tuple[FloatArray, BoolArray], pairs: IntArray
 ) -> IntArray:
-    """Pair what is each other's nearest and far nearer than the next neighbour of either.
+    """Pair positions that are mutually nearest and much closer than the next neighbour of either.
 
     Args:
-        a: places in a's frame, (n, 3), and which are known, (n,).
-        b: places in a's frame, and which are known.
-        pairs: what is paired already.
+        a: positions in a's frame, (n, 3), and which are known, (n,).
+        b: positions in a's frame, (m, 3), and which are known, (m,).
+        pairs: pairs so far, (k, 2), which are excluded.
     """
     rows_a = np.flatnonzero(a[1] & _free(len(a[0]), pairs[:, 0]))
     rows_b = np.flatnonzero(b[1] & _free(len(b[0]), pairs[:, 1]))
@@ -303,7 +300,7 @@ def nearest_places(
 
 
 def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
-    """Return the distance of each to its nearest neighbour in the same result; infinite for a single one."""
+    """Return the distance of each position to its nearest neighbour in the same result, else infinite."""
     places = one[0][one[1]]
     if len(places) < 2:
         return np.full(len(rows), np.inf)
@@ -312,19 +309,19 @@ def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class PointPairs:
-    """Coordinates of the same points in two results, each in its frame and unit."""
+    """Coordinates of the same points in two results, each in its own frame and unit."""
 
-    names: tuple[str, ...]  # n of them
+    names: tuple[str, ...]  # (n,)
     a: FloatArray  # (n, 3)
     b: FloatArray  # (n, 3)
     Q_a: FloatArray  # covariance of all coordinates of a, (3 n, 3 n)
     Q_b: FloatArray  # (3 n, 3 n)
-    C: FloatArray | None  # covariance between a and b, (3 n, 3 n); None where they are independent
-    scale: float | None  # of a over b where both have one; None where it is estimated
+    C: FloatArray | None  # covariance between a and b, (3 n, 3 n); None if they are independent
+    scale: float | None  # of a over b if both have a scale; None if it is estimated
     redundancy: int | None  # of the variances; None if they are known
 
     def differences(self, a_from_b: Similarity) -> tuple[FloatArray, FloatArray]:
-        """Return b - a in the frame of a (n, 3), and their covariance with that of rounding, (3 n, 3 n)."""
+        """Return b - a in the frame of a, (n, 3), and their covariance including rounding, (3 n, 3 n)."""
         n = len(self.a)
         J = a_from_b.scale * a_from_b.rotation
         Q = np.einsum("xi,aibj,yj->axby", J, self.Q_b.reshape(n, 3, n, 3), J, optimize=True)
@@ -336,11 +333,11 @@ class PointPairs:
         return a_from_b.apply(self.b) - self.a, Q
 
     def chosen(self, kept: IntArray, other: IntArray | None = None) -> PointPairs:
-        """Return some of the pairs, with the points of b that are others of them than by their names.
+        """Return the selected pairs, in which points of b may be assigned differently from their names.
 
         Args:
-            kept: which of a, (k,).
-            other: which of b, (k,); the same if not given.
+            kept: points of a, (k,).
+            other: points of b, (k,); the same as `kept` if not given.
         """
         other = kept if other is None else other
         rows, columns = coordinates_of(kept), coordinates_of(other)
@@ -358,16 +355,19 @@ class PointPairs:
 def pairs_of_results(
     a: Solution, b: Solution, points: IntArray, scale: float | None
 ) -> tuple[PointPairs, IntArray, BoolArray]:
-    """Return points that two results have in common, and which of them these are.
+    """Return the coordinates of common points with their covariance.
 
-    Where the covariance of all points together is known of neither, that of each single point is taken, and
-    of more points than a covariance is kept of every so manieth.
+    If the joint covariance of all points is unknown, that of each single point is used. If there are more
+    points than a covariance is stored for, every k-th point is used.
 
     Args:
         a: first result.
         b: second result.
-        points: indices of the same points in both, (n, 2).
-        scale: of a over b where both have one.
+        points: indices of the same points in both results, (n, 2).
+        scale: scale of a over b, if both have a scale.
+
+    Returns:
+        The pairs; their rows in `points`, (k,); and which rows of `points` have a known covariance, (n,).
     """
     known = [one for one in (a, b) if one.point_covariance is not None or one.covariance is not None]
     joint = all(one.covariance is not None for one in known)
@@ -395,10 +395,10 @@ def pairs_of_results(
 
 
 def held_points(variance: FloatArray) -> BoolArray:
-    """Return whether a coordinate of a point is known without error, so that nothing is left to test, (n,).
+    """Return whether any coordinate of a point is known without error, so that it cannot be tested, (n,).
 
     Args:
-        variance: of the coordinates, object unit^2, (n, 3).
+        variance: variances of the coordinates, object unit^2, (n, 3).
     """
     return (
         np.asarray((variance <= MAX_HELD_VARIANCE * variance.mean()).any(axis=1))
@@ -408,7 +408,7 @@ def held_points(variance: FloatArray) -> BoolArray:
 
 
 def rounding_of(xyz: FloatArray) -> float:
-    """Return the standard deviation of rounding of the coordinates (n, 3) of an object, object unit."""
+    """Return the standard deviation of rounding of the coordinates, (n, 3), of an object, object unit."""
     return ROUNDING * mean_distance(xyz) if len(xyz) else 0.0
 
 
@@ -418,7 +418,7 @@ def coordinates_of(points: IntArray) -> IntArray:
 
 
 def _has_sigma(a: Solution, b: Solution, points: IntArray) -> BoolArray:
-    """Return whether the covariance of either point is known, (n,)."""
+    """Return whether the covariance of either point of each pair is known, (n,)."""
     known = [
         np.isfinite(one.point_covariance[p]).all(axis=(1, 2))
         for one, p in zip((a, b), points.T, strict=True)
@@ -428,7 +428,7 @@ def _has_sigma(a: Solution, b: Solution, points: IntArray) -> BoolArray:
 
 
 def _covariance_of(result: Solution, points: IntArray, joint: bool) -> FloatArray:
-    """Return the covariance of points together, that of each single one, or 0 where none is known."""
+    """Return the joint covariance of points, or that of each single point, or 0 if it is unknown."""
     n = len(points)
     if joint and result.covariance is not None:
         rows = coordinates_of(result.covariance_rows(points))

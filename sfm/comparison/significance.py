@@ -1,13 +1,13 @@
 """Differences of two results of one object, with their standard deviations and tests.
 
-Points and photographs are paired as in `sfm.comparison.pairing`, and b is aligned to a: over common points,
-projection centres or control, or not at all. The scale is estimated only where one of them has none. Where
-the covariance of all points together is known, both are brought into one datum and tested by
-`sfm.comparison.congruency`, which also finds the points that moved; then the alignment is over those that did
-not. Where only the covariance of each single point is known, each difference d is tested by
-T = d' (Qa + Qb)^-1 d / 3, an approximation that is made for free networks only. Results that were adjusted
-from the same image points are not independent and are not tested. Reasons other than points that moved
-are in `sfm.comparison.causes`.
+`sfm.comparison.pairing` pairs points and photographs. Then b is aligned to a: over common points, projection
+centres or control, or not at all. The scale is only estimated if one of them has none.
+
+If the joint covariance of all points is known, both results are transformed into one datum, and tested by
+`sfm.comparison.congruency`. This test also finds the points that moved, and the alignment is repeated over
+the others. If only the covariance of each single point is known, each difference d is tested by T = d' (Qa +
+Qb)^-1 d / 3, an approximation for free networks only. Results that were adjusted from the same image points
+are not independent, and are not tested. `sfm.comparison.causes` finds causes other than points that moved.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, sec. 2.4.2; Caspary (2000), Concepts
 of network and deformation analysis, sec. 7.
@@ -42,10 +42,10 @@ from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity, fit_similarity
 from sfm.solution import Solution
 
-FREE_DATUMS = ("free", "")  # in which the covariance of single points gives about what the whole one does
+FREE_DATUMS = ("free", "")  # in which the covariance of single points gives about the same test
 ALIGNMENTS = ("points", "cameras", "control", "none")
-SAME_PX = 1e-3  # image points closer than this are one measurement
-SAME_SHARE = 0.5  # of a's image points that b has too, from which on they are not independent
+SAME_PX = 1e-3  # closer image points are one measurement
+SAME_SHARE = 0.5  # of a's image points; if b has more of them, the results are not independent
 ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
 
 
@@ -54,12 +54,12 @@ class InteriorDifference:
     """Interior orientation of one camera in both results."""
 
     camera: str
-    model: str  # in which they are compared: that of a
+    model: str  # model of the comparison: that of a
     names: tuple[str, ...]
     units: tuple[str, ...]  # of each parameter
     difference: FloatArray  # b - a, (p,)
-    sigma: FloatArray  # of the difference where one is known in this model, NaN where none is, (p,)
-    conversion: Conversion | None  # of b's camera into a's model, None if it was the same
+    sigma: FloatArray  # of the difference, NaN if unknown in this model, (p,)
+    conversion: Conversion | None  # of b's camera into a's model, None if the models are the same
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,39 +67,39 @@ class ResultComparison:
     """Differences b - a of two results after b was aligned to a."""
 
     names: tuple[str, str]
-    unit: str  # of a's lengths, as people call it; empty where it is not known
+    unit: str  # unit of a's lengths, for people; empty if unknown
     has_sigma: tuple[bool, bool]  # whether standard deviations of points of a and of b are known
-    same_share: float  # of a's image points that b has too; NaN if a has none
-    pairing: Pairing  # what is common, by index, and how it was recognised
+    same_share: float  # share of a's image points that b also has; NaN if a has none
+    pairing: Pairing  # common points and photographs
     alignment: str  # points | cameras | control | none
-    scale_estimated: bool  # in the alignment, since not both results have a scale
+    scale_estimated: bool  # whether the alignment estimates the scale, since not both results have one
     a_from_b: Similarity
-    points: tuple[str, ...]  # names in a of the common points, n of them
+    points: tuple[str, ...]  # names in a of the common points, (n,)
     point_difference: FloatArray  # object unit of a, (n, 3)
-    point_sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
-    untested: Remark | None  # why no test is made; None where one is
-    approximate: bool  # whether the tests know the covariance of single points only
-    statistic: FloatArray  # T of each point, NaN where not tested, (n,)
-    critical: float  # of T for one point among all; NaN without tests
+    point_sigma: FloatArray  # of the differences, NaN if unknown, object unit of a, (n, 3)
+    untested: Remark | None  # why there is no test; None with a test
+    approximate: bool  # whether the tests only use the covariance of single points
+    statistic: FloatArray  # T of each point, NaN if not tested, (n,)
+    critical: float  # critical value of T for one point among all; NaN without tests
     significant: BoolArray  # points that moved, (n,)
-    global_statistic: float  # of all points together over its degrees of freedom; NaN without tests
-    global_critical: float  # of the global test; NaN without tests
-    stable: BoolArray  # points that the alignment is over, (n,); all of them where nothing moved
-    majority: bool  # whether most of the points agree; if not, it is not known which of them moved
-    cause: Cause | None  # what explains that they differ; None where single points moved, or nothing does
-    images: tuple[str, ...]  # names in a of the common photographs, m of them
+    global_statistic: float  # of the global test, over its degrees of freedom; NaN without tests
+    global_critical: float  # critical value of the global test; NaN without tests
+    stable: BoolArray  # points of the alignment, (n,); all points if none moved
+    majority: bool  # whether most of the points agree; if not, the moved points are unknown
+    cause: Cause | None  # cause of the differences; None if single points moved, or without a cause
+    images: tuple[str, ...]  # names in a of the common photographs, (m,)
     position_difference: FloatArray  # of projection centres, object unit of a, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations, deg, (m,)
     interior: tuple[InteriorDifference, ...]  # of cameras that share photographs
 
     @property
     def independent(self) -> bool:
-        """Whether the results come from separate measurements, as the test wants it."""
+        """Whether the results come from separate measurements, as the test requires."""
         return not self.same_share > SAME_SHARE
 
     @property
     def changed(self) -> bool | None:
-        """Whether the points differ significantly, as a whole or singly; None if that is not tested."""
+        """Whether the points differ significantly, as a whole or singly; None without a test."""
         if self.cause is not None:
             return True
         if self.untested is not None:
@@ -138,10 +138,10 @@ def compare_results(
     Args:
         a: first result.
         b: second result.
-        align: points (all common ones that did not move), cameras (projection centres), control (the named
+        align: points (all common points that did not move), cameras (projection centres), control (the named
             points) or none.
         control: names in a of the points for align = control.
-        alpha: probability of calling something a change that is none.
+        alpha: probability of reporting a change if there is none.
 
     Raises:
         GeometryError: an unknown alignment, too little in common for it, or nothing in common at all.
@@ -208,7 +208,7 @@ def compare_results(
 
 
 def _chosen(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> BoolArray:
-    """Return which common points the alignment may be over, (n,)."""
+    """Return the common points that the alignment may use, (n,)."""
     if align != "control":
         return np.ones(len(names), dtype=bool)
     for name in control:
@@ -235,7 +235,7 @@ def _align(
 
 
 def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
-    """Share of a's image points that b has too, at the same place of the same photograph; NaN without any."""
+    """Return the share of a's image points that b has at the same position; NaN if a has none."""
     ours, theirs = a.image_points, b.image_points
     if not len(ours):
         return np.nan
@@ -254,7 +254,7 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
 
 
 def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
-    """Differences of the cameras that took the same photographs, or have one name, each pair once."""
+    """Return the differences of cameras with common photographs or the same name, each pair once."""
     found = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
     if a.images_named and b.images_named:
@@ -271,7 +271,7 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
         else:
             known = [
                 sigma if one.interior_sigma is None else one.interior_sigma[k] for one, k in ((a, p), (b, q))
-            ]  # what only one knows is its sigma, what neither knows stays NaN
+            ]  # if only one sigma is known, it is that of the difference; if none is known, NaN
             total = np.hypot(*(np.nan_to_num(one) for one in known))
             sigma = np.where(np.isfinite(known).any(axis=0), total, np.nan)
         found.append(
@@ -291,7 +291,7 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
 def _of_one_name(
     a: tuple[Camera, ...], b: tuple[Camera, ...], paired: set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
-    """Pair cameras of one name and one size of photographs, neither of which is paired yet."""
+    """Pair cameras with the same name and the same size of photographs that are not paired yet."""
     ours, theirs = {p for p, _ in paired}, {q for _, q in paired}
     index = {(one.name, one.size_px): q for q, one in enumerate(b) if q not in theirs}
     return [
@@ -305,7 +305,7 @@ def _of_one_name(
 class PointTest:
     """Results of the tests of the points."""
 
-    sigma: FloatArray  # of the differences, NaN where not known, (n, 3)
+    sigma: FloatArray  # of the differences, NaN if unknown, (n, 3)
     untested: Remark | None  # why there is no test
     statistic: FloatArray
     critical: float
@@ -334,17 +334,17 @@ def judge_points(
     chosen: BoolArray,
     alpha: float,
 ) -> PointTest:
-    """Test the differences of the common points with all that is known of their covariance.
+    """Test the differences of the common points with the best known covariance.
 
     Args:
         a: first result.
         b: second result.
-        pairing: what they have in common.
-        pairs: the points with their covariances, which these are, and which are known, by `pairs_of_results`.
+        pairing: common points and photographs.
+        pairs: result of `pairs_of_results` for the common points.
         transform: a_from_b.
-        align: what they are aligned by.
-        chosen: points that the alignment may be over, (n,).
-        alpha: of all tests together.
+        align: alignment: points, cameras, control or none.
+        chosen: points that the alignment may use, (n,).
+        alpha: level of all tests together.
     """
     pa, pb = pairing.points.T
     n = len(pa)
@@ -378,7 +378,7 @@ def judge_points(
             )
         except GeometryError as error:
             return without(remark("untestable", reason=str(error)))
-        sigma[together] = 0.0  # held in both, or written over
+        sigma[together] = 0.0  # held in both results, or overwritten below
         return _of_congruency(found, free, sigma, together)
     if not all(one.datum in FREE_DATUMS for one in known):
         return without(remark("no_joint_covariance"))
@@ -394,7 +394,7 @@ def judge_points(
 
 
 def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
-    """Return the test of all points where some took no part; sigma is written over where tested."""
+    """Return the test of all points, of which some took no part; `sigma` is overwritten in place."""
     n = len(together)
     statistic = np.full(n, np.nan)
     sigma[tested] = np.sqrt(np.diagonal(found.covariance).reshape(-1, 3).clip(0))
@@ -418,7 +418,7 @@ def _sum(
     transform: Similarity,
     rounding: float,
 ) -> FloatArray:
-    """Covariance of the differences, NaN where neither is known; one that is not known counts as 0."""
+    """Return the covariance of the differences; a single unknown covariance counts as 0, two give NaN."""
     unknown = np.full((len(pa), 3, 3), np.nan)
     J = transform.scale * transform.rotation
     ours = unknown if a is None else a[pa]
@@ -432,7 +432,7 @@ def _sum(
 def _single_tests(
     difference: FloatArray, covariance: FloatArray, redundancy: int | None, alpha: float
 ) -> tuple[FloatArray, float, float]:
-    """T of each point, its critical value for one of all points, and that of the mean of T."""
+    """Return T of each point, its critical value for one point among all, and that of the mean of T."""
     statistic = np.full(len(difference), np.nan)
     testable = np.isfinite(covariance).all(axis=(1, 2)) & (
         np.linalg.matrix_rank(np.nan_to_num(covariance)) == 3
@@ -447,7 +447,7 @@ def _single_tests(
 
 
 def known_scale(a: Solution, b: Solution) -> float | None:
-    """Return the scale of a over b where both have one, None where it has to be estimated."""
+    """Return the scale of a over b if both have a scale; None if it must be estimated."""
     if not (a.has_scale and b.has_scale):
         return None
     if a.unit == b.unit:
@@ -456,5 +456,5 @@ def known_scale(a: Solution, b: Solution) -> float | None:
 
 
 def has_sigma(result: Solution) -> bool:
-    """Whether the standard deviation of any point is known."""
+    """Return whether the standard deviation of any point is known."""
     return result.point_covariance is not None and bool(np.isfinite(result.point_covariance).any())

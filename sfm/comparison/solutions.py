@@ -1,12 +1,11 @@
 """Comparison of two solutions of one network, and of a survey with another pipeline.
 
-The datum is no part of a solution: one is brought onto the other by a 7-parameter similarity over the
-object points before anything is subtracted. Differences are judged in standard deviations.
+The datum is no part of a solution. Before anything is subtracted, one solution is aligned to the other by a
+7-parameter similarity over the object points. Differences are judged in standard deviations.
 
-A survey beside a baseline: photographs oriented by another pipeline, without targets, scale or covariance.
-
-The survey's accepted image points of the targets are intersected with the orientations of the baseline. That
-gives the same object points from both, whatever points the baseline found itself.
+A baseline has the photographs of a survey oriented by another pipeline, without targets, scale or covariance.
+The survey's accepted image points of the targets are intersected with the orientations of the baseline. Both
+then have the same object points, whatever points the baseline found itself.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity
 
 MIN_RAYS = 2
-EFFECT_STEPS = 9  # places along each side of the photograph where interior orientations are compared
-ROUNDING_PX = 1e-7  # of residuals and of interior orientation in the photograph
+EFFECT_STEPS = 9  # positions along each side of the photograph where interior orientations are compared
+ROUNDING_PX = 1e-7  # rounding errors of residuals, and of interior orientation in the photograph
 ROUNDING_RAD = 1e-9
-SAME_SIGMAS = 0.01  # standard deviations up to which two solutions are the same optimum
+SAME_SIGMAS = 0.01  # two solutions that differ by less, in standard deviations, are the same optimum
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Differences b - a of two solutions of one network after a similarity of b onto a."""
+    """Differences b - a of two solutions of one network, after a similarity of b onto a."""
 
     names: tuple[str, str]  # of a and b
     a: Estimate  # first solution
@@ -51,8 +50,10 @@ class Comparison:
     interior_px: FloatArray  # largest shift of a ray in the photograph, px, (cameras,)
     rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
     cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
-    sigmas: tuple[tuple[str, float], ...]  # what differs most of each kind, and by how many of its standard
-    # deviations in a; kinds of which none is known are left out
+    # (parameter that differs most, difference in its standard deviations in a) for each kind of parameter
+    # with
+    # known standard deviations
+    sigmas: tuple[tuple[str, float], ...]
 
     @property
     def max_sigmas(self) -> float:
@@ -61,7 +62,7 @@ class Comparison:
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """Differences larger than those of two solutions of one optimum, in words; empty without."""
+        """Sentences on differences too large for two solutions of one optimum; empty without any."""
         return tuple(
             f"{what} differs by {value:.2g} of its standard deviation, {SAME_SIGMAS:g} is allowed"
             for what, value in self.sigmas
@@ -98,14 +99,15 @@ def compare(
     covariance: Covariance,
     names: tuple[str, str] = ("kolinear", "colmap"),
 ) -> Comparison:
-    """Compare two solutions of the same network, whatever datum each is in.
+    """Compare two solutions of the same network, each in any datum.
 
     Args:
         a: first solution.
-        b: second solution; photographs and points that only one of them has are not compared.
-        network: the image points for the residuals of both.
-        covariance: of the first in a free datum on all points: differences are judged by it.
-        names: what to call a and b.
+        b: second solution; photographs and points that only one solution has are not compared.
+        network: has the image points for the residuals of both.
+        covariance: covariance of the first solution in a free datum on all points, which judges the
+            differences.
+        names: names of a and b.
 
     Returns:
         Differences b - a after a similarity of b onto a.
@@ -159,7 +161,7 @@ def compare(
 
 
 def _unless_rounding(difference: FloatArray, rounding: float) -> FloatArray:
-    """Return differences, 0 for those of rounding."""
+    """Return differences, with 0 for rounding errors."""
     return np.where(np.abs(difference) <= rounding, 0.0, difference)
 
 
@@ -172,9 +174,9 @@ def _in_sigmas(
     angle: FloatArray,
     interior: tuple[FloatArray, ...],
 ) -> tuple[tuple[str, float], ...]:
-    """Return the largest difference of each kind in standard deviations, and of what it is.
+    """Return, for each kind of parameter, the one that differs most in standard deviations, and by how many.
 
-    A rotation is judged by the smallest standard deviation of the three angles of its photograph.
+    A rotation is judged by the smallest standard deviation of its three angles.
     """
     exterior = np.diagonal(covariance.exterior, axis1=1, axis2=2)
     kinds: list[tuple[tuple[str, ...], FloatArray, FloatArray]] = [
@@ -206,7 +208,7 @@ def _in_sigmas(
 
 
 def reprojection(network: Network, estimate: Estimate) -> FloatArray:
-    """Return computed minus measured pixels of the image points that the estimate determines, (k, 2)."""
+    """Return computed minus measured image points that the estimate determines, px, (k, 2)."""
     seen = network.image_points
     use = estimate.oriented[seen.image] & estimate.determined[seen.point]
     v = np.zeros((len(seen), 2))
@@ -225,7 +227,7 @@ def reprojection(network: Network, estimate: Estimate) -> FloatArray:
 
 
 def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the angle between rotations, shape (k, 3, 3) each, deg; exact to rounding near 0."""
+    """Return the angles between rotations, (k, 3, 3) each, deg, (k,); exact to rounding near 0."""
     D = np.einsum("kji,kjl->kil", a, b)
     sine = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], axis=1) / 2
     cosine = (np.trace(D, axis1=1, axis2=2) - 1) / 2
@@ -233,7 +235,7 @@ def rotation_angle_deg(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def interior_effect_px(a: Camera, b: Camera) -> float:
-    """Return the largest shift between two interior orientations of a ray in the photograph, px."""
+    """Return the largest shift of a ray in the photograph between two interior orientations, px."""
     width, height = a.size_px
     x = np.linspace(-0.5, width - 0.5, EFFECT_STEPS)
     y = np.linspace(-0.5, height - 0.5, EFFECT_STEPS)
@@ -249,7 +251,7 @@ def _difference(a: Camera, b: Camera) -> FloatArray:
 
 
 def _longest(vectors: FloatArray) -> float:
-    """Length of the longest vector; those with NaN do not count."""
+    """Return the length of the longest vector, ignoring vectors with NaN."""
     return float(np.nanmax(np.linalg.norm(vectors, axis=1), initial=0.0))
 
 
@@ -262,7 +264,7 @@ class Baseline(Protocol):
 
     @property
     def network(self) -> Network:
-        """The photographs it oriented, by the survey's names, and its points in them."""
+        """The photographs that it oriented, by the survey's names, and its points in them."""
 
     @property
     def estimate(self) -> Estimate:
@@ -270,7 +272,7 @@ class Baseline(Protocol):
 
     @property
     def total(self) -> int:
-        """Photographs it was given."""
+        """Number of given photographs."""
 
     @property
     def rms_px(self) -> float:
@@ -278,7 +280,7 @@ class Baseline(Protocol):
 
     @property
     def seconds(self) -> float:
-        """From photographs to model, s."""
+        """Time from photographs to model, s."""
 
 
 @dataclass(frozen=True)
@@ -286,13 +288,13 @@ class BaselineComparison:
     """A survey and a baseline side by side; pairs are (survey, baseline)."""
 
     name: str  # of the baseline
-    photographs: tuple[int, int]  # oriented
-    total: int  # photographs given
-    rms_px: tuple[float, float]  # of the points and image points of each, per coordinate, px
-    targets: int  # object points of the survey that the baseline's photographs determine too
-    target_rms_px: float  # of the survey's image points under the baseline's orientations, px
-    points: FloatArray  # baseline minus survey after the similarity, object unit, NaN without, (n, 3)
-    position: FloatArray  # likewise of the projection centres, object unit, (m, 3)
+    photographs: tuple[int, int]  # numbers of oriented photographs
+    total: int  # number of given photographs
+    rms_px: tuple[float, float]  # residuals of each one's own image points, per coordinate, px
+    targets: int  # object points of the survey that the baseline's photographs also determine
+    target_rms_px: float  # of the survey's image points with the baseline's orientations, px
+    points: FloatArray  # baseline minus survey after the similarity, object unit, NaN if missing, (n, 3)
+    position: FloatArray  # the same for the projection centres, object unit, (m, 3)
     rotation_deg: FloatArray  # angle between the rotations of each photograph, deg, (m,)
     seconds: tuple[float, float]  # from photographs to result, s
 
@@ -326,9 +328,9 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
     """Compare a survey with the orientations that another pipeline found for its photographs.
 
     Args:
-        adjustment: of the survey.
-        baseline: what the other pipeline made of the same photographs.
-        seconds: of the survey, from photographs to adjustment, s.
+        adjustment: adjustment of the survey.
+        baseline: result of the other pipeline from the same photographs.
+        seconds: time of the survey from photographs to adjustment, s.
 
     Raises:
         GeometryError: fewer than three targets can be determined with the baseline's photographs.

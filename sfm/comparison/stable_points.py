@@ -1,13 +1,13 @@
-"""The points of a network that did not move between two epochs: removed one by one until the rest agrees.
+"""Stable points of a network between two epochs: moved points are removed one by one until the rest agrees.
 
-The differences d of m coordinates of n points have the covariance Q; whatever lies in the columns of G
-(translations, rotations, the scale) is no change. Points that moved are removed from the datum in the order
-in which they lower Omega = d' Q^+ d. With W = (Q + c G G')^-1, which is the same test for every c,
+The differences d of m coordinates of n points have the covariance Q. Motions of the whole in the columns of G
+(translations, rotations, the scale) are no change. The point whose removal from the datum lowers Omega = d'
+Q^+ d most is removed first. With W = (Q + c G G')^-1, where c does not affect the test,
 
     P = W - W G (G' W G)^-1 G' W,  w = P d,  Omega = d' w,  drop of point k: w_k' P_kk^-1 w_k,
 
-and the removal of a point, which gives it a separate displacement, is P - P_k P_kk^-1 P_k'. This
-repeats the S-transformation to the points that are left after every removal, at the cost of a product.
+and the removal of a point, which gives it a separate displacement, is P - P_k P_kk^-1 P_k'. This is
+equivalent to a new S-transformation to the remaining points, but only costs a product.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.2; Niemeier (2008),
 Ausgleichungsrechnung, sec. 12.3; Chen (1983), Analysis of deformation surveys, for the robust start.
@@ -27,44 +27,44 @@ from sfm.display import counted
 from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
-ROBUST_ROUNDS = 100  # of weighting; it has come to its end long before
-MIN_WEIGHTED = 1e-6  # of the median difference: what lies nearer has no more weight
+ROBUST_ROUNDS = 100  # of weighting, which converges long before
+MIN_WEIGHTED = 1e-6  # of the median difference; smaller differences get no larger weight
 
 
 @dataclass(frozen=True)
 class Step:
-    """The test of all points that are left, and the one that is removed after it."""
+    """A global test of the remaining points, and the point that is removed after it."""
 
-    points: int  # that are left
+    points: int  # number of remaining points
     omega: float  # d' Q^+ d
     freedom: int  # degrees of freedom
     statistic: float  # Omega over its degrees of freedom
     critical: float
-    removed: int | None  # index of the point, None where none is
+    removed: int | None  # index of the removed point, or None
 
 
 @dataclass(frozen=True)
 class StablePoints:
-    """Which points agree, and how they were found."""
+    """The points that agree, and the steps of the search."""
 
     stable: BoolArray  # (n,)
     agreed: bool  # whether they pass the test; else no majority does
     steps: tuple[Step, ...]
-    drops: FloatArray  # T of each stable point, NaN of the others, (n,)
-    weights: FloatArray  # P_kk of each stable point, 0 of the others, (n, m, m)
-    drops_of_all: FloatArray  # T of each candidate before any was removed, NaN of the others, (n,)
-    weights_of_all: FloatArray  # P_kk of each candidate before any was removed, 0 of the others, (n, m, m)
+    drops: FloatArray  # T of each stable point, NaN for others, (n,)
+    weights: FloatArray  # P_kk of each stable point, 0 for others, (n, m, m)
+    drops_of_all: FloatArray  # T of each candidate before the first removal, NaN for others, (n,)
+    weights_of_all: FloatArray  # P_kk of each candidate before the first removal, 0 for others, (n, m, m)
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Points that may be stable, with what every search among them starts from."""
+    """Points that may be stable, and the start of every search among them."""
 
-    chosen: IntArray  # their indices, (k,)
-    difference: FloatArray  # of all points, (n, m)
-    d: FloatArray  # of the candidates without any motion of the whole, (k m,)
+    chosen: IntArray  # indices of the candidates, (k,)
+    difference: FloatArray  # differences of all points, (n, m)
+    d: FloatArray  # differences of the candidates without motions of the whole, (k m,)
     P: FloatArray  # weights of d, (k m, k m)
-    motions: int  # what is no change: columns of G
+    motions: int  # number of columns of G
 
 
 def candidates_of(
@@ -74,12 +74,12 @@ def candidates_of(
 
     Args:
         difference: second minus first coordinates, (n, m).
-        covariance: of all of them together, (n m, n m).
-        G: what is no change, a column each, (n m, u).
+        covariance: joint covariance of the differences, (n m, n m).
+        G: motions that are no change, as columns, (n m, u).
         candidates: points that may be stable, (n,).
 
     Raises:
-        GeometryError: a covariance that is singular beyond G.
+        GeometryError: the covariance is singular beyond G.
     """
     chosen = np.flatnonzero(candidates)
     rows = _rows(chosen, difference.shape[1])
@@ -103,14 +103,14 @@ def find_stable_points(
 
     Args:
         among: the candidates.
-        least: points that must be left.
-        start: those of the points that the search starts with, (n,); else all candidates.
-        redundancy: of the variance in the covariance; None if it is known.
+        least: number of points that must remain.
+        start: points that the search starts from, (n,); all candidates if not given.
+        redundancy: redundancy of the variance in the covariance; None if the variance is known.
         alpha: level of the global test.
-        alpha_single: level of the largest drop of all points, which is tested, too, unless None.
+        alpha_single: level of the test of the largest drop; not tested if None.
 
     Raises:
-        GeometryError: fewer points than `least` to start with.
+        GeometryError: the search starts from fewer than `least` points.
 
     Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.2.
     """
@@ -158,7 +158,7 @@ def _rows(points: IntArray, m: int) -> IntArray:
 
 
 def _remove(P: FloatArray, w: FloatArray, rows: IntArray | slice) -> None:
-    """Give points separate displacements: their rows of P and of w = P d become 0."""
+    """Give points separate displacements in place: their rows of P and of w = P d become 0."""
     by_rows = np.linalg.solve(P[rows][:, rows], P[rows])
     w -= by_rows.T @ w[rows]
     P -= P[:, rows] @ by_rows
@@ -170,10 +170,10 @@ def in_datum(
     """Return differences and covariance after the S-transformation to a datum.
 
     Args:
-        difference: (n, m).
-        covariance: (n m, n m).
-        G: what is no change, (n m, u).
-        weight: of each point in the datum, 1 or 0 for a set of points, (n,).
+        difference: second minus first coordinates, (n, m).
+        covariance: joint covariance of the differences, (n m, n m).
+        G: motions that are no change, (n m, u).
+        weight: weight of each point in the datum, (n,); 1 or 0 for a set of points.
 
     Returns:
         d_S (n, m) and Q_S (n m, n m).
@@ -191,15 +191,15 @@ def in_datum(
 def tests_in_datum(
     difference: FloatArray, covariance: FloatArray, G: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Return T of each point by itself after the S-transformation to a datum, see `in_datum`, (n,).
+    """Return T of each single point after the S-transformation to a datum, see `in_datum`, (n,).
 
-    Only the covariance of each point by itself is formed.
+    Only the covariance of each single point is computed.
 
     Args:
-        difference: (n, m).
-        covariance: (n m, n m).
-        G: what is no change, (n m, u).
-        weight: of each point in the datum, (n,).
+        difference: second minus first coordinates, (n, m).
+        covariance: joint covariance of the differences, (n m, n m).
+        G: motions that are no change, (n m, u).
+        weight: weight of each point in the datum, (n,).
     """
     n, m = difference.shape
     H, d = _motion_in_datum(difference, G, weight)
@@ -213,7 +213,7 @@ def tests_in_datum(
 def _motion_in_datum(
     difference: FloatArray, G: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return H, the motion t = H d of the weighted points (u, n m), and d without it, (n, m)."""
+    """Return H of the motion t = H d of the weighted points, (u, n m), and d without this motion, (n, m)."""
     m = difference.shape[1]
     EG = np.repeat(weight, m)[:, None] * G
     H = np.asarray(np.linalg.solve(G.T @ EG, EG.T), dtype=float)
@@ -222,17 +222,17 @@ def _motion_in_datum(
 
 @checked_arguments(difference="n m", G="q u", candidates="n")
 def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray) -> FloatArray:
-    """Return the weights of the datum in which the sum of the lengths of all differences is least (L1 norm).
+    """Return the weights of the datum with the smallest sum of lengths of all differences (L1 norm), (n,).
 
-    Iterated weights 1 / |d|; of m coordinates the length of a point's difference counts.
+    The weights 1 / |d| are iterated, where |d| is the length of a point's difference of m coordinates.
 
     Args:
-        difference: (n, m).
-        G: what is no change, (n m, u).
+        difference: second minus first coordinates, (n, m).
+        G: motions that are no change, (n m, u).
         candidates: points that take part, (n,).
 
     Raises:
-        GeometryError: no candidates, or motions of other points.
+        GeometryError: no candidates, or G has another number of rows.
 
     Source: Chen (1983), Analysis of deformation surveys (iterative weighted similarity transformation).
     """
@@ -259,7 +259,7 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
 
 
 def single_tests(difference: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return T = d' Q_dd^-1 d / m of each point by itself, (n,); NaN where Q_dd is singular."""
+    """Return T = d' Q_dd^-1 d / m of each single point, (n,); NaN where Q_dd is singular."""
     return _tests_of_blocks(difference, point_blocks(covariance, difference.shape[1]))
 
 
@@ -274,19 +274,19 @@ def _tests_of_blocks(difference: FloatArray, blocks: FloatArray) -> FloatArray:
 
 
 def point_blocks(covariance: FloatArray, m: int) -> FloatArray:
-    """Return the covariance of each point by itself, (n, m, m)."""
+    """Return the covariance of each single point, (n, m, m)."""
     n = len(covariance) // m
     k = np.arange(n)
     return np.ascontiguousarray(covariance.reshape(n, m, n, m)[k, :, k])
 
 
 def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
-    """Return the value that a mean of `freedom` squares exceeds with probability alpha under no change.
+    """Return the value that a mean of `freedom` squares exceeds with probability alpha without any change.
 
     Args:
         alpha: error probability.
         freedom: degrees of freedom of the statistic.
-        redundancy: of the variances; None if they are known.
+        redundancy: redundancy of the variances; None if they are known.
     """
     if redundancy is None:
         return float(chi2_isf(alpha, freedom) / freedom)
@@ -294,7 +294,7 @@ def critical_value(alpha: float, freedom: int, redundancy: int | None) -> float:
 
 
 def _weights(Q: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return P of all candidates together; the basis of G is orthonormal."""
+    """Return P of all candidates; `basis` is an orthonormal basis of G."""
     u = basis.shape[1]
     if u:
         Q = Q + float(np.trace(Q)) / len(Q) * (basis @ basis.T)
@@ -315,7 +315,7 @@ def _weights(Q: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _drops(P: FloatArray, w: FloatArray, left: BoolArray, m: int) -> FloatArray:
-    """Return what Omega drops by without each of the points that are left, over m."""
+    """Return the drop of Omega by the removal of each remaining point, over m, NaN for others."""
     drops = np.full(len(left), np.nan)
     blocks, w = point_blocks(P, m)[left], w.reshape(-1, m)[left]
     drops[left] = np.einsum("ki,ki->k", w, np.linalg.solve(blocks, w[..., None])[..., 0]) / m

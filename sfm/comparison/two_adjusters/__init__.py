@@ -1,1 +1,1 @@
-"""This adjuster and another one: on the network of a survey, and on random networks."""
+"""Comparison of this adjuster with another one, on the network of a survey and on random networks."""

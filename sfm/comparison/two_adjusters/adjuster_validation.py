@@ -1,9 +1,9 @@
-"""Validation of the in-house adjuster by another one, over random networks from the same start values.
+"""Validation of the in-house adjuster against another one, on random networks with the same start values.
 
-Per network: cost, RMS, steps and seconds of both; the largest differences of their results over the
-standard deviations of these; the covariances of both at the same solution; and a remark. Two solutions
-are the same optimum when their costs differ by no more than SAME_SIGMAS standard deviations in one direction
-would cost.
+Each trial has cost, RMS, steps and seconds of both adjusters. It has the largest differences of their results
+in standard deviations, and of their covariances at the same solution. A remark states how the two ended. Two
+solutions are the same optimum if their costs differ by no more than a shift of SAME_SIGMAS standard
+deviations in one direction causes.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from sfm.similarity import fit_similarity
 
 T = TypeVar("T")
 MAX_ITERATIONS = 100
-WARM_UP_SEED = 0  # of networks that are adjusted before any is timed
-WARM_UP_IMAGE_POINTS = 3000  # which are smaller than this
+WARM_UP_SEED = 0  # of networks that are adjusted before the timing starts
+WARM_UP_IMAGE_POINTS = 3000  # these networks have fewer image points
 
 
 class ValidationAdjustment(BackendAdjustment, Protocol):
-    """Result that the other adjuster must return, and why it stopped."""
+    """Result that the other adjuster must return, with the reason why it stopped."""
 
     @property
     def message(self) -> str:
@@ -56,34 +56,34 @@ class ValidationCovariance(Protocol):
 
     @property
     def interior(self) -> tuple[FloatArray, ...]:
-        """Marginal, of the free parameters of each camera."""
+        """Marginal covariance of the free parameters of each camera."""
 
     @property
     def points(self) -> FloatArray:
-        """Conditional on photographs and cameras, (n, 3, 3)."""
+        """Covariance of the points with photographs and cameras held, (n, 3, 3)."""
 
 
 class ValidationBackend(Protocol):
-    """The other adjuster: a module or an object with a name and these two functions."""
+    """The other adjuster: a module or an object with a name and two functions."""
 
     @property
     def name(self) -> str:
         """Its name."""
 
     def adjust(self, network: Network, start: Estimate, *, control: bool) -> ValidationAdjustment:
-        """Adjust with unit weights, control points held or the datum free."""
+        """Adjust with unit weights, and with control points held or in a free datum."""
 
     def covariance(
         self, network: Network, estimate: Estimate, *, control: bool
     ) -> ValidationCovariance | None:
-        """Return covariances at a solution, None if they cannot be had."""
+        """Return covariances at a solution, None if they are not available."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One random network adjusted by both; pairs are (kolinear, the other), NaN where there is nothing."""
+    """One random network adjusted by both; pairs are (kolinear, the other), NaN if missing."""
 
-    number: int  # of the network, with the seed all that is needed to make it again
+    number: int  # of the network; number and seed reproduce it
     plan: Plan
     points: int  # object points that took part
     image_points: int
@@ -92,13 +92,13 @@ class Trial:
     iterations: tuple[int, int]
     seconds: tuple[float, float]  # of adjustment alone, covariance not included, s
     interior_sigmas: float  # largest difference of a free interior parameter over its sigma
-    position_sigmas: float  # of a coordinate of a projection centre over its sigma
-    rotation_sigmas: float  # of a rotation over the smallest sigma of its angles
-    point_sigmas: float  # of an object coordinate over its sigma
-    conditional_difference: float  # of the points' covariances with cameras held, relative
-    interior_difference: float  # of the marginal covariances of the interior orientation, relative
-    marginal_over_conditional: float  # median ratio of a point's sigma to that with cameras held
-    remark: Remark  # how the two ended
+    position_sigmas: float  # largest difference of a coordinate of a projection centre over its sigma
+    rotation_sigmas: float  # largest difference of a rotation over the smallest sigma of its angles
+    point_sigmas: float  # largest difference of an object coordinate over its sigma
+    conditional_difference: float  # relative, of the points' covariances with cameras held
+    interior_difference: float  # relative, of the marginal covariances of the interior orientation
+    marginal_over_conditional: float  # median ratio of a point's sigma to its sigma with cameras held
+    remark: Remark  # on how the two ended
 
 
 @dataclass(frozen=True)
@@ -111,24 +111,24 @@ class Validation:
 
     @property
     def passed(self) -> bool:
-        """Whether the in-house adjuster is nowhere the worse one."""
+        """Whether the in-house adjuster is never the worse one."""
         return not any(trial.remark.severity == "error" for trial in self.trials)
 
     def counts(self) -> tuple[tuple[str, int], ...]:
-        """Return how many networks ended in each way, by the kind of their remarks, most frequent first."""
+        """Return (kind of remark, number of networks), the most frequent first."""
         return tuple(Counter(trial.remark.kind for trial in self.trials).most_common())
 
 
 def validate(
     backend: ValidationBackend, *, networks: int, seed: int, jobs: int = 1, progress: Progress = SILENT
 ) -> Validation:
-    """Adjust random networks with both adjusters and compare everything.
+    """Adjust random networks with both adjusters, and compare the results.
 
     Args:
         backend: the other adjuster; it must be picklable if jobs > 1.
-        networks: how many.
-        seed: of the random networks; network k is the same for any number of networks.
-        jobs: processes at work, each on one thread.
+        networks: number of networks.
+        seed: seed of the random networks; network k is the same for any number of networks.
+        jobs: number of processes, each with one thread.
         progress: receives every network.
     """
     progress.stage("networks", networks)
@@ -140,11 +140,11 @@ def validate(
 
 
 def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
-    """Make network `number` of a seed, adjust it with both and judge.
+    """Make network `number` of a seed, adjust it with both adjusters, and judge the results.
 
     Args:
-        number: of the network, from 0.
-        seed: of the run.
+        number: number of the network, from 0.
+        seed: seed of the run.
         backend: the other adjuster.
     """
     made = random_network(np.random.default_rng([seed, number]))
@@ -193,12 +193,12 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
 
 def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Iterator[Trial]:
     with threadpool_limits(1):
-        warm_up(backend)  # compiles, where it must, once and not in every worker
+        warm_up(backend)  # compiles if needed, once and not in every worker
         if jobs <= 1:
             for number in range(networks):
                 yield make_trial(number, seed, backend)
             return
-    # Fresh processes: threads of compiled libraries do not survive a fork.
+    # New processes: threads of compiled libraries do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with (
         closed_current_folder(),
@@ -212,14 +212,14 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
 
 
 def _begin(backend: ValidationBackend) -> None:
-    """Prepare a worker: one thread, no answer to Ctrl-C (the parent's answer ends it), kernels loaded."""
+    """Prepare a worker: one thread, Ctrl-C ignored (the parent ends the worker), kernels loaded."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
     warm_up(backend)
 
 
 def warm_up(backend: ValidationBackend) -> None:
-    """Adjust a network of every camera model once, so that loading and compiling is not in the seconds."""
+    """Adjust a network of every camera model once, so that timings exclude loading and compiling."""
     waiting = set(MODELS)
     for number in count():
         made = random_network(np.random.default_rng([WARM_UP_SEED, number]))
@@ -245,7 +245,7 @@ def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = N
 
 
 def _tried(run: Callable[[], T]) -> tuple[T | None, tuple[str, ...]]:
-    """Run an adjuster; whatever it ends with is a result here, faults of a program too."""
+    """Run an adjuster; every failure is a result here, including faults of a program."""
     try:
         return run(), ()
     except KolinearError as error:
@@ -255,7 +255,7 @@ def _tried(run: Callable[[], T]) -> tuple[T | None, tuple[str, ...]]:
 
 
 def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
-    """Cost (px^2) and RMS (px) of an estimate by the same formulas for both; NaN if it has lost points."""
+    """Return cost, px^2, and RMS, px, of an estimate; NaN if it has lost points."""
     if estimate is None:
         return np.nan, np.nan
     v = reprojection(network, estimate)
@@ -265,16 +265,21 @@ def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
 
 
 def apart(a: float, b: float, sigma_px: float) -> float:
-    """Return by how many standard deviations in one direction two costs (px^2) are those of other solutions.
+    """Return the shift in one direction, in standard deviations, that explains the difference of two costs.
 
-    In that direction the cost grows by sigma_px^2 / 2 times the square of so many standard deviations.
+    A shift of s standard deviations increases the cost by s^2 sigma_px^2 / 2.
+
+    Args:
+        a: first cost, px^2.
+        b: second cost, px^2.
+        sigma_px: standard deviation of an image coordinate, px.
     """
     return float(np.sqrt(2 * abs(a - b)) / sigma_px)
 
 
 def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> str:
-    """Return how two adjusters ended, a kind of remark, by their costs (px^2) and why they failed."""
-    # An adjuster that ends at the optimum of the other has solved the network, whatever it reports.
+    """Return the kind of remark on how two adjusters ended, from their costs (px^2) and failures."""
+    # An adjuster that ends at the other's optimum has solved the network, whatever it reports.
     if apart(a, b, sigma_px) <= SAME_SIGMAS:
         return "same_optimum"
     if ours and theirs:
@@ -287,10 +292,10 @@ def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: t
 
 
 def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[float, float, float, float]:
-    """Largest differences of interior, position, rotation and points over their standard deviations.
+    """Return the largest differences of interior, position, rotation and points, in standard deviations.
 
-    In a free network after a 7-parameter similarity over all points, which is the datum of inner
-    constraints that the standard deviations refer to.
+    A free network is first aligned by a 7-parameter similarity over all points, since its standard deviations
+    refer to the datum of inner constraints.
     """
     ours = full.estimate
     if not control:
@@ -315,7 +320,7 @@ def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[
 def _covariances(
     full: Adjustment, backend: ValidationBackend, *, control: bool
 ) -> tuple[float, float, float]:
-    """Relative differences of conditional and interior covariances, ratio of marginal to conditional."""
+    """Return relative differences of conditional and interior covariances, and the ratio of sigmas."""
     network, variance = full.network, (full.sigma0 * full.sigma_px) ** 2
     conditional = full.covariance.points_limiting
     spread = np.trace(full.covariance.points, axis1=1, axis2=2)
@@ -337,6 +342,6 @@ def _covariances(
 
 
 def _relative(ours: FloatArray, theirs: FloatArray) -> float:
-    """Largest difference of two covariances, each element over the sigmas it belongs to."""
+    """Return the largest difference of two covariances, each element over its two sigmas."""
     sigma = np.sqrt(np.diag(theirs))
     return float(np.abs((ours - theirs) / np.outer(sigma, sigma)).max())

@@ -1,17 +1,18 @@
-"""Comparison of two adjusters on one network, with a camera that both can estimate.
+"""Comparison of two adjusters on one network, with a camera model that both can estimate.
 
-Two adjusters are compared on what both can do: the accepted image points with equal weights, no control and
-no scale bars, and one functional model, which for a survey in `brown` is `full_opencv`. Cameras that share
-single parameters get one each, for adjusters that know no such sharing.
+Both adjusters get a problem that both can solve: the accepted image points with equal weights, without
+control or scale bars, and with one functional model. For a survey in `brown` this model is `full_opencv`. If
+cameras share only some of their parameters, the shared parameters are held, since COLMAP cannot share single
+parameters.
 
-With all twelve parameters free, full_opencv is near to singular: a factor common to the numerator and
-the denominator of its radial term changes nothing, and COLMAP frees the distortion as a whole or not at
-all. Where the image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's
-result in both adjusters, and the comparison reports it.
+With all twelve parameters free, full_opencv is nearly singular: a common factor of the numerator and the
+denominator of its radial term changes nothing. COLMAP frees the distortion as a whole or not at all. If the
+image points cannot separate k1-k3 from k4-k6, the distortion is therefore held at the survey's result in both
+adjusters, and the comparison reports this.
 
-Whether the other adjuster's camera fits the image points better than that of the survey is tested too: COLMAP
-frees fx and fy, the principal point and the distortion in groups. Two adjusters can agree on a camera
-that has more free than the survey's; that they agree then proves nothing about the survey.
+COLMAP frees fx and fy, the principal point, and the distortion as groups. Two adjusters can therefore agree
+on a camera with more free parameters than the survey's camera has. Their agreement then proves nothing about
+the survey. For this reason the comparison also tests whether that camera fits the image points better.
 """
 
 from __future__ import annotations
@@ -41,68 +42,71 @@ from sfm.reduced_network import reduce_network, supported
 from sfm.runtime.progress import report_step
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
-# The weak directions of full_opencv take more steps than a survey. That k1 to k6 have grown a thousandfold
-# does not show whether they converge: of 32 random networks that had not after 40 steps, 25 did by 200.
+# The weak directions of full_opencv need more steps than a survey. Even if k1 to k6 have grown a
+# thousandfold, they
+# may still converge: of 32 random networks that had not converged after 40 steps, 25 did so by step 200.
 MAX_ITERATIONS = 200
-ALPHA = 0.05  # of the chi-square test whether the image points distinguish two solutions, with 1 freedom
+ALPHA = (
+    0.05  # of the chi-square test, with 1 degree of freedom, whether image points distinguish two solutions
+)
 Outcome = Literal["agrees", "fits alike", "differs"]
-CAMERA_ALPHA = 0.001  # probability of the F-test where both cameras fit alike
-MIN_RMS_RATIO = 1.1  # times; below it the difference is not seen in the coordinates
+CAMERA_ALPHA = 0.001  # error probability of the F-test whether one camera fits better
+MIN_RMS_RATIO = 1.1  # of residuals; a smaller ratio has no visible effect on the coordinates
 
 
 @dataclass(frozen=True)
 class BetterFit:
     """A camera with more free parameters that fits the image points significantly better."""
 
-    own_rms_px: float  # per coordinate, the survey's camera, equal weights, px
-    rms_px: float  # the camera of the comparison, px
-    free: tuple[str, ...]  # what of the survey's cameras is held and should be free: "b1", clearest first
+    own_rms_px: float  # per coordinate with the survey's camera and equal weights, px
+    rms_px: float  # per coordinate with the camera of the comparison, px
+    free: tuple[str, ...]  # held parameters of the survey's cameras that should be free, the clearest first
 
     @property
     def times(self) -> float:
-        """How many times smaller the residuals are."""
+        """Ratio of the residuals."""
         return self.own_rms_px / self.rms_px if self.rms_px > 0 else np.inf
 
 
 @dataclass(frozen=True)
 class AdjusterComparison:
-    """Two adjusters on the same network, model, weights and start values."""
+    """Results of two adjusters with the same network, model, weights and start values."""
 
     backend: str  # the other adjuster
     model: str  # functional model of both
-    conversions: tuple[Conversion, ...]  # of each camera from the survey's model; misfit 0 if it is the same
-    freed: tuple[str, ...]  # cameras with more free parameters than the survey's, in words
+    conversions: tuple[Conversion, ...]  # of each camera from the survey's model; misfit 0 for the same model
+    freed: tuple[str, ...]  # text on cameras with more free parameters than in the survey
     held: tuple[str, ...]  # why the distortion was held at the survey's result; empty if it was free
-    network: Network  # accepted image points with unit weights, as both had them
-    adjustment: Adjustment  # the in-house one in that model
+    network: Network  # accepted image points with equal weights, as given to both
+    adjustment: Adjustment  # the in-house adjustment in this model
     backend_iterations: int  # steps of the other adjuster
     backend_converged: bool
     comparison: Comparison
-    backend_points: (
-        FloatArray | None
-    )  # the other's covariances of the points with photographs and cameras held
-    # (conditional), scaled by our sigma0, object unit^2, (n, 3, 3); None where it has none
-    unshared: tuple[str, ...] = ()  # what cameras share in the survey and was held at its result, in words
-    better: BetterFit | None = None  # than the camera of the survey, where the compared one has more free
-    stopped_early: bool = False  # whether going on from the other's solution leads to the in-house one
+    # the other adjuster's covariances of the points with photographs and cameras held (conditional), scaled
+    # by our
+    # sigma0, object unit^2, (n, 3, 3); None if it has none
+    backend_points: FloatArray | None
+    unshared: tuple[str, ...] = ()  # text on parameters that cameras share in the survey, held at its result
+    better: BetterFit | None = None  # if the compared camera has more free parameters and fits better
+    stopped_early: bool = False  # whether continuing from the other solution leads to the in-house one
 
     @property
     def agree(self) -> bool:
-        """Whether both found the same optimum, though the other adjuster may have stopped short of it."""
+        """Whether both found the same optimum, even if the other adjuster stopped before it."""
         if not self.adjustment.converged:
             return False
         return self.stopped_early or (self.comparison.agree and self.backend_converged)
 
     @property
     def gap(self) -> float:
-        """Difference of v'Pv of the two, in variances of an image coordinate."""
+        """Difference of v'Pv of the two solutions, in variances of an image coordinate."""
         a, b = self.comparison.cost
         sigma = max(self.adjustment.sigma0 * self.adjustment.sigma_px, ROUNDING_PX)
         return 2 * abs(b - a) / sigma**2
 
     @property
     def outcome(self) -> Outcome:
-        """Whether they agree, fit alike (the image points do not distinguish them), or differ."""
+        """Whether they agree, fit alike (image points do not distinguish them), or differ."""
         if self.agree:
             return "agrees"
         return "fits alike" if self.gap <= chi2_isf(ALPHA, 1) else "differs"
@@ -121,7 +125,7 @@ class BackendAdjustment(Protocol):
 
     @property
     def converged(self) -> bool:
-        """Whether it reports that it has converged."""
+        """Whether it reports convergence."""
 
     @property
     def seconds(self) -> float:
@@ -129,7 +133,7 @@ class BackendAdjustment(Protocol):
 
     @property
     def point_covariance(self) -> FloatArray | None:
-        """Of the points, photographs and cameras held, for image coordinates of 1 px; None without."""
+        """Covariance of the points with photographs and cameras held, for a sigma of 1 px; None without."""
 
 
 def compare_adjusters(
@@ -141,18 +145,18 @@ def compare_adjusters(
 ) -> AdjusterComparison:
     """Run the in-house adjuster and another one on the accepted image points of a survey.
 
-    Both start from the survey's result with its cameras converted, all image coordinates have the same
+    Both start from the survey's result with its cameras converted. All image coordinates have the same
     weight, and the datum is free.
 
     Args:
-        adjustment: of the survey.
+        adjustment: adjustment of the survey.
         backend: the other adjuster, a function of network and start values.
-        name: of the backend.
-        model: functional model of both; that of the survey if COLMAP has it, else full_opencv.
+        name: name of the backend.
+        model: functional model of both; if not given, that of the survey if COLMAP has it, else full_opencv.
 
     Raises:
         GeometryError: nothing is left to compare.
-        BackendError: the backend refuses.
+        BackendError: the backend fails.
     """
     cameras, unshared = without_sharing(adjustment.estimate.cameras)
     adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=cameras))
@@ -214,11 +218,11 @@ def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
 
 
 def without_sharing(cameras: tuple[Camera, ...]) -> tuple[tuple[Camera, ...], tuple[str, ...]]:
-    """Return the cameras unshared, with what they share held fixed at its value, and what that is, in words.
+    """Return the cameras with shared parameters held, and a text on these parameters.
 
-    COLMAP shares all parameters of a camera among its photographs or none. Parameters that several cameras
-    share in part, such as one distortion for photographs that differ in c, can only be held at the survey's
-    result.
+    COLMAP shares either all parameters of a camera among its photographs, or none. If several cameras share
+    only some parameters, such as one distortion for photographs that differ in c, these can only be held at
+    the survey's result.
 
     Args:
         cameras: interior orientations, some parameters of which may be shared.
@@ -245,10 +249,13 @@ def common_problem(
 ) -> tuple[Network, Estimate, tuple[Conversion, ...], tuple[str, ...]]:
     """Return the network, start values, conversions and changes of free parameters of a comparison.
 
-    Left are photographs that are oriented and show three points, points in two photographs, and accepted
-    image points, each with the covariance sigma_px^2 I. Parameters of a group that COLMAP frees as a
-    whole (focal lengths, principal point, distortion) are all free if one of them is, and in all cameras
-    that are not fixed.
+    The network has oriented photographs with three points, points in two photographs, and accepted image
+    points, each with the covariance sigma_px^2 I. COLMAP frees focal lengths, principal point and distortion
+    as groups. If one parameter of a group is free, the whole group is free in all cameras that are not fixed.
+
+    Args:
+        adjustment: adjustment of the survey.
+        model: functional model; if not given, that of the survey if COLMAP has it, else full_opencv.
 
     Raises:
         GeometryError: fewer than two photographs with accepted image points.
@@ -277,7 +284,7 @@ def common_problem(
     )
     seen = network.image_points
     unit = np.tile(np.eye(2) * adjustment.sigma_px**2, (len(seen), 1, 1))
-    # Nothing but image points: no control, scale bars or other observations.
+    # Only image points: no control, scale bars or other observations.
     network = Network(
         network.images,
         network.camera,
@@ -289,7 +296,7 @@ def common_problem(
 
 
 def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
-    """Return cameras whose free parameters are whole groups, the same in all that are not fixed."""
+    """Return the cameras with whole groups of free parameters, the same in all cameras that are not fixed."""
     free = [any(camera.free[camera.parts[g]].any() for camera in cameras) for g in range(3)]
     out = []
     for camera in cameras:
@@ -307,12 +314,12 @@ def distortion_held(camera: Camera) -> Camera:
 
 
 def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> BetterFit | None:
-    """Return by how much the camera of the comparison fits better; None where it does not.
+    """Return how much better the camera of the comparison fits; None if it does not fit better.
 
     Args:
         survey: adjustment of the survey, with its cameras.
-        network: image points with equal weights, as both adjusters had them.
-        compared: the in-house adjustment of that network with the cameras of the comparison.
+        network: image points with equal weights, as given to both adjusters.
+        compared: in-house adjustment of this network with the cameras of the comparison.
     """
     own_cameras = survey.estimate.cameras
     more = _held_there(own_cameras, compared.estimate.cameras)
@@ -333,7 +340,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
 
 
 def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
-    """Return the parameters that the survey holds fixed and the comparison has free under another name."""
+    """Return the survey's fixed parameters whose counterparts are free in the comparison."""
     names: dict[str, None] = {}
     for ours, theirs in zip(cameras, compared, strict=True):
         free = corresponding_free(theirs, ours.model) & ~ours.free

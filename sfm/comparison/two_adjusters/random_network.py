@@ -1,7 +1,7 @@
-"""Random networks of the kinds that close-range surveys are made of, with truth and start values.
+"""Random networks like those of close-range surveys, with truth and start values.
 
-Everything is drawn from one generator: arrangement of the photographs, object, visibility, noise, lens,
-what is free, and datum. The object has a radius of 1 object unit.
+One generator draws everything: arrangement of the photographs, object, visibility, noise, lens, free
+parameters and datum. The object has a radius of 1 object unit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 
-MODELS = ("opencv", "full_opencv")  # those that COLMAP has as well
+MODELS = ("opencv", "full_opencv")  # models that COLMAP also has
 ARRANGEMENTS = ("ring", "hemisphere", "strip", "close pairs")
 IMAGES = (4, 60)
 POINTS = (20, 2000)
@@ -23,17 +23,18 @@ NOISE_PX = (0.02, 1.0)
 SIZE_PX = (3000, 2000)
 PIXEL_MM = (0.006, 0.006)
 C_MM = 18.0  # a field of 53 x 37 deg
-DISTANCE = 4.5  # of the cameras from the object, at which it fills the photograph
-MIN_RAYS = 3  # photographs that every point is in, two for networks of pairs
+DISTANCE = 4.5  # of the cameras from the object, which then fills the photograph
+MIN_RAYS = 3  # photographs that show every point; two for networks of pairs
 MIN_POINTS = 12  # points that every photograph shows
-STRIP_POINTS = 12  # at least so many points per photograph of a strip, each of which shows few of them
+STRIP_POINTS = 12  # least number of points per photograph of a strip, since each photograph shows few of them
 CONTROL_POINTS = 6
 SELF_CALIBRATING = ("ring", "hemisphere")  # convergent and rolled: they determine the interior orientation
-SELF_CALIBRATION_IMAGES = 8  # photographs of each camera from which on it may be free
-START_POSITION = 0.01  # error of start values: length over the distance, of projection centres and points
+SELF_CALIBRATION_IMAGES = 8  # photographs of each camera that are needed to free it
+START_POSITION = 0.01  # error of start values of projection centres and points, over the distance
 START_ANGLE_DEG = 1.0
-# A strip hangs together by few rays: errors of neighbours that do not fit bend it as a whole, and from far
-# off every adjuster ends beside the optimum. Its start values come from relative orientation in practice.
+# Few rays connect a strip: inconsistent errors of neighbours bend it as a whole, and from distant start
+# values every
+# adjuster ends beside the optimum. In practice its start values come from relative orientation.
 STRIP_START = 0.2
 START_FOCAL = 0.02  # relative error of free focal lengths at the start
 
@@ -44,19 +45,19 @@ class Plan:
 
     arrangement: str  # ring | hemisphere | strip | close pairs
     images: int  # photographs
-    points: int  # object points asked for; those with too few rays are left out
+    points: int  # requested object points; those with too few rays are left out
     planar: bool  # whether the object is flat
     visibility: float  # share of the points that a photograph shows
     noise_px: float  # standard deviation of an image coordinate, px
     model: str  # opencv | full_opencv
-    cameras: int  # cameras that take turns
+    cameras: int  # number of cameras, which alternate
     interior: str  # fixed | focal and principal point | all
     datum: str  # free | control
 
 
 @dataclass(frozen=True)
 class RandomNetwork:
-    """A network with its truth and the start values that adjusters get."""
+    """A network with its truth, and the start values for adjusters."""
 
     plan: Plan
     network: Network
@@ -67,8 +68,8 @@ class RandomNetwork:
 def random_network(rng: np.random.Generator) -> RandomNetwork:
     """Return a random network of 4-60 photographs and 20-2000 points.
 
-    Interior orientation is free only in arrangements that determine it. The distortion of `full_opencv`
-    is not: its numerator and denominator cannot be separated by a network in which both are smooth.
+    Interior orientation is free only in arrangements that determine it. The distortion of `full_opencv` is
+    never free: no network separates its numerator and denominator, which are both smooth.
 
     Args:
         rng: source of all randomness.
@@ -141,7 +142,7 @@ def _log_uniform(rng: np.random.Generator, low: int, high: int) -> int:
 
 
 def _camera(rng: np.random.Generator, plan: Plan, number: int) -> Camera:
-    """A lens with up to some 50 px of distortion in the corners."""
+    """Return a lens with up to about 50 px of distortion in the corners."""
     values = [
         ("cx", (SIZE_PX[0] - 1) / 2 + rng.uniform(-20, 20)),
         ("cy", (SIZE_PX[1] - 1) / 2 + rng.uniform(-20, 20)),
@@ -164,9 +165,9 @@ def _camera(rng: np.random.Generator, plan: Plan, number: int) -> Camera:
 
 
 def _object(rng: np.random.Generator, plan: Plan) -> FloatArray:
-    """Points in a disc or a ball, flat strips in a rectangle along the strip."""
+    """Return points in a disc or a ball; those of a strip are in a rectangle or box along the strip."""
     if plan.arrangement == "strip":
-        length = 0.7 * (plan.images - 1) + 1.6  # that the photographs cover
+        length = 0.7 * (plan.images - 1) + 1.6  # covered by the photographs
         xyz = rng.uniform(-1, 1, (plan.points, 3)) * [length / 2, 1.0, 0.3]
     else:
         xyz = rng.standard_normal((plan.points, 3))
@@ -176,7 +177,7 @@ def _object(rng: np.random.Generator, plan: Plan) -> FloatArray:
 
 
 def _stations(rng: np.random.Generator, plan: Plan) -> tuple[FloatArray, FloatArray]:
-    """Projection centres and rotations; axes look at the object or, in strips, down."""
+    """Return projection centres and rotations; the cameras look at the object or, in strips, down."""
     m = plan.images
     azimuth = 2 * np.pi * (np.arange(m) + rng.uniform(-0.3, 0.3, m)) / m
     distance = DISTANCE * rng.uniform(0.9, 1.2, m)
@@ -208,10 +209,10 @@ def _stations(rng: np.random.Generator, plan: Plan) -> tuple[FloatArray, FloatAr
 
 
 def _looking(position: FloatArray, aim: FloatArray, roll: FloatArray) -> FloatArray:
-    """Rotations whose -z axis runs from position to aim, turned about it by the roll."""
+    """Return rotations whose -z axis points from position to aim, turned about it by the roll."""
     z = position - aim
     z /= np.linalg.norm(z, axis=1, keepdims=True)
-    # For a vertical axis x is taken along X, where the cross product with Z would vanish.
+    # For a vertical axis, x is along X, since the cross product with Z would vanish.
     x = np.where(np.abs(z[:, 2:]) > 0.999, [[1.0, 0.0, 0.0]], np.cross([0.0, 0.0, 1.0], z))
     x -= (x * z).sum(axis=1, keepdims=True) * z
     x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -224,14 +225,14 @@ def _min_rays(plan: Plan) -> int:
 
 
 def _visible(rng: np.random.Generator, plan: Plan, truth: Estimate, camera: np.ndarray) -> BoolArray:
-    """Which photograph shows which point, (m, n): inside its borders, and drawn or needed."""
+    """Return which photograph shows which point, (m, n): inside its borders, and drawn or needed."""
     inside = np.empty((plan.images, len(truth.points)), dtype=bool)
     for i in range(plan.images):
         xy = project(truth.cameras[camera[i]], truth.position[i], truth.rotation[i], truth.points)
         inside[i] = ((xy > 0) & (xy < np.array(SIZE_PX) - 1)).all(axis=1)
     order = np.where(inside, rng.random(inside.shape), 2.0)
     seen = order < plan.visibility
-    # The least visible of each photograph and of each point are let in, so that none is left dangling.
+    # Each photograph and each point gets enough rays, so that none is undetermined.
     nearest = np.argsort(order, axis=1)[:, :MIN_POINTS]
     np.put_along_axis(seen, nearest, True, axis=1)
     nearest = np.argsort(order, axis=0)[: _min_rays(plan)]
@@ -240,7 +241,7 @@ def _visible(rng: np.random.Generator, plan: Plan, truth: Estimate, camera: np.n
 
 
 def _spread(points: FloatArray, count: int) -> np.ndarray:
-    """Indices of points far from one another: always the one farthest from those chosen."""
+    """Return indices of points far from one another: each is the farthest from those chosen before."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     while len(chosen) < min(count, len(points)):
         gap = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(axis=1)
@@ -249,7 +250,7 @@ def _spread(points: FloatArray, count: int) -> np.ndarray:
 
 
 def _start(rng: np.random.Generator, truth: Estimate, control: ObjectPoints, error: float) -> Estimate:
-    """Start values: everything that is not known spoiled, free distortion at 0."""
+    """Return start values: unknowns with errors, free distortion 0."""
     m, n = len(truth.position), len(truth.points)
     points = truth.points + error * START_POSITION * rng.standard_normal((n, 3))
     points[control.point] = control.xyz
