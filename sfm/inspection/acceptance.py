@@ -1,8 +1,9 @@
-"""Acceptance test of a measuring system by calibrated lengths: VDI/VDE 2634 part 1.
+"""Acceptance test of a measuring system with calibrated lengths: VDI/VDE 2634 part 1.
 
-The error of a length measurement is the measured minus the calibrated length. It may be A + K L, and no more
-than B. ISO 14253-1 decides with the uncertainty of the calibration whether that is proven. Requirements of
-part 1 that the data do not meet are listed. It is no test by ISO 10360-13, which is for area scanners.
+The error of a length measurement is the measured minus the calibrated length. The limit of its absolute value
+is A + K L, and at most B. ISO 14253-1 decides whether conformity is proven, given the uncertainty of the
+calibration. Requirements of part 1 that the data do not meet are listed. This is no test by ISO 10360-13,
+which applies to area scanners.
 
 Source: VDI/VDE 2634 part 1 (2002), Optical 3D measuring systems: imaging systems with point-by-point probing,
 secs. 3 and 4; ISO 14253-1:2017.
@@ -26,9 +27,9 @@ from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.solution import Solution
 
 MIN_LINES = 7
-MIN_LENGTHS = 5  # of a line
+MIN_LENGTHS = 5  # on a line
 MIN_LONGEST = 2 / 3  # of the body diagonal of the measuring volume
-SAME_DIRECTION_DEG = 5.0  # below which two lines have one direction
+SAME_DIRECTION_DEG = 5.0  # lines with a smaller angle have the same direction
 HEADLINES: Mapping[Level, str] = {
     "good": "The limit is kept: all lengths are proven to be inside.",
     "fair": "It is not proven by a complete test that the limit is kept.",
@@ -38,35 +39,35 @@ HEADLINES: Mapping[Level, str] = {
 
 @dataclass(frozen=True)
 class CalibratedLengths:
-    """Lengths between targets as a calibration gives them."""
+    """Calibrated lengths between targets."""
 
-    line: tuple[str, ...]  # measuring line that each is on, k of them
+    line: tuple[str, ...]  # measuring line of each length, (k,)
     start: tuple[str, ...]  # names of points
     end: tuple[str, ...]
     length: FloatArray  # object unit, (k,)
-    sigma: FloatArray  # standard deviation of the calibration, object unit; NaN where not stated, (k,)
+    sigma: FloatArray  # standard deviation of the calibration, object unit; NaN if not stated, (k,)
 
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Errors of length measurement and what they prove."""
+    """Errors of length measurement, and the decision on each."""
 
     name: str  # of the result
     unit: str
     lengths: CalibratedLengths
     error: FloatArray  # measured minus calibrated, object unit, (k,)
-    sigma: FloatArray  # of the measured lengths by the network's covariance; NaN where not known, (k,)
+    sigma: FloatArray  # of the measured lengths from the network's covariance; NaN if unknown, (k,)
     limit: FloatArray  # A + K L, at most B, object unit, (k,)
     a: float  # object unit
     k: float  # pure number
-    b: float  # object unit; infinite without
+    b: float  # object unit; infinite without B
     coverage: float  # k of U = k sigma of the calibration
     decision: tuple[str, ...]  # in | out | undecided | not known, of each length
     diagonal: float  # of the measuring volume, object unit
-    lacking: tuple[Remark, ...]  # what part 1 asks for and the data lack
+    lacking: tuple[Remark, ...]  # requirements of part 1 that the data do not meet
 
     def count(self, decision: str) -> int:
-        """Return how many lengths have a decision."""
+        """Return the number of lengths with a decision."""
         return self.decision.count(decision)
 
     @property
@@ -76,9 +77,9 @@ class Acceptance:
 
     @property
     def verdict(self) -> Verdict:
-        """Return good (proven to be kept, nothing lacking), fair or bad.
+        """The verdict: good if conformity is proven and nothing is lacking, else fair or bad.
 
-        Bad are errors proven to be outside of the limit, and larger ones than it with nothing to excuse them.
+        It is bad if an error is proven to exceed the limit, or exceeds it without a known uncertainty.
         """
         unknown = np.array([decision == UNKNOWN for decision in self.decision])
         exceeding = int((unknown & (np.abs(self.error) > self.limit)).sum())
@@ -99,7 +100,7 @@ def read_lengths(path: Path) -> CalibratedLengths:
     """Read calibrated lengths: line,from,to,length[,sigma].
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: something is wrong; the message has file and line number.
     """
     table = read_table(path, ("line", "from", "to"), ("length",), ("sigma",), blank=("sigma",))
     lines, start, end = table.texts
@@ -131,18 +132,19 @@ def accept_result(
     """Test a result against calibrated lengths.
 
     Args:
-        result: of a survey with a scale from other bars.
-        lengths: calibrated, between points of the result.
+        result: result of a survey with a scale from other bars.
+        lengths: calibrated lengths between points of the result.
         a: A of the limit A + K L, object unit.
-        k: K of it, a pure number.
-        b: what the limit is at most, object unit.
-        bars: "start - end" of the scale bars that gave the scale; None where not known.
-        control: names of control points that gave it.
+        k: K of the limit A + K L, a pure number.
+        b: B, the largest limit, object unit.
+        bars: "start - end" of the scale bars that gave the scale; None if unknown.
+        control: names of control points that gave the scale.
         coverage: k of the expanded uncertainty of the calibration.
-        diagonal: of the measuring volume, object unit; that of the box around all points if not given.
+        diagonal: diagonal of the measuring volume, object unit; that of the box around all points if not
+            given.
 
     Raises:
-        GeometryError: no scale, one from the lengths to be tested, or limits that are none.
+        GeometryError: no scale, a scale from the tested lengths, or impossible limits.
         UnknownNameError: an end of a length is not in the result.
     """
     if not (a >= 0 and k >= 0 and a + k > 0 and b > 0):
@@ -166,9 +168,9 @@ def accept_result(
     variance = np.array([points.covariance_between([one])[0, 0] for one in functions])
     error = measured - lengths.length
     limit = np.minimum(a + k * lengths.length, b)
-    # |error| against the limit of each length: scaled, all limits are 1
+    # |error| is scaled so that the limit of each length is 1
     decision = decide(np.abs(error) / limit, lengths.sigma / limit, -np.inf, 1.0, coverage)
-    if diagonal is None:  # of the smaller box: along the axes of the system, or along those of the object
+    if diagonal is None:  # of the smaller box: along the axes of the system, or along the object's axes
         _, _, principal = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)
         boxes = [np.ptp(points.xyz @ axes.T, axis=0) for axes in (np.eye(3), principal)]
         diagonal = float(min(np.linalg.norm(box) for box in boxes))
@@ -198,7 +200,7 @@ def accept_result(
 def _refuse_tested_scale(
     name: str, lengths: CalibratedLengths, bars: Sequence[str] | None, control: Sequence[str]
 ) -> None:
-    """Refuse lengths on a bar that gave the scale."""
+    """Refuse lengths on a bar or between control points that gave the scale."""
     if bars is None or not (bars or control):
         raise GeometryError(
             f"{name}: the origin of its scale is not stated, it must come from other bars than those tested"
@@ -223,7 +225,7 @@ def _refuse_tested_scale(
 
 
 def _lacking(lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str) -> list[Remark]:
-    """Return what part 1 asks for and the data lack."""
+    """Return remarks on requirements of part 1 that the data do not meet."""
     lines = list(dict.fromkeys(lengths.line))
     found = []
     if len(lines) < MIN_LINES:

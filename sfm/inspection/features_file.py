@@ -45,13 +45,13 @@ class HiddenPointSettings(Section):
 
     name: Name
     start: Name = Field(alias="from")  # the farther target
-    end: Name = Field(alias="to")  # the nearer one
-    distance: Length  # from that to the hidden point, object unit
+    end: Name = Field(alias="to")  # the nearer target
+    distance: Length  # from the nearer target to the hidden point, object unit
     sigma: NotNegative = 0.0  # of the distance, object unit
 
 
 class HeldSettings(Section):
-    """hold = {...} of a shape: what is not fitted."""
+    """hold = {...} of a shape: parameters that are held fixed."""
 
     point: Numbers | None = None
     centre: Numbers | None = None
@@ -74,15 +74,15 @@ class ShapeSettings(Section):
     name: Name
     kind: Literal[tuple(KINDS)]  # type: ignore[valid-type]
     points: Patterns
-    weights: Weights | None = None  # else that of [measure]
+    weights: Weights | None = None  # else the weights of [measure]
     robust: bool = False
     hold: HeldSettings = HeldSettings()
     offset: NotNegative = 0.0  # of the targets from the surface, along its normal, object unit
-    side: Name = "cameras"  # on which the targets are: that of the cameras, or of the point of this name
+    side: Name = "cameras"  # side of the targets: that of the cameras, or of the point of this name
 
 
 class AlignmentSettings(Section):
-    """[alignment]: the system in which coordinates and directions are given."""
+    """[alignment]: the system of the coordinates and directions."""
 
     method: Literal["3-2-1", "features", "points"]
     plane: Patterns | None = None  # 3-2-1: three points of Z = 0
@@ -91,14 +91,14 @@ class AlignmentSettings(Section):
     z_axis: Name | None = None  # features: shape whose direction becomes Z; a plane lies at Z = 0
     x_axis: Patterns | None = None  # features: shape whose direction becomes X, or two points or shapes
     nominal: Name | None = None  # points: table id,X,Y,Z[,sX,sY,sZ]
-    points: Patterns | None = None  # points: those that count; all of the table if not given
-    scale: bool = False  # points: whether it is fitted
-    robust: bool = False  # points: whether those that others contradict are held out
-    weights: Weights | None = None  # points; else that of [measure]
+    points: Patterns | None = None  # points: points to use; all points of the table if not given
+    scale: bool = False  # points: whether the scale is fitted
+    robust: bool = False  # points: whether points that others contradict are left out
+    weights: Weights | None = None  # points: else the weights of [measure]
 
 
 class DistanceSettings(Section):
-    """[[distance]]: of points, or of a point from a plane or an axis."""
+    """[[distance]]: between points, or from a point to a plane or an axis."""
 
     name: Name
     start: Name = Field(alias="from")  # point or shape
@@ -128,22 +128,22 @@ class ToleranceSettings(Section):
     shape: Name | None = None
     nominal: Name | None = None  # table id,X,Y,Z[,sX,sY,sZ]
     mesh: Name | None = None  # .stl or .ply
-    points: Patterns | None = None  # to be judged: of a mesh those named, else all of the shape or table
+    points: Patterns | None = None  # points to judge; required for a mesh, else all of the shape or table
     lower: Value | None = None  # object unit; -upper if not given
     upper: Annotated[float, Field(gt=-LARGEST, le=LARGEST)]
     offset: Value = 0.0  # mesh: of the targets from the surface, along its normal, object unit
-    coverage: Coverage | None = None  # k of the uncertainty U = k sigma; else that of [measure]
+    coverage: Coverage | None = None  # k of the uncertainty U = k sigma; else the coverage of [measure]
 
 
 class MeasureSettings(Section):
-    """[measure]: settings that apply to all."""
+    """[measure]: settings for all features."""
 
     weights: Weights = "network"
     coverage: Coverage = 2.0
 
 
 class FeaturesFile(Section):
-    """Content of a features file; the tables and meshes that it names are not read yet."""
+    """Content of a features file; its tables and meshes are not read yet."""
 
     measure: MeasureSettings = MeasureSettings()
     groups: Annotated[tuple[GroupSettings, ...], _entries("group")] = ()
@@ -179,15 +179,15 @@ def read_features_file(path: Path, *, allow_outside: bool = False) -> tuple[Feat
     """Read and check a features file.
 
     Args:
-        path: the TOML file; every path in it is relative to it.
+        path: the TOML file; the paths in it are relative to it.
         allow_outside: whether these paths may lead out of its folder.
 
     Returns:
-        Its settings, and the paths of the tables and meshes that it names.
+        Its settings, and the paths of its tables and meshes by name.
 
     Raises:
-        SurveyFileError: unreadable, no TOML, an unknown key, a wrong type, or a contradiction; the line names
-            the file, the key, what was found and what was needed.
+        SurveyFileError: the file is unreadable or no TOML, or has an unknown key, a wrong type, or a
+            contradiction. The message states the file, the key, the value found and the value needed.
     """
     path = Path(path)
     text, table = read_toml(path, "a features file")

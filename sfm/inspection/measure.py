@@ -1,7 +1,7 @@
-"""Measuring a result: hidden points, alignment, shapes, functions and tolerances, in this order.
+"""Measurements in a result: hidden points, alignment, shapes, functions and tolerances, in this order.
 
 Source: Luhmann et al. (2020), Close-Range Photogrammetry and 3D Imaging, chs. 6 and 8; the module of each
-step names its source.
+step states its source.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ HEADLINES_OF_TOLERANCES: Mapping[Level, str] = {
     "bad": "Tolerances are not kept.",
 }
 WITH_AXIS = ("line", "cylinder", "cone", "torus", "paraboloid")
-SEEN_FROM = 0.8  # of the rays of targets that come from their side of a surface, at least
+SEEN_FROM = 0.8  # least share of the rays of targets that come from one side of a surface
 MeshReader = Callable[[Path], tuple[FloatArray, IntArray]]
 
 
@@ -72,11 +72,11 @@ class Quantity:
     """A distance, an angle or a height."""
 
     name: str
-    what: str  # of what, in words
+    what: str  # description, for people
     kind: str  # length | angle
     value: float  # object unit, rad
-    sigma: float  # NaN where not known
-    remarks: tuple[Remark, ...] = ()  # why the sigma means less than it seems
+    sigma: float  # NaN if unknown
+    remarks: tuple[Remark, ...] = ()  # on limitations of the sigma
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Measurement:
 
     name: str  # of the result
     points: MeasuredPoints  # in the system of the alignment, hidden points included
-    groups: tuple[tuple[str, IntArray], ...]  # name and points of each
+    groups: tuple[tuple[str, IntArray], ...]  # (name, indices of points)
     alignment: Alignment | None
     shapes: tuple[ShapeFit, ...]
     quantities: tuple[Quantity, ...]
@@ -99,7 +99,7 @@ class Measurement:
         return self.points.unit or "object units"
 
     def group_of(self, point: int) -> str:
-        """Return the name of the first group that a point is in, empty where it is in none."""
+        """Return the name of the first group that contains a point, empty if none does."""
         return next((name for name, members in self.groups if point in members), "")
 
     @property
@@ -137,14 +137,14 @@ def measure_result(
     """Measure a result.
 
     Args:
-        result: of a survey, or read from another program.
-        features: what is asked for; only the coordinates if not given.
-        paths: of the tables and meshes that it names.
+        result: result of a survey, or of another program.
+        features: requested features; only the coordinates if not given.
+        paths: paths of the tables and meshes named in `features`.
         read_mesh: reads the vertices and triangles of a mesh.
 
     Raises:
-        KolinearError: a feature that its points do not determine, names that are unknown, or tables that
-            cannot be read.
+        KolinearError: the points of a feature do not determine it, a name is unknown, or a table cannot be
+            read.
     """
     features = FeaturesFile() if features is None else features
     paths = {} if paths is None else paths
@@ -201,7 +201,7 @@ class _Work:
         )
 
     def chosen(self, patterns: tuple[str, ...], what: str) -> IntArray:
-        """Return the points of names, patterns and groups."""
+        """Return the points that names, patterns and groups select."""
         flat = [one for pattern in patterns for one in self.patterns.get(pattern, (pattern,))]
         return self.points.matching(flat, what)
 
@@ -228,7 +228,7 @@ class _Work:
         return first if one.offset == 0 else fitted(one.offset * self.side(one, first))
 
     def side(self, one: ShapeSettings, fit: ShapeFit) -> float:
-        """Return on which side of a shape its targets are, 1 on that of its normals."""
+        """Return the side of a shape on which its targets are: 1 for the side of its normals, else -1."""
         xyz = self.points.xyz[fit.points]
         normals = fit.shape.design(xyz)[1][:, -1]
         if one.side != "cameras":
@@ -292,7 +292,7 @@ class _Work:
         return fit.function[fit.parameters.rows("direction")]
 
     def place(self, name: str) -> Function:
-        """Return the coordinates of a point, or of where a shape lies."""
+        """Return the coordinates of a point, or the position of a shape."""
         if name in self.shapes:
             fit = self.shapes[name]
             return fit.function[fit.parameters.rows(fit.shape.kind.place)]
@@ -314,7 +314,9 @@ class _Work:
             else:
                 fits = [self.shape_named(name, f"angle {angle.name}") for name in (a, b)]
                 function = angle_of_directions(*map(self.direction, fits), undirected=True)
-                if sum(fit.shape.kind.name == "plane" for fit in fits) == 1:  # of a plane's normal it is not
+                if (
+                    sum(fit.shape.kind.name == "plane" for fit in fits) == 1
+                ):  # from the angle with the plane's normal
                     flip = np.array([[-1.0]])
                     function = function.times(flip, np.pi / 2 - function.value)
                 what = f"angle between {a} and {b}"
@@ -334,7 +336,7 @@ class _Work:
         return found
 
     def distance(self, start: str, end: str) -> Function:
-        """Return the distance of two places, or of a place from a plane or an axis."""
+        """Return the distance of two positions, or of a position from a plane or an axis."""
         for one, other in ((start, end), (end, start)):
             fit = self.shapes.get(other)
             if fit is None or (one in self.shapes and self.shapes[one].shape.kind.name in WITH_AXIS):
@@ -388,7 +390,7 @@ class _Work:
         )
 
     def remarks(self) -> Iterator[Remark]:
-        """Yield what limits the result, and what is wrong with its shapes."""
+        """Yield the remarks on limitations of the result, and on its shapes."""
         points = self.points
         if points.covariance is None:
             yield remark("no_precision")
@@ -433,7 +435,7 @@ def _nominal(path: Path) -> Nominal:
 
 
 def _rays(result: Solution) -> tuple[IntArray, FloatArray]:
-    """Return point and camera position of each ray; points count among those with coordinates."""
+    """Return the point, counted among those with coordinates, and the camera position of each ray."""
     network, estimate = result.network, result.estimate
     seen = network.image_points
     number = np.cumsum(estimate.determined) - 1

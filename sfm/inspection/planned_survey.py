@@ -1,4 +1,8 @@
-"""A plan as a survey to be run: read from its folder, rendered, compared with what the survey achieved."""
+"""Simulation of a planned survey: reading the plan, rendering its photographs, checking its precision.
+
+The simulated survey has random errors with the standard deviations of the plan. After its adjustment, the
+achieved precision is compared with the prediction.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +40,8 @@ from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
 
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
-MAX_PIXELS = 70_000_000  # of a simulated photograph: they are drawn whole, with oversampling
-MAX_NEIGHBOUR_FRACTION = 0.3  # of the distance of neighbours within which a measured point is a planned one
+MAX_PIXELS = 70_000_000  # of a simulated photograph, which is drawn whole, with oversampling
+MAX_NEIGHBOUR_FRACTION = 0.3  # of the distance of neighbours: limit between a measured and its planned point
 Positive = Annotated[float, Field(gt=0, lt=1e12)]
 Deviation = Annotated[float, Field(ge=0, lt=1e12)]
 
@@ -91,20 +95,24 @@ class PlannedSurvey:
     points: tuple[str, ...]
     xyz: FloatArray  # object unit, (n, 3)
     normals: FloatArray  # (n, 3)
-    sigma: FloatArray  # predicted, of X, Y, Z, object unit; NaN where not determined, (n, 3)
+    sigma: FloatArray  # predicted, of X, Y, Z, object unit; NaN if undetermined, (n, 3)
     coded: BoolArray  # (n,)
     seen: BoolArray  # which photograph shows which point, (m, n)
     diameter: float  # of targets, object unit
     contrast: float
     noise: float
     blur_px: float
-    sigma_px: float  # of an image coordinate, as the prediction has it
+    sigma_px: float  # of an image coordinate, as in the prediction
     bars: tuple[tuple[str, str, float], ...]  # ends and standard deviation, object unit
     tables: tuple[ObservationTable, ...]
-    given_mounts: MountObservations  # those held fixed have variance 0
+    given_mounts: MountObservations  # mounts held fixed have variance 0
 
     def simulated(self, seed: int) -> tuple[Network, Estimate]:
-        """Return what the survey measures, with errors, and the truth."""
+        """Return the measured network with errors, and the truth.
+
+        Args:
+            seed: seed of the errors.
+        """
         i, j = np.nonzero(self.seen)
         C = np.tile(self.sigma_px**2 * np.eye(2), (len(i), 1, 1))
         stations = self.stations
@@ -122,22 +130,24 @@ class PlannedSurvey:
 
 @dataclass(frozen=True)
 class AchievedPrecision:
-    """Precision that a simulated survey achieved, against the prediction of its plan."""
+    """Precision of a simulated survey, compared with the prediction of its plan."""
 
-    points: int  # planned points that were measured
-    planned: int
-    ratio: float  # median of a posteriori over predicted sigmas of points
-    error: float  # RMS error against the truth over the predicted RMS sigma, in the datum of the prediction
+    points: int  # number of planned points that were measured
+    planned: int  # number of planned points
+    ratio: float  # median ratio of a posteriori to predicted sigmas of points
+    error: float  # RMS true error over the predicted RMS sigma, in the datum of the prediction
     sigma_px: float  # a posteriori, of an image coordinate
     predicted_px: float
-    mounts: float | None = None  # RMS true error of mounts over their a posteriori sigmas; None without any
+    mounts: float | None = (
+        None  # RMS true error of mounts over their a posteriori sigmas; None without mounts
+    )
 
 
 def read_plan(folder: Path) -> PlannedSurvey:
-    """Read a plan from the folder that `kolinear plan network` has written.
+    """Read a plan from a folder written by `kolinear plan network`.
 
     Raises:
-        SurveyFileError: what is missing or wrong, with file and line.
+        SurveyFileError: something is missing or wrong; the message has file and line.
     """
     refuse_links_out(folder)
     plan = read_json(folder / "plan.json", _Plan, "a plan")
@@ -213,7 +223,7 @@ def _camera(where: Path, c: _Camera) -> Camera:
 
 
 def _rig(where: Path, mounts: Sequence[_Mount], cameras: tuple[Camera, ...]) -> Mounts | None:
-    """Return the rig of a plan; None of one camera."""
+    """Return the rig of a plan; None for a single camera."""
     if [one.camera for one in mounts] != [camera.name for camera in cameras][: len(mounts)] or (
         len(cameras) > 1 and len(mounts) != len(cameras)
     ):
@@ -230,7 +240,7 @@ def _rig(where: Path, mounts: Sequence[_Mount], cameras: tuple[Camera, ...]) -> 
 
 
 def _given_mounts(mounts: Sequence[_Mount]) -> MountObservations:
-    """Return the mounts that are given, but for the reference."""
+    """Return the given mounts, except for the reference camera."""
     on = [a for a, one in enumerate(mounts) if one.sigma is not None and any((*one.value, *one.sigma))]
     value = np.array([mounts[a].value for a in on]).reshape(-1, 6) / IN_FILES
     sigma = np.array([mounts[a].sigma for a in on]).reshape(-1, 6) / IN_FILES
@@ -239,7 +249,7 @@ def _given_mounts(mounts: Sequence[_Mount]) -> MountObservations:
 
 
 def _table(where: Path, kind: str, rows: list[list[str | float]]) -> ObservationTable:
-    """Return survey observations of a plan."""
+    """Return the survey observations of one kind in a plan."""
     texts, columns = TABLES[kind].texts, TABLES[kind].columns()
     n = len(texts)
     for row in rows:
@@ -253,7 +263,11 @@ def _table(where: Path, kind: str, rows: list[list[str | float]]) -> Observation
 
 
 def codes_of(plan: PlannedSurvey, family: CodeFamily) -> IntArray:
-    """Return the code number of each target, UNCODED where it has no ring, (n,).
+    """Return the code number of each target, UNCODED for targets without a ring, (n,).
+
+    Args:
+        plan: the plan.
+        family: code family of the targets.
 
     Raises:
         SurveyFileError: the family has fewer codes than the plan needs.
@@ -272,16 +286,16 @@ def codes_of(plan: PlannedSurvey, family: CodeFamily) -> IntArray:
 def write_simulation(
     plan: PlannedSurvey, folder: Path, *, codes: str | None = "ring14", seed: int = 0
 ) -> Path:
-    """Write photographs or image points of a plan and the survey file of them; return its path.
+    """Write the photographs or image points of a plan, and their survey file; return the path of this file.
 
-    Observations of every kind, those of the rig and image points among them, have errors with the standard
-    deviations that the plan states.
+    Observations of every kind, including mounts of the rig and image points, have errors with the standard
+    deviations of the plan.
 
     Args:
         plan: the plan.
-        folder: that is there; photographs go into `photographs` in it.
-        codes: family of the coded targets; image points in place of photographs if None.
-        seed: of the noise.
+        folder: existing folder; photographs are written into its subfolder `photographs`.
+        codes: family of the coded targets; None for image points in place of photographs.
+        seed: seed of the noise.
 
     Raises:
         KolinearError: too many codes, targets that overlap, or a file that cannot be written.
@@ -330,7 +344,7 @@ def _image_points(network: Network) -> Iterator[tuple[object, ...]]:
 
 
 def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes: str, seed: int) -> None:
-    """Render the photographs of a plan, whose points are at true places."""
+    """Render the photographs of a plan with its points at their true positions."""
     family = _rings(codes)
     unknown = np.isnan(plan.normals).any(axis=1)
     if unknown.any():
@@ -367,7 +381,7 @@ def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes
 
 
 def _camera_section(camera: Camera, images: list[str]) -> list[str]:
-    """Return the lines of a camera, whose free parameters begin at 0."""
+    """Return the lines of a camera; its free parameters start at 0."""
     free = [name for name, one in zip(camera.names, camera.free, strict=True) if one]
     values = zip(camera.names, camera.parameters.tolist(), strict=True)
     held = [f"{name} = {value!r}" for name, value in values if name not in free and name != "c"]
@@ -380,7 +394,7 @@ def _camera_section(camera: Camera, images: list[str]) -> list[str]:
 
 
 def _rig_section(folder: Path, network: Network, truth: Estimate) -> list[str]:
-    """Return the lines of the rig; writes moments, and the mounts that are given."""
+    """Return the lines of the rig, and write its moments and given mounts."""
     if truth.mounts is None or network.moment is None:
         return []
     ((rig, on),) = truth.mounts.by_rig().items()
@@ -406,11 +420,11 @@ def _rings(codes: str) -> CodeFamily:
 
 
 def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
-    """Return what a survey calls the points of a plan, None of those without code, (n,).
+    """Return the names of a plan's points in the survey, None for points without a code, (n,).
 
     Args:
         plan: the plan.
-        codes: family of the coded targets; None where image points were simulated.
+        codes: family of the coded targets; None if image points were simulated.
     """
     if codes is None:
         return plan.points
@@ -420,19 +434,19 @@ def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
 def achieved(
     plan: PlannedSurvey, codes: str | None, result: SurveyResult, *, seed: int = 0
 ) -> AchievedPrecision:
-    """Return what a simulated survey achieved against its plan.
+    """Compare the precision of a simulated survey with its plan.
 
-    True errors are those of the datum of the prediction: the result is moved onto the truth by the motions
-    that no observation gives. An error of a scale that a bar gives is one of the points.
+    True errors are in the datum of the prediction: the result is moved onto the truth by the motions that no
+    observation determines. If a bar gives the scale, an error of the scale counts as an error of the points.
 
     Args:
         plan: the plan.
-        codes: as of `write_simulation`.
-        result: of the survey.
-        seed: as of `write_simulation`.
+        codes: as in `write_simulation`.
+        result: result of the survey.
+        seed: as in `write_simulation`.
 
     Raises:
-        SurveyFileError: fewer than 3 coded targets were measured, by which the others are named.
+        SurveyFileError: fewer than 3 coded targets were measured, so the other points cannot be identified.
     """
     names = {name: j for j, name in enumerate(result.network.points)}
     xyz = result.estimate.points
@@ -470,7 +484,7 @@ def achieved(
 
 
 def _mount_error(plan: PlannedSurvey, result: Solution, scale: float) -> float | None:
-    """Return the RMS true error of the mounts that were adjusted over their standard deviations."""
+    """Return the RMS true error of the adjusted mounts over their standard deviations."""
     rig, found, Q = plan.stations.rig, result.estimate.mounts, result.mount_covariance
     if rig is None or found is None or Q is None or not found.free.any():
         return None

@@ -1,11 +1,11 @@
-"""Planning: what a network must be like before anything is photographed.
+"""Planning: the design of a network before anything is photographed.
 
-- `compute_target_size`: how large targets must be.
+- `compute_target_size`: the size of targets.
 - `shape_object`, `object_of_points`, `object_of_mesh`: the object.
-- `arrangement`, then `predict_network`: stations of the textbooks, and what photographs from them give.
-- `design_network`: stations that give what is wanted; `further_photographs`: what to add to a survey.
+- `arrangement`, then `predict_network`: stations of textbooks, and the precision of photographs from them.
+- `design_network`: stations that give the wanted precision; `further_photographs`: additions to a survey.
 - `sight_of`, `depth_of_field`, `hidden_points` (by the `box_tree` of a mesh), `centre_covariance`: which
-  point is seen from where, and how precisely.
+point is seen from which station, and how precisely.
 - `calibratability`, `choose_coded`: whether the camera can be calibrated, and which targets must be coded.
 
     >>> from sfm.planning import compute_target_size
@@ -21,4 +21,4 @@ from sfm.runtime.installation import public_names
 __getattr__, __dir__, __all__ = public_names(__name__, __path__[0])
 
 MIN_PIXELS = 7.0
-"""on a target, as document 000 takes it; the measurement itself begins at 3"""
+"""across a target, as in document 000; targets can be measured from 3 px on"""

@@ -1,12 +1,13 @@
-"""A network designed for what is wanted: candidates for stations, their gain, and the choice.
+"""Design of a network for a wanted precision: candidate stations, their gains, and the choice among them.
 
-The choice goes by the limiting covariance of points, in which the orientations are held (`gains`); each
-point's share of what that ignores - orientation, self-calibration, datum - is taken from the full covariance
-of the network so far. Figures of the design always are of the full covariance.
+The choice uses the limiting covariance of points, in which the orientations are held (`gains`). It ignores
+orientation, self-calibration and datum. Their share in the variance of each point is taken from the full
+covariance of the network so far. The figures of a design always come from the full covariance.
 
-Gain of one more photograph for the points that it shows, the orientations of all photographs held. Each image
-point adds A'PA to the 3 x 3 normal matrix of its point, so that the gain of every candidate follows from
-updates of rank 2, without any system of equations: limiting error propagation.
+The gain of a candidate is the improvement of the points that it shows, with the orientations of all
+photographs held. Each image point adds A'PA to the 3 x 3 normal matrix of its point. The gain of every
+candidate therefore follows from updates of rank 2, without solving a system of equations (limiting error
+propagation):
 
     Q' = Q - Q A' (P^-1 + A Q A')^-1 A Q
 
@@ -44,32 +45,32 @@ from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
 
-POWER = 4  # of the variances in the sum that represents the worst: smooth, so that ties are broken
+POWER = 4  # of the variances in the cost: a smooth maximum, which also breaks ties
 COUNT = 300  # stations that the designer chooses from, each upright and rolled
-DISTANCES = (0.75, 1.25)  # of that at which the object fills the photograph, by default
+DISTANCES = (0.75, 1.25)  # default distances, over the distance at which the object fills the photograph
 AIMS = 8  # parts of the object that a station may look at, besides its middle
-TRIES = 60  # positions tried for each that is wanted, until no room is reported
+TRIES = 60  # positions tried for each wanted station before a lack of room is reported
 MIN_POINTS = 4  # points that a candidate must show
-BASES = (2, 3, 5)
-MIN_PHOTOGRAPHS = 4  # photographs of a network whose gross errors can be found
+BASES = (2, 3, 5)  # of the Halton sequence
+MIN_PHOTOGRAPHS = 4  # photographs of a network in which gross errors can be found
 MAX_PHOTOGRAPHS = 100
-SWEEPS = 3  # exchanges of all stations at most
-MIN_DECREASE = 1e-3  # relative decrease of the cost from which an exchange is one
-MAX_RATIO = 25.0  # of the full over the limiting variance of a point that is believed
-NO_BETTER = 0.98  # of the shortfall: a round of additions that leaves more than this gains nothing
-ROUNDS = 6  # of additions and exchanges at most
-PATIENCE = 6  # photographs that gain nothing one after the other, until the limit is reported
+SWEEPS = 3  # largest number of exchanges of all stations
+MIN_DECREASE = 1e-3  # relative decrease of the cost that justifies an exchange
+MAX_RATIO = 25.0  # largest accepted ratio of the full to the limiting variance of a point
+NO_BETTER = 0.98  # of the shortfall: additions that leave more than this are no gain
+ROUNDS = 6  # largest number of rounds of additions and exchanges
+PATIENCE = 6  # consecutive photographs without gain before the limit is reported
 
 
 @dataclass(frozen=True)
 class Design:
-    """Stations that were chosen, and what they will give."""
+    """The chosen stations and their predicted precision."""
 
-    prediction: Prediction  # full covariance of the network
-    shortfall: float  # largest of what is wanted: predicted over wanted, reached at 1 or below
+    prediction: Prediction  # with the full covariance of the network
+    shortfall: float  # largest ratio of predicted to wanted values; reached at 1 or below
     reached: bool
-    limit: str  # what limits it, in words; empty where it is reached
-    photographs_tried: int  # candidates, upright and rolled
+    limit: str  # text on the limitation; empty if the requirements are reached
+    photographs_tried: int  # number of candidates, upright and rolled
 
 
 @checked_arguments()
@@ -85,21 +86,21 @@ def design_network(
     bars: Sequence[ScaleBarPlan] = (),
     given: Callable[[Network], Network] | None = None,
 ) -> Design:
-    """Return the few stations that give what is wanted.
+    """Return few stations that meet the requirements.
 
     Args:
         planned: the object.
-        camera: interior orientation, and which parameters are adjusted.
-        allowed: where one may stand.
+        camera: interior orientation and its free parameters.
+        allowed: limits of the stations.
         seeing: limits and precision of image points.
-        wanted: what the network must give.
-        max_photographs: photographs at most.
-        count: candidates for stations, each upright and rolled.
+        wanted: requirements on the network.
+        max_photographs: largest number of photographs.
+        count: number of candidate stations, each upright and rolled.
         bars: scale bars.
-        given: as of `predict_network`.
+        given: as in `predict_network`.
 
     Raises:
-        GeometryError: no room to stand in, or nothing can be determined from there.
+        GeometryError: no room for stations, or nothing can be determined from them.
 
     Source: Fedorov (1972), Theory of Optimal Experiments; Fraser (1984).
     """
@@ -112,7 +113,7 @@ def design_network(
 
 
 class _Designer:
-    """The choice so far, with what its steps share."""
+    """State of the design that its steps share."""
 
     def __init__(
         self,
@@ -129,7 +130,7 @@ class _Designer:
         self.found, self.most, self.bars, self.given = found, most, bars, given
         self.rows = image_rows(planned, camera, found.stations, found.sight)
         self.single = np.einsum("mnai,mnaj->mnij", self.rows, self.rows)
-        self.prior = np.eye(3) / planned.size**2  # what is known of a point that nothing shows yet
+        self.prior = np.eye(3) / planned.size**2  # weight of a point that no photograph shows yet
         self.seeable = found.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
         self.scale = np.where(self.seeable, 1 / wanted.point_variance(planned), 0.0)
         self.ratio = np.ones(len(planned.names))
@@ -167,13 +168,13 @@ class _Designer:
         )
 
     def _open(self, chosen: Sequence[int]) -> BoolArray:
-        """Return which candidates may be taken: of one station one photograph, upright or rolled."""
+        """Return the candidates that may be taken: each station once, either upright or rolled."""
         open_ = np.ones(len(self.found.stations), dtype=bool)
         taken = np.array(chosen, dtype=np.int64)
         half = self.found.count
         open_[taken] = False
         open_[(taken + half) % (2 * half)] = False
-        # half of the photographs rolled where the camera is calibrated
+        # if the camera is calibrated, half of the photographs are rolled
         if self.camera.free.any() and len(chosen):
             turned = int((taken >= half).sum())
             if turned > len(chosen) - turned:
@@ -192,7 +193,7 @@ class _Designer:
         return cost_of(np.trace(self._cofactors(chosen), axis1=1, axis2=2) / 3, self.scale * self.ratio)
 
     def _full(self, chosen: Sequence[int]) -> tuple[Prediction | None, float]:
-        """Return the full prediction and what it falls short by; learn what the limiting one ignores."""
+        """Return the full prediction and its shortfall; update the ratios of full to limiting variances."""
         which = np.array(chosen, dtype=np.int64)
         report_step(f"predicting {counted(len(chosen), 'photograph')}")
         try:
@@ -214,7 +215,7 @@ class _Designer:
         return prediction, short_of(prediction, self.wanted, self.seeable)
 
     def _exchanged(self, chosen: list[int]) -> tuple[list[int], Prediction, float]:
-        """Return the choice with stations exchanged for better ones, while the full prediction gains."""
+        """Exchange stations for better ones as long as the full prediction improves."""
         prediction, short = self._full(chosen)
         for _ in range(SWEEPS):
             tried = list(chosen)
@@ -241,7 +242,7 @@ class _Designer:
     def _fewer(
         self, chosen: list[int], prediction: Prediction, short: float
     ) -> tuple[list[int], Prediction, float]:
-        """Return the choice without those photographs that what is wanted does not need."""
+        """Remove photographs that the requirements do not need."""
         while len(chosen) > MIN_PHOTOGRAPHS:
             order = np.argsort([self._cost(chosen[:k] + chosen[k + 1 :]) for k in range(len(chosen))])
             for k in order[:3]:
@@ -272,43 +273,44 @@ class _Designer:
 
 @dataclass(frozen=True)
 class StationLimits:
-    """Where one may stand."""
+    """Limits of the stations."""
 
-    distance: tuple[float, float] | None = None  # to the nearest point of the object, least and most, object
-    # unit; None = as fills the photographs
+    # least and largest distance to the nearest point of the object, object unit; None = it fills the
+    # photographs
+    distance: tuple[float, float] | None = None
     space: FloatArray | None = None  # least and largest X, Y, Z of a station, object unit, (2, 3)
     floor: float | None = None  # least Z of a station, object unit
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Stations to choose from: the upright ones, then the same rolled by 90 deg."""
+    """Stations to choose from: upright ones, then the same ones rolled by 90 deg."""
 
     stations: Stations
     sight: Sight
 
     @property
     def count(self) -> int:
-        """How many different stations there are."""
+        """Number of different stations."""
         return len(self.stations) // 2
 
 
 def candidates(
     planned: PlannedObject, camera: Camera, allowed: StationLimits, seeing: Seeing, *, count: int = COUNT
 ) -> Candidates:
-    """Return stations that may be taken, spread evenly over the room that is allowed.
+    """Return candidate stations, spread evenly over the allowed room.
 
-    From each place a camera looks at the middle of the object or at the part where it shows most points.
+    From each position a camera looks at the middle of the object, or at the part where it shows most points.
 
     Args:
         planned: the object.
         camera: interior orientation.
-        allowed: where one may stand.
-        seeing: what is seen.
-        count: stations, each upright and rolled.
+        allowed: limits of the stations.
+        seeing: limits of visibility.
+        count: number of stations, each upright and rolled.
 
     Raises:
-        GeometryError: no room, or nothing is seen from where one may stand.
+        GeometryError: no room, or too little is seen from the allowed positions.
     """
     least, most = _distances(planned, camera, allowed)
     low, high = _room(planned, allowed, most)
@@ -329,14 +331,14 @@ def candidates(
         faced |= np.isnan(planned.normals[:, 0])
         if faced.sum() < MIN_POINTS:
             continue
-        near = planned.size / nearest > sees_all  # the object does not fit in a photograph from here
+        near = planned.size / nearest > sees_all  # the object does not fit in a photograph from this position
         aimed_at = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
         ways = np.array([looking(aim - place) for aim in aimed_at])
         shown = sight_of(planned, camera, np.tile(place, (len(ways), 1)), ways, seeing).seen.sum(axis=1)
         best = int(np.argmax(shown))
         if shown[best] < MIN_POINTS:
             continue
-        if near and counted % 2:  # half of them look elsewhere, so that neighbours overlap in several ways
+        if near and counted % 2:  # half of the stations look elsewhere, for more overlaps of neighbours
             others = np.flatnonzero(shown >= max(MIN_POINTS, shown[best] / 2))
             best = int(others[counted // 2 % len(others)])
         position.append(place)
@@ -351,7 +353,7 @@ def candidates(
 
 
 def _distances(planned: PlannedObject, camera: Camera, allowed: StationLimits) -> tuple[float, float]:
-    """Return least and largest distance to the nearest point of the object."""
+    """Return the least and the largest distance to the nearest point of the object."""
     if allowed.distance is not None:
         least, most = allowed.distance
         if not 0 < least < most:
@@ -407,7 +409,14 @@ def _halton(count: int) -> FloatArray:
 
 
 def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight: Sight) -> FloatArray:
-    """Return A of every image point over its standard deviation, 0 where it is not seen, (m, n, 2, 3)."""
+    """Return A of every image point over its standard deviation, 0 if it is not seen, (m, n, 2, 3).
+
+    Args:
+        planned: the object.
+        camera: interior orientation.
+        stations: m stations.
+        sight: visibility of n points in their photographs.
+    """
     m, n = sight.why.shape
     rows = np.zeros((m, n, 2, 3))
     for i in range(m):
@@ -427,18 +436,23 @@ def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight
 
 
 def cost_of(variance: FloatArray, scale: FloatArray) -> float:
-    """Return the sum of the variances of points over what is wanted, each to a power."""
+    """Return the cost: the sum of the variances of points over the wanted ones, each to the POWER.
+
+    Args:
+        variance: variance of a coordinate of each point, object unit^2, (n,).
+        scale: 1 over the wanted variance of each point, (n,).
+    """
     return float(((variance * scale) ** POWER).sum())
 
 
 def gains(Q: FloatArray, rows: FloatArray, scale: FloatArray, open_: BoolArray) -> FloatArray:
-    """Return by how much each candidate reduces the cost, (m,); -1 where it may not be taken.
+    """Return the reduction of the cost by each candidate, (m,); -1 for candidates that may not be taken.
 
     Args:
         Q: covariance of each point, object unit^2, (n, 3, 3).
-        rows: of the candidates, see `image_rows`, (m, n, 2, 3).
-        scale: 1 over the variance that is wanted of each point, (n,).
-        open_: which candidates may be taken, (m,).
+        rows: result of `image_rows` for the candidates, (m, n, 2, 3).
+        scale: 1 over the wanted variance of each point, (n,).
+        open_: candidates that may be taken, (m,).
     """
     return np.asarray(_gains(Q, rows, scale, open_))
 

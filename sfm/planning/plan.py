@@ -1,7 +1,7 @@
-"""A plan: stations, predicted precision and weaknesses; photographs to add after a survey.
+"""A plan: stations, predicted precision and weaknesses; and photographs to add to a survey.
 
-After a survey it states which few photographs more would help its weakest points most. Directions are taken
-from the existing rays: a point faces the mean of its rays. Obstacles in other directions are not known.
+After a survey, `further_photographs` finds the few additional photographs that improve its weakest points
+most. A point is assumed to face the mean direction of its rays. Obstacles in other directions are unknown.
 
 Source: Fedorov (1972), Theory of Optimal Experiments (augmentation of a design).
 """
@@ -51,8 +51,8 @@ from sfm.remarks.remark import Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.runtime.progress import report_step
 
-DISTANCES = (0.8, 1.2)  # of those that the survey was photographed from
-ROOM = 0.25  # by which the box around its stations may be left, of its size
+DISTANCES = (0.8, 1.2)  # factors on the nearest and farthest distance of the survey's photographs
+ROOM = 0.25  # margin around the box of its stations, over the size of the box
 MAX_LISTED = 10  # points that are listed
 HEADLINES: Mapping[Level, str] = {
     "good": "The photographs determine the network.",
@@ -64,32 +64,32 @@ HEADLINES_OF_WANTED: Mapping[Level, str] = {
     "fair": "The plan determines the network, and does not give all that is wanted.",
     "bad": "The photographs do not determine the network.",
 }
-MIN_CODES = 5  # coded targets of a photograph, one more than orient it
+MIN_CODES = 5  # coded targets of a photograph, one more than its orientation needs
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned network with all remarks on it."""
+    """A planned network, with everything that its report states."""
 
     name: str
     unit: str  # of lengths
     prediction: Prediction
     seeing: Seeing
     wanted: WantedPrecision
-    design: Design | None  # None where the stations were given
-    shortfall: float  # largest of predicted over wanted; 0 where nothing is wanted
+    design: Design | None  # None for given stations
+    shortfall: float  # largest ratio of predicted to wanted values; 0 without requirements
     weak: tuple[WeakPoint, ...]
     unusable: tuple[str, ...]  # photographs that share too few points with others
-    groups: tuple[tuple[str, ...], ...]  # of photographs that are connected, the largest first
+    groups: tuple[tuple[str, ...], ...]  # connected photographs, the largest group first
     calibrations: tuple[Calibratability, ...]  # of the cameras that are not held
-    contributions: tuple[Contribution, ...]  # of the rig and of observations beside image points
-    target: TargetSize  # that shows MIN_PIXELS from the farthest station
-    coded: IntArray  # points that are coded targets: five in every photograph, and those that are observed
+    contributions: tuple[Contribution, ...]  # of the rig and of observations besides image points
+    target: TargetSize  # of MIN_PIXELS from the farthest station
+    coded: IntArray  # points that are coded targets: five in every photograph, and those with observations
     shots: tuple[Shot, ...]
 
     @property
     def reached(self) -> bool:
-        """Whether all that is wanted is predicted, and every point is determined."""
+        """Whether the prediction meets all requirements, and every point is determined."""
         whole = self.prediction.determined.all() and not self.prediction.adjustment.undetermined
         return self.shortfall <= 1 and bool(whole)
 
@@ -106,10 +106,21 @@ def plan_of(
     bars: Sequence[ScaleBarPlan] = (),
     given: Callable[[Network], Network] | None = None,
 ) -> Plan:
-    """Return the plan of given stations; arguments as of `predict_network`.
+    """Return the plan of given stations.
+
+    Args:
+        name: name of the plan.
+        unit: unit of lengths.
+        planned: the object.
+        camera: as in `predict_network`.
+        stations: as in `predict_network`.
+        seeing: limits and precision of image points.
+        wanted: requirements on the network.
+        bars: scale bars.
+        given: as in `predict_network`.
 
     Raises:
-        GeometryError: as `predict_network`.
+        GeometryError: as in `predict_network`.
     """
     prediction = predict_network(planned, camera, stations, seeing, bars=bars, given=given)
     every = np.ones(len(planned.names), dtype=bool)
@@ -125,7 +136,17 @@ def describe_plan(
     shortfall: float,
     design: Design | None,
 ) -> Plan:
-    """Return the remarks on a prediction."""
+    """Return the plan of a prediction, with its weaknesses and list of photographs.
+
+    Args:
+        name: name of the plan.
+        unit: unit of lengths.
+        prediction: prediction of the network.
+        seeing: limits and precision of image points.
+        wanted: requirements on the network.
+        shortfall: largest ratio of predicted to wanted values.
+        design: the design of the stations; None for given stations.
+    """
     seen = prediction.sight.seen
     coded = np.union1d(choose_coded(seen), _observed(prediction))
     camera = prediction.cameras[0]
@@ -170,7 +191,7 @@ def describe_plan(
 
 
 def _observed(prediction: Prediction) -> IntArray:
-    """Return the points that observations beside image points are of; a code names them."""
+    """Return the points with observations besides image points; they need a code as their name."""
     network = prediction.adjustment.network
     points = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
     return np.flatnonzero(np.isin(prediction.point, np.concatenate([*points, np.zeros(0, dtype=np.int64)])))
@@ -184,7 +205,7 @@ def _tilt(rays: FloatArray, normals: FloatArray, seeing: Seeing) -> float:
 
 
 def verdict_of_plan(plan: Plan) -> Verdict:
-    """Return the verdict on a plan with what limits it."""
+    """Return the verdict on a plan, with remarks on its limitations."""
     return judge(_remarks(plan), HEADLINES_OF_WANTED if plan.wanted.anything else HEADLINES)
 
 
@@ -229,16 +250,16 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
 
 @dataclass(frozen=True)
 class Further:
-    """Photographs to be added to a survey, and what they will give."""
+    """Photographs to add to a survey, and their effect."""
 
-    camera: str  # that they are taken with
+    camera: str  # camera of these photographs
     stations: Stations
     seen: BoolArray  # which of them shows which point, (m, n)
     shots: tuple[Shot, ...]
-    points: IntArray  # the weakest points before, as indices, (w,)
+    points: IntArray  # indices of the weakest points before, (w,)
     before: FloatArray  # sigma of every point, RMS of its coordinates, object unit, (n,)
-    after: FloatArray  # with the further photographs, (n,)
-    adjustment: Adjustment  # predicted, of survey and further photographs together
+    after: FloatArray  # the same with the further photographs, (n,)
+    adjustment: Adjustment  # predicted, of the survey together with the further photographs
 
 
 @checked_arguments()
@@ -251,21 +272,22 @@ def further_photographs(
     candidate_count: int = 200,
     max_incidence_deg: float = 60.0,
 ) -> Further:
-    """Return the photographs that help the weakest points of a survey most.
+    """Return the photographs that improve the weakest points of a survey most.
 
-    They are taken with the camera that most photographs have, without the others of its rig, from the
-    distances and within the room that it was photographed from.
+    They use the camera of most photographs, without the other cameras of its rig. Their distances and
+    positions are about those of the survey.
 
     Args:
-        network: of the survey, with the standard deviations that its image points turned out to have.
-        estimate: its solution.
+        network: network of the survey, with the a posteriori standard deviations of its image points.
+        estimate: solution of the survey.
         sigma_px: standard deviation of an image coordinate in further photographs, px.
-        count: photographs to add.
-        candidate_count: stations to choose from.
-        max_incidence_deg: of a ray to the mean of the rays that there are.
+        count: number of photographs to add.
+        candidate_count: number of stations to choose from.
+        max_incidence_deg: largest angle of a ray to the mean of the existing rays, deg.
 
     Raises:
-        GeometryError: fewer than 2 photographs or 3 points, no count, or nothing is seen from there.
+        GeometryError: fewer than 2 photographs or 3 points, a count below 1, or no station from which enough
+            is seen.
 
     Source: Fedorov (1972); limiting error propagation, see `sfm.planning.designer`.
     """
@@ -304,7 +326,7 @@ def further_photographs(
         np.concatenate([seen.xy, sight.xy[i, j]]),
         np.concatenate([seen.covariance, sight.covariance[i, j]]),
     )
-    moment = network.moment  # of photographs of a rig: further ones are single
+    moment = network.moment  # of photographs of a rig; each further photograph has its own moment
     larger = replace(
         network,
         images=(*network.images, *names),
@@ -335,7 +357,7 @@ def further_photographs(
 
 
 def _faced(network: Network, estimate: Estimate, rows: IntArray) -> PlannedObject:
-    """Return some points with the mean of their rays as the direction that they face."""
+    """Return the selected points, with the mean direction of their rays as their normals."""
     seen = network.image_points
     ray = estimate.position[seen.image] - estimate.points[seen.point]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -348,7 +370,7 @@ def _faced(network: Network, estimate: Estimate, rows: IntArray) -> PlannedObjec
 
 
 def _room(planned: PlannedObject, position: FloatArray) -> StationLimits:
-    """Return the room that a survey was photographed from, a little larger."""
+    """Return the limits of the survey's stations, slightly enlarged."""
     nearest = np.linalg.norm(planned.xyz[None] - position[:, None], axis=2).min(axis=1)
     low, high = position.min(axis=0), position.max(axis=0)
     margin = ROOM * float(np.linalg.norm(high - low)) + 1e-6 * planned.size
@@ -361,7 +383,7 @@ def _room(planned: PlannedObject, position: FloatArray) -> StationLimits:
 def _chosen(
     planned: PlannedObject, camera: Camera, room: Candidates, covariance: FloatArray, count: int
 ) -> IntArray:
-    """Return the candidates of which each next one helps the weakest points most, (count,)."""
+    """Return candidates, each the one that then improves the weakest points most, (count,)."""
     rows = image_rows(planned, camera, room.stations, room.sight)
     Q = covariance.copy()
     scale = np.full(len(Q), 3 / np.median(np.trace(Q, axis1=1, axis2=2)))
@@ -379,6 +401,6 @@ def _chosen(
 
 
 def _new_names(taken: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return names of further photographs that no photograph has."""
+    """Return names of further photographs that are not taken."""
     free = (f"new {k}" for k in range(1, len(taken) + count + 1) if f"new {k}" not in taken)
     return tuple(next(free) for _ in range(count))

@@ -1,10 +1,10 @@
-"""The object of a plan: points, the directions they face, and the surface that hides them.
+"""The object of a plan: its points, their normals, and the surface that hides points.
 
-A surface is sampled evenly: many random points of equal density, of which each next one is farthest from
-those taken before.
+A surface is sampled evenly: many random points of equal density are drawn, and each next chosen point is the
+farthest from those chosen before.
 
-Points hidden by a mesh: is a triangle between a point and a projection centre? The triangles are sorted into
-a tree of boxes, halved along their longest side, so that a ray meets few.
+A mesh hides a point if a triangle is between the point and the projection centre. The triangles are sorted
+into a tree of boxes, which are halved along their longest side, so that a ray meets few of them.
 
 Source: Gonzalez (1985), Theoretical Computer Science 38 (farthest point sampling); Moeller and Trumbore
 (1997), J. Graphics Tools 2(1) (ray and triangle); Kay and Kajiya (1986), SIGGRAPH (ray and box).
@@ -28,14 +28,14 @@ from sfm.files.csv_tables import MAX_NUMBER
 from sfm.geometry.tolerance import Mesh
 from sfm.kernels.compiling import compiled
 
-LEAF = 4  # triangles in a box that is not halved any more
-OFF_SURFACE = 1e-4  # of the size of the mesh: what is nearer to the point does not hide it
-DEPTH = 64  # boxes inside one another at most; halving by count needs log2 of the triangles
-SEGMENTS = 48  # of a round shape: its facets lie 0.2 % of the radius inside
-PER_POINT = 20  # random points of a surface for each that is kept
-SAME_VERTEX = 1e-9  # of the size of a mesh: corners nearer than this are one
-ON_LINE = 1e-9  # of the extent of points: they are on one line if they leave it by less
-REACH = 1 + 1e-9  # of a search for points, so that rounding loses none
+LEAF = 4  # triangles in a box that is not halved further
+OFF_SURFACE = 1e-4  # of the size of the mesh: triangles closer to the point do not hide it
+DEPTH = 64  # largest depth of nested boxes; halving by number needs log2 of the triangles
+SEGMENTS = 48  # of a round shape: its facets are up to 0.2 % of the radius inside
+PER_POINT = 20  # random points of a surface for each chosen point
+SAME_VERTEX = 1e-9  # of the size of a mesh: closer corners are one
+ON_LINE = 1e-9  # of the extent of points: they are on a line if their breadth is less
+REACH = 1 + 1e-9  # factor on the radius of a search, so that rounding loses no point
 SHAPES = {
     "box": ("LX", "LY", "LZ"),
     "cylinder": ("DIAMETER", "HEIGHT"),
@@ -43,21 +43,21 @@ SHAPES = {
     "wall": ("LENGTH", "HEIGHT"),
     "dish": ("DIAMETER", "DEPTH"),
 }
-"""shapes by name, and the sizes that each has; `shape_object` makes them"""
+"""sizes of each shape by its name; `shape_object` makes them"""
 
 
 @dataclass(frozen=True)
 class PlannedObject:
     """The object to be measured."""
 
-    names: tuple[str, ...]  # of the points, n of them
+    names: tuple[str, ...]  # of the points, (n,)
     xyz: FloatArray  # object unit, (n, 3)
-    normals: FloatArray  # directions that the points face, length 1; NaN where not known, (n, 3)
-    mesh: Mesh | None = None  # what hides points; None = nothing does
+    normals: FloatArray  # unit vectors of the directions that the points face; NaN if unknown, (n, 3)
+    mesh: Mesh | None = None  # surface that hides points; None = nothing hides them
 
     @cached_property
     def tree(self) -> BoxTree | None:
-        """The mesh sorted into boxes, None where nothing hides points."""
+        """The mesh sorted into boxes, None without a mesh."""
         return None if self.mesh is None else box_tree(self.mesh)
 
     @property
@@ -76,13 +76,13 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
     """Return points as an object without a surface.
 
     Args:
-        names: of the points.
-        xyz: object unit, (n, 3).
-        normals: directions that they face, of any length, (n, 3); None where not known.
+        names: names of the points, (n,).
+        xyz: coordinates, object unit, (n, 3).
+        normals: directions that the points face, of any length, (n, 3); None if unknown.
 
     Raises:
-        GeometryError: fewer than 3 points, more or fewer names, all on one line, too large, or a normal of
-            length 0.
+        GeometryError: fewer than 3 points, a wrong number of names, all points on a line, too large
+            coordinates, or a normal of length 0.
     """
     count = counted(len(xyz), "point")
     if len(xyz) < 3:
@@ -105,18 +105,18 @@ def object_of_points(names: tuple[str, ...], xyz: FloatArray, normals: FloatArra
 def object_of_mesh(
     mesh: Mesh, count: int, *, open_surface: bool = False, bare: BoolArray | None = None
 ) -> PlannedObject:
-    """Return points spread evenly over a mesh, which hides those behind it.
+    """Return points spread evenly over a mesh, which hides points behind it.
 
     Args:
-        mesh: triangles; where it is closed they are turned so that they face outwards.
-        count: points.
-        open_surface: whether the mesh may have edges of one triangle only; it is seen from the side on which
+        mesh: triangles; those of a closed mesh are oriented outwards.
+        count: number of points.
+        open_surface: whether the mesh may have edges of only one triangle; it is seen from the side on which
             its triangles run counter-clockwise.
         bare: triangles without points, such as the bottom that an object rests on, (t,).
 
     Raises:
-        GeometryError: no area, too large, fewer than 3 points asked for, a mesh with holes not stated to be
-            open, or triangles that do not run alike.
+        GeometryError: no area, too large coordinates, fewer than 3 points, a mesh with holes that is not
+            declared open, or triangles of inconsistent orientation.
     """
     if count < 3:
         raise GeometryError(f"object: {counted(count, 'point')} asked for, needed 3 or more")
@@ -158,16 +158,16 @@ def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObje
     """Return points spread evenly over a simple shape.
 
     Boxes and cylinders stand on Z = 0 about the Z axis, without points on the bottom. A plate lies in Z = 0
-    and faces up; a wall stands on Z = 0 in the plane Y = 0 and faces -Y; a dish is a paraboloid that opens
+    and faces up. A wall stands on Z = 0 in the plane Y = 0 and faces -Y. A dish is a paraboloid that opens
     upwards, with its vertex at the origin.
 
     Args:
         kind: a name in SHAPES.
-        sizes: as SHAPES names them, object unit.
-        count: points.
+        sizes: sizes in the order of SHAPES, object unit.
+        count: number of points.
 
     Raises:
-        GeometryError: another shape, another number of sizes, or a size that is not positive.
+        GeometryError: an unknown shape, a wrong number of sizes, or a size that is not positive.
     """
     if kind not in SHAPES:
         raise GeometryError(f"object: shape '{kind}', expected one of {', '.join(SHAPES)}")
@@ -195,20 +195,20 @@ def shape_object(kind: str, sizes: tuple[float, ...], count: int) -> PlannedObje
 
 
 def _refuse_too_large(xyz: FloatArray) -> None:
-    """Raise GeometryError for coordinates that no table may hold, whose squares and products overflow."""
+    """Raise GeometryError for coordinates too large for tables, whose squares and products overflow."""
     largest = float(np.abs(xyz).max(initial=0.0))
     if not largest <= MAX_NUMBER:
         raise GeometryError(f"object: a coordinate of {largest:g}, needed at most {MAX_NUMBER:g}; see --unit")
 
 
 def open_edges(mesh: Mesh) -> int:
-    """Return how many edges belong to one triangle only; vertices in one place are one."""
+    """Return the number of edges that belong to only one triangle; coincident vertices count as one."""
     _, count = np.unique(np.sort(_edges(mesh), axis=1), axis=0, return_counts=True)
     return int((count == 1).sum())
 
 
 def _reversed_edges(mesh: Mesh) -> int:
-    """Return at how many edges of two triangles both run through it in the same direction."""
+    """Return the number of edges that both of their triangles run through in the same direction."""
     edges = _edges(mesh)
     _, of, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     along = np.bincount(of.reshape(-1), weights=edges[:, 0] < edges[:, 1], minlength=len(count))
@@ -216,7 +216,7 @@ def _reversed_edges(mesh: Mesh) -> int:
 
 
 def _edges(mesh: Mesh) -> IntArray:
-    """Return the edges of the triangles as they run, vertices in one place as one, (3 t, 2)."""
+    """Return the directed edges of the triangles, with coincident vertices merged, (3 t, 2)."""
     step = SAME_VERTEX * max(float(np.abs(np.ptp(mesh.vertices, axis=0)).max()), 1e-300)
     _, same = np.unique(np.round(mesh.vertices / step), axis=0, return_inverse=True)
     t = same.reshape(-1)[mesh.triangles]
@@ -225,10 +225,15 @@ def _edges(mesh: Mesh) -> IntArray:
 
 
 def farthest_points(xyz: FloatArray, count: int) -> IntArray:
-    """Return points of which each next one is farthest from those before, (count,); all of fewer.
+    """Return indices of points, each the farthest from those before, (count,); all points if there are fewer.
 
-    The first is the one nearest to the middle. A new one changes only distances of points that are nearer
-    to it than it is to those before. Distances only shrink: what the queue has of a point is never too short.
+    The first is the nearest to the middle. A new point only changes the distances of points that are closer
+    to it than it is to the points before. Distances only decrease, so a distance in the queue is never too
+    short.
+
+    Args:
+        xyz: points, (n, 3).
+        count: number of points to choose.
     """
     count = min(count, len(xyz))
     chosen = np.empty(count, dtype=np.int64)
@@ -257,7 +262,7 @@ def _rectangle(corners: list[list[float]]) -> Mesh:
 
 
 def _prism(outline: FloatArray, height: float) -> Mesh:
-    """Return a closed prism on Z = 0 over a convex outline that runs counter-clockwise, (k, 2)."""
+    """Return a closed prism on Z = 0 over a convex, counter-clockwise outline, (k, 2)."""
     k = len(outline)
     low = np.column_stack([outline, np.zeros(k)])
     vertices = np.concatenate([low, low + np.array([0.0, 0.0, height])])
@@ -273,7 +278,7 @@ def _prism(outline: FloatArray, height: float) -> Mesh:
 
 
 def _dish(diameter: float, depth: float) -> Mesh:
-    """Return z = depth (r / R)^2, seen from above."""
+    """Return the paraboloid z = depth (r / R)^2, facing up."""
     rings = SEGMENTS // 4
     radius = np.arange(1, rings + 1) / rings
     flat = (radius[:, None, None] * _circle()[None] * diameter / 2).reshape(-1, 2)
@@ -293,10 +298,10 @@ class BoxTree:
 
     low: FloatArray  # corners of the boxes, object unit, (b, 3)
     high: FloatArray  # (b, 3)
-    first: IntArray  # first triangle of a leaf, or the first of two boxes inside, (b,)
-    count: IntArray  # triangles of a leaf, 0 where there are boxes inside, (b,)
-    corners: FloatArray  # of the triangles in their order, (t, 3, 3)
-    tolerance: float  # distance from a point within which nothing hides it, object unit
+    first: IntArray  # first triangle of a leaf, or the first of its two inner boxes, (b,)
+    count: IntArray  # number of triangles of a leaf, 0 for a box with inner boxes, (b,)
+    corners: FloatArray  # of the triangles in sorted order, (t, 3, 3)
+    tolerance: float  # triangles within this distance of a point do not hide it, object unit
 
 
 @checked_arguments()
@@ -306,7 +311,7 @@ def box_tree(mesh: Mesh) -> BoxTree:
     low, high, centre = corners.min(axis=1), corners.max(axis=1), corners.mean(axis=1)
     order = np.arange(len(corners))
     boxes: list[tuple[FloatArray, FloatArray, int, int]] = []
-    todo = [(0, len(corners), 0)]  # triangles from, to, and the place of their box
+    todo = [(0, len(corners), 0)]  # first triangle, end, and index of their box
     boxes.append((np.zeros(3), np.zeros(3), 0, 0))
     while todo:
         start, end, place = todo.pop()
@@ -335,7 +340,7 @@ def box_tree(mesh: Mesh) -> BoxTree:
 
 @checked_arguments(position="3", xyz="n 3")
 def hidden_points(tree: BoxTree, position: FloatArray, xyz: FloatArray) -> BoolArray:
-    """Return which points a mesh hides from a projection centre, (n,).
+    """Return the points that a mesh hides from a projection centre, (n,).
 
     Args:
         tree: the mesh.

@@ -1,12 +1,15 @@
-"""Prediction of a planned network: covariance, requirements, and simulated observations.
+"""Prediction of a planned network: its covariance, requirements on it, and simulated observations.
+
+Fraser's rule for the precision of points is
 
     sigma = q S sigma_image / sqrt(k)
 
-with the mean scale number S, k photographs from each station, and q that states how strong the network is.
+with the mean scale number S, k photographs from each station, and the factor q, which describes the strength
+of the network.
 
-Requirements on a network: a standard deviation of points or lengths, or a displacement that is found. A
-displacement between two such surveys is found, in its worst direction, if it is as long as the noncentrality
-of the test of three coordinates over the standard deviation of the difference.
+Requirements on a network are a standard deviation of points or lengths, or a detectable displacement. A
+displacement between two such surveys is detectable in its worst direction if its length, over the standard
+deviation of the difference, reaches the noncentrality of the test of three coordinates.
 
 Source: Fraser (1984), "Network design considerations for non-topographic photogrammetry", Photogramm. Eng.
 Remote Sens. 50(8); Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3; Baarda (1968), sec. 4 (power
@@ -40,11 +43,11 @@ from sfm.planning.stations import Stations
 from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.similarity import similarity_motions
 
-MIN_RAYS = 3  # of a point: with two it is never seen whose a gross error is
+MIN_RAYS = 3  # of a point: with two rays a gross error cannot be located
 ALPHA = 0.001  # of the test of one point among many
-MIN_POINTS = 4  # that a photograph must show to be oriented
-MAX_OFF_SIGMAS = 5.0  # of what is planned from what its observations state, as of points from a line
-MAX_JOINT = 1000  # points of whose joint covariance lengths are predicted; evenly spread ones of more
+MIN_POINTS = 4  # points that a photograph must show to be oriented
+MAX_OFF_SIGMAS = 5.0  # largest misfit of planned points to their observations, such as a line, in sigmas
+MAX_JOINT = 1000  # points with a joint covariance; if there are more, evenly spread ones are used
 
 
 @dataclass(frozen=True)
@@ -58,23 +61,23 @@ class ScaleBarPlan:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Prediction for photographs of an object from some stations."""
+    """Prediction for photographs of an object from stations."""
 
     planned: PlannedObject
     stations: Stations
     sight: Sight
-    adjustment: Adjustment  # of the points that two or more usable photographs show, for sigma0 = 1
-    point: IntArray  # place of each point of the object in that network, -1 = not in it, (n,)
-    photograph: IntArray  # likewise of each photograph, (m,)
+    adjustment: Adjustment  # of the points in two or more usable photographs, for sigma0 = 1
+    point: IntArray  # index of each point of the object in this network, -1 = not in it, (n,)
+    photograph: IntArray  # index of each photograph in this network, -1 = not in it, (m,)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Cameras, one or those of a rig."""
+        """The camera, or the cameras of a rig."""
         return self.adjustment.estimate.cameras
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of each point, object unit^2; infinite variances where it is not determined, (n, 3, 3)."""
+        """Covariance of each point, object unit^2; infinite variances if undetermined, (n, 3, 3)."""
         out = np.tile(np.diag(np.full(3, np.inf)), (len(self.point), 1, 1))
         of_point = self.adjustment.covariance.points[self.point]
         known = (self.point >= 0) & (np.trace(of_point, axis1=1, axis2=2) > 0)
@@ -83,12 +86,12 @@ class Prediction:
 
     @cached_property
     def sigma(self) -> FloatArray:
-        """Of each point, RMS of its three coordinates, object unit; infinite where not determined, (n,)."""
+        """RMS sigma of the three coordinates of each point, object unit; infinite if undetermined, (n,)."""
         return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3))
 
     @cached_property
     def largest_sigma(self) -> FloatArray:
-        """Of each point in its worst direction, object unit, (n,)."""
+        """Sigma of each point in its worst direction, object unit; infinite if undetermined, (n,)."""
         out = np.full(len(self.point), np.inf)
         known = np.isfinite(self.sigma)
         out[known] = np.sqrt(np.linalg.eigvalsh(self.covariance[known])[:, -1])
@@ -96,12 +99,12 @@ class Prediction:
 
     @cached_property
     def determined(self) -> BoolArray:
-        """Which points have coordinates, (n,)."""
+        """Which points are determined, (n,)."""
         return np.isfinite(self.sigma)
 
     @cached_property
     def rays(self) -> IntArray:
-        """In how many usable photographs each point is seen, (n,)."""
+        """Number of usable photographs that show each point, (n,)."""
         return np.asarray(self.sight.seen[self.photograph >= 0].sum(axis=0))
 
     @cached_property
@@ -113,18 +116,18 @@ class Prediction:
 
     @property
     def rms_sigma(self) -> float:
-        """Of all determined points, RMS per coordinate, object unit."""
+        """RMS sigma of a coordinate over all determined points, object unit."""
         return float(np.sqrt((self.sigma[self.determined] ** 2).mean()))
 
     @cached_property
     def sigma_px(self) -> float:
-        """Of an image coordinate, the median, px."""
+        """Median sigma of an image coordinate, px."""
         C = self.adjustment.network.image_points.covariance
         return float(np.median(np.sqrt(np.trace(C, axis1=1, axis2=2) / 2)))
 
     @cached_property
     def scale_number(self) -> float:
-        """Mean S of distance along the axis over principal distance, over all rays, object unit per px."""
+        """Mean scale number S over all rays: depth over principal distance, object unit per px."""
         seen = self.sight.seen
         m, n = np.nonzero(seen)
         away = self.planned.xyz[n] - self.stations.position[m]
@@ -134,7 +137,7 @@ class Prediction:
 
     @property
     def photographs_per_station(self) -> float:
-        """K of Fraser's rule: photographs over different projection centres."""
+        """K of Fraser's rule: number of photographs over number of projection centres."""
         return len(self.stations) / self.stations.places
 
     @property
@@ -145,9 +148,9 @@ class Prediction:
 
     @cached_property
     def motion_variance(self) -> FloatArray:
-        """Of a coordinate of each point by position, attitude and scale of all of them together, (n, 3).
+        """Variance of a coordinate of each point by position, attitude and scale of the whole, (n, 3).
 
-        0 by what is datum: that of inner constraints; object unit^2.
+        In object unit^2; 0 for motions that are datum, as with inner constraints.
         """
         a = self.adjustment
         some = spread_evenly(self.point[self.determined])
@@ -163,7 +166,7 @@ class Prediction:
 
     @cached_property
     def length_sigma(self) -> float:
-        """Largest sigma of a length between two determined points, object unit; of at most MAX_JOINT."""
+        """Largest sigma of a length between two of at most MAX_JOINT determined points, object unit."""
         a = self.adjustment
         some = spread_evenly(self.point[self.determined])
         Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
@@ -181,22 +184,22 @@ def predict_network(
     given: Callable[[Network], Network] | None = None,
     sight: Sight | None = None,
 ) -> Prediction:
-    """Return what photographs from stations will give, adjusted with the free parameters of the camera.
+    """Predict the precision of photographs from stations, adjusted with the free parameters of the camera.
 
-    The datum is free: inner constraints on all points, with the scale from bars where there are any.
+    The datum is free, with inner constraints on all points. Bars, if any, give the scale.
 
     Args:
         planned: the object.
-        camera: interior orientation and which of its parameters are adjusted; of a rig of all its cameras.
-        stations: where photographs are taken from, and on what rig.
+        camera: interior orientation and its free parameters; for a rig, all its cameras.
+        stations: stations of the photographs, and their rig.
         seeing: limits and precision of image points.
         bars: scale bars.
         given: returns the network with observations of further kinds, whose values do not matter.
-        sight: of these stations, where it is known already.
+        sight: visibility from these stations, if already known.
 
     Raises:
-        GeometryError: no photograph or no point that can be determined, as from one place, an unknown
-            point of a bar, or points that are not on the line that is observed of them.
+        GeometryError: no photograph or point can be determined, for example with all photographs from one
+            position; a bar has an unknown point; or points are off a line that is observed.
 
     Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
     """
@@ -243,7 +246,7 @@ def predict_network(
 
 
 def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
-    """Refuse observations without values, as of lines, that the planned points contradict."""
+    """Refuse observations without values, such as lines, that the planned points contradict."""
     for kind in (kind for kind in network.observations if isinstance(kind, Group) and len(kind)):
         off = np.abs(kind.linearise(values_of(estimate)).difference.ravel())
         beyond = off / kind.sigma.ravel()
@@ -258,7 +261,7 @@ def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
 
 
 def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations, seeing: Seeing) -> Sight:
-    """Return what photographs show, each by its camera."""
+    """Return the visibility in all photographs, each with its camera."""
     rows = rows_of(stations.camera, len(cameras))
     parts = [
         sight_of(planned, camera, stations.position[of_camera], stations.rotation[of_camera], seeing)
@@ -270,11 +273,12 @@ def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations
 
 
 def usable(seen: BoolArray, moment: IntArray | None = None) -> tuple[IntArray, IntArray]:
-    """Return the photographs that can be oriented and the points that two of them show, as indices.
+    """Return the indices of photographs that can be oriented, and of points that two of them show.
 
     Args:
         seen: which photograph shows which point, (m, n).
-        moment: of photographs of a rig, which are oriented together; each is alone if None, (m,).
+        moment: moments of photographs of a rig, which are oriented together, (m,); None for single
+            photographs.
     """
     photographs = np.ones(len(seen), dtype=bool)
     together = np.arange(len(seen)) if moment is None else moment
@@ -295,11 +299,11 @@ def spread_evenly(rows: IntArray) -> IntArray:
 
 
 def largest_length_sigma(xyz: FloatArray, covariance: FloatArray) -> float:
-    """Return the largest standard deviation of a length between two of some points.
+    """Return the largest standard deviation of a length between any two points, object unit.
 
     Args:
-        xyz: object unit, (n, 3).
-        covariance: of all coordinates together, object unit^2, (3 n, 3 n).
+        xyz: coordinates, object unit, (n, 3).
+        covariance: joint covariance of all coordinates, object unit^2, (3 n, 3 n).
     """
     n = len(xyz)
     Q = covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
@@ -337,17 +341,17 @@ def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBar
 def simulate_network(
     network: Network, truth: Estimate, rng: np.random.Generator | None = None
 ) -> tuple[Network, Estimate]:
-    """Return a network with the values that a truth gives, and the truth.
+    """Return a network with simulated observations, and the truth.
 
     Args:
-        network: gives what is measured, and how precisely; its values do not matter, but for coordinates
-            of rigid frames and offsets, which are near what they will be.
+        network: states the observations and their precision. Its values do not matter, except for coordinates
+            of rigid frames and offsets, which must be approximate.
         truth: true values of all unknowns.
-        rng: source of the errors, normally distributed with the covariances stated; no errors if None.
+        rng: source of the errors, normally distributed with the stated covariances; no errors if None.
 
     Returns:
-        The network, and the truth; its points on lines are moved onto the line and off it by the errors that
-        the observations state, unless there are none.
+        The network, and the truth. With errors, its points on lines are first moved onto the line, and then
+        off it by the stated errors.
     """
     if rng is not None:
         for kind in network.kinds:
@@ -377,11 +381,11 @@ def simulate_network(
 
 @dataclass(frozen=True)
 class WantedPrecision:
-    """Each None if it is not asked for; lengths in the object unit."""
+    """Requirements on a network, None if there is none; lengths in the object unit."""
 
     sigma: float | None = None  # of every point, RMS of its coordinates
     length_sigma: float | None = None  # of every length between two points
-    displacement: float | None = None  # of any point between two surveys, found with POWER
+    displacement: float | None = None  # of any point between two surveys, detectable with POWER
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -394,11 +398,11 @@ class WantedPrecision:
 
     @property
     def anything(self) -> bool:
-        """Whether something is asked for."""
+        """Whether there is any requirement."""
         return any(x is not None for x in (self.sigma, self.length_sigma, self.displacement))
 
     def point_variance(self, planned: PlannedObject) -> FloatArray:
-        """Return about what variance of a coordinate is enough at each point, object unit^2, (n,).
+        """Return the approximate variance of a coordinate that suffices at each point, object unit^2, (n,).
 
         Args:
             planned: the object.
@@ -414,24 +418,24 @@ class WantedPrecision:
 
 
 def displacement_per_sigma() -> float:
-    """Return how long a displacement between two surveys must be to be found, over sigma of one of them."""
+    """Return the length of a detectable displacement between two surveys, over sigma of one survey."""
     return math.sqrt(2) * detectable_shift(ALPHA, POWER, 3, None)
 
 
 def found_displacement(prediction: Prediction) -> FloatArray:
-    """Return the displacement of each point that would be found between two surveys, object unit, (n,)."""
+    """Return the detectable displacement of each point between two surveys, object unit, (n,)."""
     return prediction.largest_sigma * displacement_per_sigma()
 
 
 def short_of(prediction: Prediction, wanted: WantedPrecision, points: BoolArray) -> float:
-    """Return the largest of what is predicted over what is wanted; 1 or less where all of it is reached.
+    """Return the largest ratio of predicted to wanted values; 1 or less if all requirements are met.
 
-    Infinite where a point has fewer than MIN_RAYS, or the network leaves something undetermined.
+    It is infinite if a point has fewer than MIN_RAYS, or if the network leaves something undetermined.
 
     Args:
-        prediction: of a network.
-        wanted: what it must give.
-        points: that count, (n,).
+        prediction: prediction of a network.
+        wanted: requirements on the network.
+        points: points that count, (n,).
     """
     if not points.any():
         raise GeometryError(f"plan: no point can be seen from {MIN_RAYS} stations")

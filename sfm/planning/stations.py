@@ -1,7 +1,7 @@
-"""Stations of a plan: arrangements that people know, and the photographs to take from each.
+"""Stations of a plan: well-known arrangements, and the photographs to take from each station.
 
-Source: document 000, sec. 2.5.2 (designs left-right and front-back of V-STARS, four stations after Fraser),
-whose figures show them; Fraser (1984), Photogramm. Eng. Remote Sens. 50(8), for convergent networks.
+Source: document 000, sec. 2.5.2, text and figures (designs left-right and front-back of V-STARS, four
+stations after Fraser); Fraser (1984), Photogramm. Eng. Remote Sens. 50(8) (convergent networks).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from sfm.network import Mounts
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.visibility import best_focus
 
-MIN_CODED_TARGETS = 5  # targets in every photograph, by which it is oriented by resection
+MIN_CODED_TARGETS = 5  # in every photograph, for its orientation by resection
 FILLING = 0.9  # share of the format that the object fills
 RING_ELEVATION_DEG = 40.0
 TWO_RINGS_DEG = (25.0, 60.0)
-CONVERGENCE_DEG = 40.0  # of four stations to the axis, and of the designs of the documents
+CONVERGENCE_DEG = 40.0  # angle to the axis of four stations, and of the designs of document 000
 ARRANGEMENTS = {
     "ring": "COUNT: around the object, 40 deg above it",
     "two-rings": "COUNT: half of them 25 and half 60 deg above it",
@@ -42,8 +42,8 @@ class Stations:
     names: tuple[str, ...]
     position: FloatArray  # projection centres, object unit, (m, 3)
     rotation: FloatArray  # R, image to object axes, (m, 3, 3)
-    rig: Mounts | None = None  # of the cameras that are at each station together, see `with_rig`
-    taken_by: IntArray | None = None  # which camera takes each photograph; the only one if None, (m,)
+    rig: Mounts | None = None  # mounts of the cameras at each station, see `with_rig`
+    taken_by: IntArray | None = None  # camera index of each photograph, (m,); None for a single camera
     taken_at: IntArray | None = None  # moment of each photograph of a rig, (m,)
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class Stations:
         return np.zeros(len(self), dtype=np.int64) if self.taken_by is None else self.taken_by
 
     def of(self, which: AnyArray) -> Stations:
-        """Return some of the stations, in this order."""
+        """Return the selected stations, in this order."""
         return Stations(
             tuple(self.names[i] for i in which),
             self.position[which],
@@ -66,15 +66,15 @@ class Stations:
         )
 
     def renamed(self) -> Stations:
-        """Return the stations with names that count them."""
+        """Return the stations with consecutive numbers as names."""
         return replace(self, names=_numbered(len(self)))
 
     def with_rig(self, rig: Mounts, cameras: Sequence[Camera]) -> Stations:
-        """Return the photographs of all cameras of a rig whose reference camera is at the stations.
+        """Return the photographs of all cameras of a rig, with its reference camera at the stations.
 
         Args:
-            rig: mounts of its cameras.
-            cameras: the same, for their names, which precede those of the stations.
+            rig: mounts of the cameras.
+            cameras: cameras of the rig; their names precede those of the stations.
         """
         m, a = len(self), len(cameras)
         of, at = np.tile(np.arange(a), m), np.repeat(np.arange(m), a)
@@ -90,23 +90,23 @@ class Stations:
 
     @property
     def places(self) -> int:
-        """How many different projection centres there are."""
+        """Number of different projection centres."""
         return len(np.unique(np.round(self.position, 9), axis=0))
 
 
 @checked_arguments()
 def arrangement(text: str, planned: PlannedObject, camera: Camera) -> Stations:
-    """Return the stations of an arrangement that fills the photographs with the object.
+    """Return the stations of an arrangement, at distances at which the object fills the photographs.
 
     Every second photograph is rolled by 90 degrees.
 
     Args:
         text: such as "ring:12", "strips:5x2" or "four-stations"; see ARRANGEMENTS.
         planned: the object.
-        camera: whose photographs it fills.
+        camera: camera of the photographs.
 
     Raises:
-        GeometryError: another arrangement, or a number that it cannot have.
+        GeometryError: an unknown arrangement, or an impossible number.
 
     Source: document 000, sec. 2.5.2, figures 2.12 to 2.15.
     """
@@ -146,12 +146,12 @@ def arrangement(text: str, planned: PlannedObject, camera: Camera) -> Stations:
 
 
 def around(planned: PlannedObject, camera: Camera, away: FloatArray) -> Stations:
-    """Return stations that look at the middle of an object from directions, as near as it fills the format.
+    """Return stations in given directions that look at the middle of an object, which fills the format.
 
     Args:
         planned: the object.
-        camera: whose photographs it fills.
-        away: from the object to the station, (m, 3).
+        camera: camera of the photographs.
+        away: directions from the object to the stations, (m, 3).
     """
     rolls = np.pi / 2 * (np.arange(len(away)) % 2)
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -161,7 +161,13 @@ def around(planned: PlannedObject, camera: Camera, away: FloatArray) -> Stations
 
 
 def filling_distance(planned: PlannedObject, camera: Camera, rotation: FloatArray) -> float:
-    """Return the distance from the middle of an object at which it fills the format, object unit."""
+    """Return the distance from the middle of an object at which it fills the format, object unit.
+
+    Args:
+        planned: the object.
+        camera: camera of the photograph.
+        rotation: R of the photograph, image to object axes, (3, 3).
+    """
     half = np.array(camera.size_px) / 2 / camera.c_px * FILLING
     local = (planned.xyz - planned.centre) @ rotation
     return float((np.abs(local[:, :2]) / half + local[:, 2:]).max())
@@ -171,8 +177,8 @@ def looking(direction: FloatArray, roll: float = 0.0) -> FloatArray:
     """Return R of a camera that looks along a direction; with roll 0 the x axis of the image is horizontal.
 
     Args:
-        direction: in which it looks, (3,).
-        roll: counter-clockwise about it, rad.
+        direction: viewing direction, (3,).
+        roll: counter-clockwise rotation about this direction, rad.
     """
     z = -direction / np.linalg.norm(direction)
     right = np.cross([0.0, 0.0, 1.0], z)
@@ -184,14 +190,14 @@ def looking(direction: FloatArray, roll: float = 0.0) -> FloatArray:
 
 
 def rolled(rotation: FloatArray) -> FloatArray:
-    """Return rotations of the same cameras rolled by 90 degrees, (..., 3, 3)."""
+    """Return the rotations, (..., 3, 3), rolled by 90 degrees."""
     return np.stack([rotation[..., 1], -rotation[..., 0], rotation[..., 2]], axis=-1)
 
 
 def object_axes(planned: PlannedObject) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the direction that most of an object faces, and what is right and up when looking at it.
+    """Return the main direction that an object faces, and its right and up directions for a viewer.
 
-    The mean of the normals, or where these cancel or are unknown the direction of least extent.
+    This is the mean of the normals. If these cancel or are unknown, it is the direction of least extent.
     """
     known = planned.normals[~np.isnan(planned.normals).any(axis=1)]
     mean = known.mean(axis=0) if len(known) else np.zeros(3)
@@ -214,7 +220,7 @@ def _strips(text: str, number: str, planned: PlannedObject, camera: Camera) -> S
     a, b = int(columns), int(rows)
     local = (planned.xyz - planned.centre) @ np.stack([right, up, axis], axis=1)
     low, high = local.min(axis=0), local.max(axis=0)
-    # each photograph shows the part of the object that three of them would share
+    # the photographs overlap: each shows a part of the object three steps wide
     part = np.ptp(local[:, :2], axis=0) * np.minimum(1.0, 3 / (np.array([a, b]) + 2))
     half = np.array(camera.size_px) / 2 / camera.c_px * FILLING
     distances = np.array([(part / 2 / h).max() for h in (half, half[::-1])]) + high[2]  # upright, rolled
@@ -238,17 +244,17 @@ def _numbered(count: int) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Shot:
-    """A photograph to be taken."""
+    """A photograph to take."""
 
     station: str
     position: FloatArray  # object unit, (3,)
-    azimuth_deg: float  # of the direction in which the camera looks, from +X towards +Y
-    elevation_deg: float  # of the same, down is negative
-    roll_deg: float  # counter-clockwise about it; 0 = upright
-    distance: float  # mean along the axis of the points that it shows, object unit
-    focus: float  # of the lens, one for all photographs, object unit
-    points: int  # that it shows
-    coded: int  # of them coded
+    azimuth_deg: float  # of the viewing direction, from +X towards +Y
+    elevation_deg: float  # of the viewing direction, negative downwards
+    roll_deg: float  # counter-clockwise about the viewing direction; 0 = upright
+    distance: float  # mean distance along the axis of the points that it shows, object unit
+    focus: float  # focus distance of the lens, the same for all photographs, object unit
+    points: int  # number of points that it shows
+    coded: int  # number of coded points among them
 
 
 def shots(
@@ -256,14 +262,15 @@ def shots(
 ) -> tuple[Shot, ...]:
     """Return the list of photographs of a plan.
 
-    They have one focus, as they have one calibration: another focus is another principal distance.
+    All photographs have one focus, since they have one calibration: another focus changes the principal
+    distance.
 
     Args:
         xyz: points, object unit, (n, 3).
-        stations: of the m photographs.
+        stations: stations of the m photographs.
         seen: which photograph shows which point, (m, n).
-        coded: which points are coded targets, see `choose_coded`.
-        focus: distance in focus, object unit; None = as sharp at the nearest point as at the farthest.
+        coded: indices of the coded targets, see `choose_coded`.
+        focus: focus distance, object unit; None = equally sharp at the nearest and the farthest point.
     """
     found = []
     if focus is None:
@@ -292,27 +299,30 @@ def shots(
 
 
 def roll_deg(rotation: FloatArray) -> float:
-    """Return by how much a camera is rolled about its axis, deg, -180 to 180; 0 where image x is horizontal.
+    """Return the roll of a camera about its axis, deg, -180 to 180; 0 if image x is horizontal.
 
-    Of a camera that looks straight down or up, the roll is that of image x against X.
+    If a camera looks straight down or up, its roll is the angle of image x against X.
+
+    Args:
+        rotation: R of the camera, image to object axes, (3, 3).
     """
     level = np.cross([0.0, 0.0, 1.0], rotation[:, 2])
     if np.linalg.norm(level) < 1e-6:
         level = np.array([1.0, 0.0, 0.0])
     up = np.cross(rotation[:, 2], level)
-    # + 0.0: no roll of -0.0
+    # + 0.0 turns -0.0 into 0.0
     return float(np.round(np.degrees(np.arctan2(rotation[:, 0] @ up, rotation[:, 0] @ level)), 9) + 0.0)
 
 
 @checked_arguments(seen="m n")
 def choose_coded(seen: BoolArray, *, per_photograph: int = MIN_CODED_TARGETS) -> IntArray:
-    """Return few points which, as coded targets, give every photograph so many, or all that it shows.
+    """Return few points that, as coded targets, give every photograph enough of them, or all that it shows.
 
-    The point that most photographs still lack comes first.
+    The point that most photographs still need is chosen first.
 
     Args:
         seen: which photograph shows which point, (m, n).
-        per_photograph: coded targets in each.
+        per_photograph: number of coded targets in each photograph.
 
     Source: Chvatal (1979), Math. Oper. Res. 4(3) (greedy covering).
     """

@@ -1,9 +1,12 @@
-"""Which point is seen from which station, and how well; depth of field and sizes of targets.
+"""Visibility of points from stations, precision of targets in photographs, depth of field and target sizes.
 
-Precision of a target in a photograph from its size, contrast, blur and noise. An edge blurred by a Gaussian
-of standard deviation s contains, per length, the information A^2 / (2 s sqrt(pi)) / noise^2 on a shift across
-it. Summed round an ellipse that is the Cramer-Rao bound of its centre, which the measurement of targets
-reaches within some 5 % where the background is even.
+A photograph shows a point unless it is outside the format, too oblique, hidden by the surface, not sharp, or
+too small.
+
+The precision of a target follows from its size, contrast, blur and noise. An edge of contrast A, blurred by a
+Gaussian of standard deviation s, contains per unit of length the information A^2 / (2 s sqrt(pi)) / noise^2
+on a shift across it. The sum round an ellipse gives the Cramer-Rao bound of its centre. The measurement of
+targets reaches this bound within about 5 % if the background is uniform.
 
     information = A^2 / (2 s sqrt(pi) noise^2) * integral of n n' dl
     circle of radius R: sigma^2 = 2 s noise^2 / (sqrt(pi) R A^2)
@@ -28,17 +31,17 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject, hidden_points
 
-STEEPEST_DEG = 75.0  # beyond, a target is not recognised
-STEPS = 24  # round an ellipse; the integrand is smooth and periodic
+STEEPEST_DEG = 75.0  # beyond this tilt a target is not recognised
+STEPS = 24  # of the integral round an ellipse; the integrand is smooth and periodic
 
 
 @dataclass(frozen=True)
 class TargetImage:
-    """How well targets stand out in the photographs."""
+    """Appearance of targets in photographs."""
 
     contrast: float = 120.0  # step of intensity between target and surroundings
     noise: float = 2.0  # standard deviation of an intensity, same scale
-    blur_px: float = 0.8  # standard deviation of the edge, the box of a pixel included
+    blur_px: float = 0.8  # standard deviation of the edge, including the box of a pixel
 
     def __post_init__(self) -> None:
         for name, value in (("contrast", self.contrast), ("noise", self.noise), ("blur", self.blur_px)):
@@ -55,9 +58,11 @@ class DepthOfField:
     focus: float  # distance in focus
 
 
-MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond, targets are measured badly or not at all
-MIN_DIAMETER_PX = 5.0  # shorter axis of a target from which on it is measured
-SAME_RAY = 1e-6  # tangents of one ray; a polynomial folds far ones back into the format
+MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond it targets are measured badly or not at all
+MIN_DIAMETER_PX = 5.0  # shorter axis of the smallest target that is measured
+SAME_RAY = (
+    1e-6  # difference of tangents of one ray; a distortion polynomial folds distant rays back into the format
+)
 BORDER_PX = 2.0  # between a target and the edge of the photograph
 
 
@@ -66,10 +71,10 @@ class Why(IntEnum):
 
     SEEN = 0
     OUTSIDE = 1  # the photograph or behind the camera
-    OBLIQUE = 2  # its ray is too far from the normal
+    OBLIQUE = 2  # the angle of its ray to the normal is too large
     HIDDEN = 3  # by the surface
     UNSHARP = 4  # outside the depth of field
-    SMALL = 5  # its target shows too few pixels
+    SMALL = 5  # its target is too few pixels across
 
 
 WORDS = {
@@ -86,10 +91,10 @@ class Seeing:
     """Limits that decide whether a point is seen, and how precisely."""
 
     max_incidence_deg: float = MAX_INCIDENCE_DEG
-    diameter: float | None = None  # of a target, object unit; None = any size is measured with `sigma_px`
+    diameter: float | None = None  # of a target, object unit; None = every target has `sigma_px`
     min_diameter_px: float = MIN_DIAMETER_PX
     depth: DepthOfField | None = None  # object unit; None = everything is sharp
-    sigma_px: float | None = None  # of an image coordinate; None = from diameter and `target`
+    sigma_px: float | None = None  # of an image coordinate; None = computed from diameter and `target`
     target: TargetImage = field(default_factory=TargetImage)
 
     def __post_init__(self) -> None:
@@ -108,10 +113,12 @@ class Seeing:
 class Sight:
     """Visibility of n points in m photographs."""
 
-    why: AnyArray  # a Why of each, (m, n)
-    xy: FloatArray  # where, px; NaN behind the camera, (m, n, 2)
-    covariance: FloatArray  # of an image point, px^2; NaN where it is not seen, (m, n, 2, 2)
-    diameter_px: FloatArray  # shorter axis of the target; NaN where its size or direction is unknown, (m, n)
+    why: AnyArray  # values of Why, (m, n)
+    xy: FloatArray  # image points, px; NaN behind the camera, (m, n, 2)
+    covariance: FloatArray  # of an image point, px^2; NaN if it is not seen, (m, n, 2, 2)
+    diameter_px: (
+        FloatArray  # shorter axis of the target; NaN if its size is unknown or it is not seen, (m, n)
+    )
 
     @property
     def seen(self) -> BoolArray:
@@ -119,7 +126,7 @@ class Sight:
         return np.asarray(self.why == Why.SEEN)
 
     def of(self, photographs: AnyArray) -> Sight:
-        """Return what some of the photographs show."""
+        """Return the visibility in the selected photographs."""
         return replace(
             self,
             why=self.why[photographs],
@@ -133,16 +140,16 @@ class Sight:
 def sight_of(
     planned: PlannedObject, camera: Camera, position: FloatArray, rotation: FloatArray, seeing: Seeing
 ) -> Sight:
-    """Return what photographs from some stations show.
+    """Return the visibility of points in photographs from stations.
 
-    A point without normal has no incidence: it counts as a target that faces the camera.
+    A point without a normal has no incidence, and counts as a target that faces the camera.
 
     Args:
         planned: points, normals and surface.
         camera: interior orientation.
         position: projection centres, object unit, (m, 3).
         rotation: R, image to object axes, (m, 3, 3).
-        seeing: limits, and what targets are like.
+        seeing: limits, and the appearance of targets.
 
     Source: Mason (1997), Photogramm. Eng. Remote Sens. 63(9).
     """
@@ -163,7 +170,7 @@ def sight_of(
 
 def _turned_away_or_hidden(planned: PlannedObject, position: FloatArray) -> BoolArray:
     away = planned.normals * (position - planned.xyz)
-    turned = away.sum(axis=1) <= 0  # NaN where the normal is unknown: not turned away
+    turned = away.sum(axis=1) <= 0  # NaN for an unknown normal: not turned away
     if planned.tree is not None:
         turned |= hidden_points(planned.tree, position, planned.xyz)
     return np.asarray(turned)
@@ -187,10 +194,12 @@ def _photograph(
     inside = np.asarray(within)
     looked_at = np.flatnonzero(inside)
     back = tangents_from_pixel(camera, xy[looked_at]) - UVW[looked_at, :2] / -UVW[looked_at, 2:]
-    inside[looked_at] = np.abs(back).max(axis=1, initial=0.0) < SAME_RAY  # NaN is none, too
+    inside[looked_at] = np.abs(back).max(axis=1, initial=0.0) < SAME_RAY  # NaN also fails
     why = np.where(inside, Why.SEEN, Why.OUTSIDE).astype(np.uint8)
     ray = position - planned.xyz
-    ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-300)  # a station at the point sees none
+    ray /= np.maximum(
+        np.linalg.norm(ray, axis=1, keepdims=True), 1e-300
+    )  # a station at a point does not see it
     cosine = (planned.normals * ray).sum(axis=1)
     oblique = cosine < np.cos(np.radians(seeing.max_incidence_deg))
     why[inside & oblique] = Why.OBLIQUE
@@ -222,7 +231,7 @@ def _outlines(
     xy: FloatArray,
     ray: FloatArray,
 ) -> FloatArray:
-    """Return J of the images of circles on the object, to first order, px, (k, 2, 2)."""
+    """Return J of the images of circular targets to first order, px, (k, 2, 2), see `centre_covariance`."""
     normal = planned.normals[used]
     normal = np.where(np.isnan(normal), ray, normal)
     helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
@@ -240,7 +249,7 @@ def _outlines(
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens with its setting; lengths in mm."""
+    """A lens and its setting; lengths in mm."""
 
     f_number: float  # focal length over the diameter of the aperture
     focus_mm: float  # distance of the plane in focus from the projection centre
@@ -249,11 +258,11 @@ class Lens:
 
 @checked_arguments()
 def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
-    """Return between which distances a lens is sharp, mm.
+    """Return the distances between which a lens is sharp, mm.
 
     Args:
         lens: the lens and its setting.
-        f_mm: focal length.
+        f_mm: focal length, mm.
 
     Raises:
         GeometryError: a number that is not positive, or a focus within the focal length.
@@ -280,7 +289,7 @@ def depth_of_field(lens: Lens, f_mm: float) -> DepthOfField:
 
 
 def best_focus(near: float, far: float) -> float:
-    """Return the focus distance that is as sharp at the nearest as at the farthest point: 2 n f / (n + f)."""
+    """Return the focus distance with equal sharpness at the nearest and farthest point: 2 n f / (n + f)."""
     return 2 * near * far / (near + far)
 
 
@@ -289,7 +298,7 @@ def centre_covariance(axes: FloatArray, target: TargetImage) -> FloatArray:
     """Return the covariance of the centres of ellipses, px^2, (k, 2, 2).
 
     Args:
-        axes: J of each ellipse: its outline is J (cos t, sin t)', px, (k, 2, 2).
+        axes: J of each ellipse, whose outline is J (cos t, sin t)', px, (k, 2, 2).
         target: contrast, noise and blur.
 
     Source: Cramer-Rao bound of a blurred edge, summed round the outline.
@@ -305,7 +314,7 @@ def centre_covariance(axes: FloatArray, target: TargetImage) -> FloatArray:
 
 @dataclass(frozen=True)
 class TargetSize:
-    """The size of targets for a camera and a distance."""
+    """Size of targets for a camera and a distance."""
 
     diameter: float  # of the dot, unit of the distance
     ring: float  # outer diameter of a coded ring around it, unit of the distance
@@ -316,13 +325,13 @@ class TargetSize:
 def compute_target_size(
     *, p: float, w_mm: float, d: float, c_mm: float, n: int, tilt_deg: float = 0.0, ring_per_dot: float = 3.0
 ) -> TargetSize:
-    """Return how large a target must be to show so many pixels: r = p w d / (c n).
+    """Return the size of a target that is p pixels across: r = p w d / (c n).
 
-    A target that is seen obliquely is shorter in one direction by the cosine of the tilt; its diameter is
-    larger by as much, so that it still shows p pixels there.
+    The image of an oblique target is shorter in one direction by the cosine of the tilt. Its diameter is
+    enlarged accordingly, so that it is p pixels across even in this direction.
 
     Args:
-        p: pixels across the target, at least.
+        p: least number of pixels across the target.
         w_mm: width of the sensor, mm.
         d: farthest distance of the camera from the object, in any unit.
         c_mm: principal distance (focal length), mm.

@@ -1,9 +1,9 @@
-"""Where a planned network is weak, and what the rig and each kind of observation contribute.
+"""Weaknesses of a planned network, and the contributions of the rig and of each kind of observation.
 
-Contributions of the rig and of each kind of observation beside image points to a planned network. Precision
-without and with a kind is compared in the datum of the network without it: with inner constraints for the
-motions that it leaves open. It is the datum of the plan unless the kind alone gives a motion, as the only
-scale bars do.
+The contribution of the rig, or of a kind of observation besides image points, is the gain in precision by it.
+Precision without and with it is compared in the datum of the network without it: with inner constraints for
+the motions that this network leaves open. This is the datum of the plan, unless a kind alone determines a
+motion, as the only scale bars do.
 
 Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (what determines interior orientation:
 convergence, rolled photographs, depth of the object); Baarda (1968) for reliability; Baarda (1973),
@@ -40,22 +40,22 @@ from sfm.reduced_network import reduce_network
 from sfm.similarity import OPEN, motions_along
 
 RIG = "rig"
-MIN_SHAPE = 3  # points that have one
-MIN_WEAK_RATIO = 1.5  # times the median sigma from which a point is called weak
-MIN_RAYS = 4  # with fewer a gross error is hardly found, and hardly ever attributed
-FLAT_DEG = 40.0  # largest angle of rays below which depth is much weaker than the rest
-ROLLED_DEG = 45.0  # from the others, from which a photograph counts as rolled
-MIN_DEPTH = 0.1  # of the object over its distance, below which it is flat to the camera
+MIN_SHAPE = 3  # points that form a shape
+MIN_WEAK_RATIO = 1.5  # a point with a larger sigma, over the median sigma, is weak
+MIN_RAYS = 4  # with fewer rays a gross error is hardly found, and can hardly be located
+FLAT_DEG = 40.0  # if the largest angle of rays is smaller, depth is much weaker than the rest
+ROLLED_DEG = 45.0  # least roll against the others of a photograph that counts as rolled
+MIN_DEPTH = 0.1  # depth of the object over its distance; with less it is flat for the camera
 MOTIONS = ("position", "attitude", "scale")  # of a network
 MAX_PLACES = 500  # image points at which the calibration is judged
 
 
 @dataclass(frozen=True)
 class WeakPoint:
-    """A point that is predicted worse than the others, or not at all."""
+    """A point with a worse predicted precision than the others, or an undetermined point."""
 
     name: str
-    sigma: float  # RMS of its coordinates, object unit; infinite where not determined
+    sigma: float  # RMS of its coordinates, object unit; infinite if undetermined
     reason: str
 
 
@@ -63,29 +63,28 @@ class WeakPoint:
 class Calibratability:
     """Whether a network determines the interior orientation of a camera."""
 
-    camera: str  # its name
-    parameters: tuple[str, ...]  # that are adjusted
-    sigma: FloatArray  # predicted, in the units of the camera's model, NaN where not determined
-    contribution: (
-        float  # of their uncertainty to the angles between rays, RMS over the image points, in sigmas
-    )
-    # of an image coordinate: what is left in the photograph after a rotation of the camera
-    cost: float  # sigma of points over that with the camera held
-    rolled: float  # share of photographs that are rolled by about 90 deg against the others, at most 1/2
+    camera: str  # name of the camera
+    parameters: tuple[str, ...]  # free parameters
+    sigma: FloatArray  # predicted, in the units of the camera's model, NaN if undetermined
+    # effect of their uncertainty on the angles between rays, that is, on image points after a rotation of the
+    # camera: RMS over the image points, in sigmas of an image coordinate
+    contribution: float
+    cost: float  # sigma of points over their sigma with the camera held
+    rolled: float  # share of photographs rolled by about 90 deg against the others, at most 1/2
     convergence_deg: float  # largest angle between two optical axes
     depth: float  # largest depth of the object in a photograph over its mean distance there
-    correlations: tuple[Correlation, ...]  # strong ones of camera parameters with one another
-    with_exterior: tuple[OrientationCorrelation, ...]  # strong ones with exterior orientation
+    correlations: tuple[Correlation, ...]  # strong correlations of camera parameters with one another
+    with_exterior: tuple[OrientationCorrelation, ...]  # strong correlations with exterior orientation
     undetermined: tuple[str, ...]
 
     @property
     def good(self) -> bool:
-        """Whether it is: nothing is undetermined and it costs less than an image point does."""
+        """Whether nothing is undetermined and the contribution is at most that of an image point."""
         return not self.undetermined and self.contribution <= 1.0
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """The reason in the network, in words."""
+        """The causes in the geometry of the network, in words."""
         words = []
         if self.rolled < 0.2:
             words.append(f"{self.rolled:.0%} of the photographs are rolled by 90 deg, better half of them")
@@ -97,7 +96,7 @@ class Calibratability:
 
 
 def weak_points(prediction: Prediction) -> tuple[WeakPoint, ...]:
-    """Return the points that are not determined and those much worse than the median, worst first."""
+    """Return the undetermined points and those much worse than the median, the worst first."""
     sigma, determined = prediction.sigma, prediction.determined
     limit = MIN_WEAK_RATIO * float(np.median(sigma[determined])) if determined.any() else 0.0
     weak = np.flatnonzero(~determined | (sigma > limit) | (prediction.rays < 2))
@@ -108,7 +107,12 @@ def weak_points(prediction: Prediction) -> tuple[WeakPoint, ...]:
 
 
 def reason_of(prediction: Prediction, j: int) -> str:
-    """Return why a point is as weak as it is: "2 rays, 9 degrees"; where no ray is, why."""
+    """Return the reason for the weakness of a point: "2 rays, 9 degrees", and why rays are missing.
+
+    Args:
+        prediction: prediction of the network.
+        j: index of the point.
+    """
     rays, angle = int(prediction.rays[j]), float(prediction.angle_deg[j])
     words = [counted(rays, "ray")]
     if np.isfinite(angle):
@@ -129,17 +133,17 @@ def reason_of(prediction: Prediction, j: int) -> str:
 
 
 def unusable_photographs(prediction: Prediction) -> tuple[str, ...]:
-    """Return the photographs that share too few points with others to be oriented, by name."""
+    """Return the names of the photographs that share too few points with others to be oriented."""
     return tuple(
         name for name, k in zip(prediction.stations.names, prediction.photograph, strict=True) if k < 0
     )
 
 
 def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
-    """Return the groups of photographs that share too few points to be one network, the largest first.
+    """Return the groups of photographs that share too few points to form one network, the largest first.
 
-    A group is joined to another with which it shares MIN_POINTS points, as a photograph is; a network that is
-    connected is one group.
+    Two groups are merged if they share MIN_POINTS points, as for single photographs. A connected network is
+    one group.
     """
     network = prediction.adjustment.network
     m = len(network.images)
@@ -160,12 +164,12 @@ def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
 
 @checked_arguments()
 def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 0) -> Calibratability | None:
-    """Return whether the network determines the free parameters of a camera; None where it has none.
+    """Return whether the network determines the free parameters of a camera; None if it has none.
 
     Args:
-        prediction: of the network.
-        seeing: by which it was predicted.
-        camera_index: which camera of a rig.
+        prediction: prediction of the network.
+        seeing: settings of this prediction.
+        camera_index: index of the camera on a rig.
 
     Source: Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4).
     """
@@ -204,9 +208,13 @@ def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 
 
 
 def rolled_share(rotation: FloatArray) -> float:
-    """Return which share of photographs is rolled by about 90 deg against the others, at most 1/2.
+    """Return the share of photographs rolled by about 90 deg against the others, at most 1/2.
 
-    The roll is that of the image's x axis out of the horizontal, of views straight down or up out of X.
+    Roll is the angle of the image's x axis against the horizontal, or against X for views straight down or
+    up.
+
+    Args:
+        rotation: R of each photograph, image to object axes, (m, 3, 3).
     """
     z, x = rotation[:, :, 2], rotation[:, :, 0]
     level = np.cross([0.0, 0.0, 1.0], z)
@@ -217,10 +225,10 @@ def rolled_share(rotation: FloatArray) -> float:
 
 
 def _angle_sigma_px(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
-    """Return what the uncertainty of the interior orientation does to the angles between rays, RMS, px.
+    """Return the RMS effect of the uncertainty of the interior orientation on the angles between rays, px.
 
-    A principal point that is off by little and a camera that is turned by as much cannot be distinguished,
-    and need not be: a rotation of the camera is taken off.
+    A small shift of the principal point cannot be distinguished from a rotation of the camera, and need not
+    be. Therefore the effect of a rotation is removed.
     """
     some = xy[:: 1 + len(xy) // MAX_PLACES]
     Q = projection_covariance(camera, covariance, some, some)
@@ -229,26 +237,27 @@ def _angle_sigma_px(camera: Camera, covariance: FloatArray, xy: FloatArray) -> f
 
 @dataclass(frozen=True)
 class Contribution:
-    """A kind of observation of a plan, or its rig."""
+    """Contribution of a kind of observation of a plan, or of its rig."""
 
     name: str  # of the kind
-    count: int  # observations, or moments of the rig
-    shifts: int  # of the network that nothing else fixes, up to 3
-    rotations: int  # likewise
-    scale: bool  # whether nothing else gives it
-    points: int  # that nothing else determines
-    sigma_without: float  # of the other points, RMS of a coordinate, object unit; infinite where nothing is
-    # determined without it
-    sigma_with: float
+    count: int  # number of observations, or of moments of the rig
+    shifts: int  # number of shifts of the network that nothing else determines, up to 3
+    rotations: int  # the same for rotations
+    scale: bool  # whether nothing else determines the scale
+    points: int  # number of points that nothing else determines
+    # RMS sigma of a coordinate of the other points, object unit; infinite if nothing is determined without
+    # the kind
+    sigma_without: float
+    sigma_with: float  # the same with the kind
 
     @property
     def gain(self) -> float:
-        """Standard deviations of points without it over those with it."""
+        """Standard deviation of points without the kind over that with it."""
         return self.sigma_without / self.sigma_with
 
 
 def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
-    """Return what the rig and each kind of observations add to a plan."""
+    """Return the contributions of the rig and of each kind of observation to a plan."""
     a = prediction.adjustment
     found = []
     if a.estimate.mounts is not None and a.network.moment is not None:
@@ -263,10 +272,10 @@ def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
 def _contribution_of(
     a: Adjustment, name: str, count: int, network: Network, estimate: Estimate
 ) -> Contribution:
-    """Return what is gained from a network without a kind to the whole one."""
+    """Return the contribution of a kind from the network without it and the whole network."""
     rest = tuple(kind for kind in network.observations if not kind.needs_scale)
     known, less = _determined(a), None
-    for observations in (network.observations, rest):  # the others need a scale, which only this one may give
+    for observations in (network.observations, rest):  # other kinds need a scale, which only this may give
         with suppress(GeometryError):
             less = less or predict(replace(network, observations=observations), estimate)
     left = np.zeros(0, dtype=bool) if less is None else _determined(less)
@@ -301,7 +310,7 @@ def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, 
 
 
 def _without_rig(network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
-    """Return a network of single photographs, of those that can be oriented alone."""
+    """Return a network without the rig, of the photographs that can be oriented alone."""
     network, _ = _without(replace(network, moment=None), estimate, MountObservations.name)
     seen = network.incidence(np.ones(len(network.image_points), dtype=bool)).toarray() > 0
     images, points = np.zeros(len(network.images), dtype=bool), np.zeros(len(network.points), dtype=bool)
@@ -318,11 +327,11 @@ def _determined(a: Adjustment) -> BoolArray:
 
 
 def open_counts(adjustment: Adjustment, points: IntArray) -> IntArray:
-    """Return how many shifts, rotations and scales of the network are open, (3,).
+    """Return the numbers of open shifts, rotations and scales of a network, (3,).
 
     Args:
-        adjustment: of the network.
-        points: index of those by which it is seen, MIN_SHAPE or more, (n,).
+        adjustment: adjustment of the network.
+        points: indices of points that show the motions, MIN_SHAPE or more, (n,).
     """
     X = adjustment.estimate.points[points]
     centre, size = X.mean(axis=0), float(np.ptp(X, axis=0).max())
@@ -335,9 +344,9 @@ def sigma_beside(adjustment: Adjustment, points: IntArray, motions: FloatArray) 
     """Return the standard deviation of points with inner constraints for some motions.
 
     Args:
-        adjustment: of the network.
-        points: index of each, (n,).
-        motions: how they move, those that are open among them, (n, 3, d).
+        adjustment: adjustment of the network.
+        points: indices of the points, (n,).
+        motions: displacements of the points by these motions, including all open motions, (n, 3, d).
 
     Returns:
         RMS of a coordinate, object unit.
@@ -348,6 +357,11 @@ def sigma_beside(adjustment: Adjustment, points: IntArray, motions: FloatArray) 
 
 
 def open_motions(adjustment: Adjustment, points: IntArray) -> FloatArray:
-    """Return how points move with each motion of the network that is open, (n, 3, d)."""
+    """Return the displacements of points by each open motion of the network, (n, 3, d).
+
+    Args:
+        adjustment: adjustment of the network.
+        points: indices of the points, (n,).
+    """
     motions = marginal_of(adjustment).optimum.motions.points[points]
     return motions.reshape(len(points), 3, -1)[:, :, : adjustment.expected_defect]
