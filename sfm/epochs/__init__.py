@@ -1,11 +1,11 @@
-"""Epochs of one object: what moved between them, by how much, and what would have been seen.
+"""Epochs of one object: displacements between them, their tests, and detectable displacements.
 
-- `analyse_epochs`: begin here; each epoch against the first and the one before.
-- `epoch_differences`, then `find_displacements` and `block_motion`: its steps, for two epochs.
-- `adjust_together`: one interior orientation for several epochs.
+- `analyse_epochs`: begin here; compares each epoch with the first and with the previous one.
+- `epoch_differences`, then `find_displacements` and `block_motion`: the steps for two epochs.
+- `adjust_together`: estimates one interior orientation for several epochs.
 
     >>> from sfm.epochs import Epoch, epoch_differences, find_displacements
-    >>> # first, second: what run_survey, adjust or read_result returned, as `.solution`
+    >>> # first, second: `.solution` of the results of run_survey, adjust or read_result
     >>> spring, autumn = Epoch("spring", first), Epoch("autumn", second)
     >>> found = find_displacements(epoch_differences(spring, autumn))
     >>> [name for name, stable in zip(found.differences.points, found.stable) if not stable]

@@ -1,18 +1,18 @@
-"""Differences of two epochs in one frame, of points and of mounts, with their covariance.
+"""Differences between two epochs in one frame, of points and of mounts, with their covariance.
 
-Points are recognised by their codes and other names, and those with a mere number by their place after a
-robust alignment. Q_d = Q_1 + Q_2 - C - C' where both epochs were given the same values: a bar whose length is
-stated wrong makes both epochs wrong alike. With an observation l of standard deviation s and gradient g, an
-epoch moves by Q g / s^2 for a unit of l, so that
+Points are recognised by their codes and other names. Points with only a number are recognised by their
+position after a robust alignment. If both epochs use the same given values, they are correlated, for example
+because a wrong length of a bar causes the same error in both. Then Q_d = Q_1 + Q_2 - C - C'. With an
+observation l of standard deviation s and gradient g, a unit of l shifts an epoch by Q g / s^2, so that
 
     C = (Q_1 g_1) (Q_2 g_2)' / (s^2 s01 s02),
 
-with the sigma0 of both that their covariances hold, summed over the bars, and over the coordinates of
-control, that both share.
+with sigma0 of both epochs, which their covariances contain. The sum is over the bars and the coordinates of
+control that both share.
 
-Change of the mounts of a rig between two epochs: T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom. Values
-given alike to both epochs, as a scale bar, make the true variance of d smaller than Q_1 + Q_2: the test then
-finds less, and does not find what is not there.
+The change of the mounts of a rig is tested by T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom. If both
+epochs use the same given values, such as a scale bar, the true variance of d is smaller than Q_1 + Q_2. The
+test then finds fewer changes, but reports no false ones.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2; Koch (1999), Parameter Estimation and Hypothesis
 Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).
@@ -44,7 +44,7 @@ from sfm.errors import GeometryError
 from sfm.network import ObjectPoints, ScaleBars
 from sfm.solution import Solution
 
-MAX_SAME_DIFFERENCE = 1e-9  # relative difference of two given values that are the same one
+MAX_SAME_DIFFERENCE = 1e-9  # relative difference up to which two given values are the same
 
 
 @dataclass(frozen=True)
@@ -53,20 +53,20 @@ class Differences:
 
     names: tuple[str, str]  # of the epochs
     unit: str
-    points: tuple[str, ...]  # names in the first epoch, n of them
-    pairs: PointPairs  # the points of both epochs, each in its frame
-    xyz: FloatArray  # in the first epoch, object unit, (n, 3)
+    points: tuple[str, ...]  # names in the first epoch, (n,)
+    pairs: PointPairs  # the points of both epochs, each in its own frame
+    xyz: FloatArray  # coordinates in the first epoch, object unit, (n, 3)
     difference: FloatArray  # object unit, (n, 3)
     covariance: FloatArray  # of the differences, object unit^2, (3 n, 3 n)
-    motion: str  # what is no change: rigid, or similarity where not both have a scale
+    motion: str  # motion that is no change: rigid, or similarity unless both have a scale
     redundancy: int | None  # of both adjustments together
-    only_first: tuple[str, ...]  # points that the second epoch lacks
-    only_second: tuple[str, ...]
-    by_place: int  # points recognised by their place
-    untested: tuple[str, ...]  # common points that an epoch holds fixed, or did not keep the covariance of
-    shared: tuple[str, ...]  # given values that both epochs share, in words
-    held_alike: tuple[str, ...] = ()  # cameras with the same values held in both
-    held_apart: tuple[str, ...] = ()  # with values held in one only, or at others in either
+    only_first: tuple[str, ...]  # points that the second epoch does not have
+    only_second: tuple[str, ...]  # points that the first epoch does not have
+    by_place: int  # number of points recognised by their position
+    untested: tuple[str, ...]  # common points that an epoch holds fixed, or whose covariance is not stored
+    shared: tuple[str, ...]  # text on given values that both epochs share
+    held_alike: tuple[str, ...] = ()  # cameras with the same values held in both epochs
+    held_apart: tuple[str, ...] = ()  # cameras with values held in only one epoch, or at different values
 
     @property
     def motions(self) -> FloatArray:
@@ -76,16 +76,16 @@ class Differences:
 
 @checked_arguments()
 def epoch_differences(first: Epoch, second: Epoch) -> Differences:
-    """Bring the second epoch into the frame of the first, and return the differences.
+    """Transform the second epoch into the frame of the first, and return the differences.
 
     Args:
         first: an epoch.
-        second: a later one.
+        second: a later epoch.
 
     Raises:
-        GeometryError: an epoch without the covariance of its points, image points that are those of the
-            other, fewer than four common points, units that cannot be converted, or a weighted calibration
-            that both share.
+        GeometryError: an epoch without the covariance of its points, two epochs with the same image points,
+            fewer than four common points, units that cannot be converted, or a weighted calibration that both
+            share.
     """
     for epoch in (first, second):
         if epoch.result.redundancy == 0:
@@ -148,7 +148,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
 
 
 def _with_prefixed_photographs(result: Solution, prefix: str) -> Solution:
-    """Return a result whose photographs have other names than those of another epoch."""
+    """Return a result with prefixed names of photographs, which differ from those of another epoch."""
     names = tuple(f"{prefix}/{name}" for name in result.network.images)
     return replace(result, network=replace(result.network, images=names))
 
@@ -161,7 +161,7 @@ def _others(result: Solution, paired: IntArray) -> tuple[str, ...]:
 
 
 def _held_cameras(a: Solution, b: Solution) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return cameras with values other than 0 held alike in both epochs, and those with others held."""
+    """Return cameras with the same nonzero values held in both epochs, and other cameras with held values."""
     ours, theirs = _held_values(a), _held_values(b)
     names = tuple(dict.fromkeys((*ours, *theirs)))
     alike = tuple(name for name in names if name in ours and name in theirs and ours[name] == theirs[name])
@@ -182,7 +182,7 @@ def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
 
 
 def _refuse_same_photographs(first: Epoch, second: Epoch) -> None:
-    """Refuse one survey under two names: its displacements are 0, with a standard deviation of 0."""
+    """Refuse the same survey under two names, with displacements and standard deviations of 0."""
     a, b = (one.result.network.image_points.xy for one in (first, second))
     if len(a) and a.shape == b.shape and np.array_equal(a, b):
         raise GeometryError(
@@ -203,7 +203,7 @@ def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
 
 
 def _correlated(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """Return C of two epochs that were adjusted together, and in words what both were given."""
+    """Return C of two epochs that were adjusted together, and a text on each shared given value."""
     assert first.common is not None and second.common is not None
     a, b = first.common, second.common
     given = np.flatnonzero(
@@ -214,7 +214,7 @@ def _correlated(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArra
 
 
 def _shared(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """Return C of two epochs that were given the same values, and these in words."""
+    """Return C of two epochs with the same given values, and a text on each of these."""
     mine: list[FloatArray] = []
     yours: list[FloatArray] = []
     words: list[str] = []
@@ -236,7 +236,7 @@ def _shared(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | 
 
 
 def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray) -> FloatArray:
-    """Return a b' of the common points, each epoch in its frame, (3 n, 3 n)."""
+    """Return a b' for the common points, each epoch in its own frame, (3 n, 3 n)."""
     rows_a, rows_b = (
         coordinates_of(one.result.covariance_rows(p)) for one, p in zip((first, second), pairs.T, strict=True)
     )
@@ -245,31 +245,32 @@ def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs
 
 @dataclass(frozen=True)
 class MountChange:
-    """A camera on its rig in two epochs."""
+    """Change of the mount of a camera between two epochs."""
 
     camera: str
-    difference: FloatArray  # second minus first: X, Y, Z (object unit of the first; NaN where not both epochs
-    # have a scale), omega, phi, kappa (rad), (6,)
+    # second minus first: X, Y, Z (object unit of the first; NaN unless both epochs have a scale), omega, phi,
+    # kappa (rad), (6,)
+    difference: FloatArray
     sigma: FloatArray  # (6,)
     statistic: float  # T
     critical: float
 
     @property
     def changed(self) -> bool:
-        """Whether the camera was moved on its rig."""
+        """Whether the camera moved on its rig."""
         return self.statistic > self.critical
 
 
 def mount_changes(
     first: Solution, second: Solution, *, alpha: float, redundancy: int | None
 ) -> tuple[MountChange, ...]:
-    """Test the mounts that two epochs have adjusted, all of them together at one level.
+    """Test the changes of adjusted mounts between two epochs, with one level for all mounts together.
 
     Args:
         first: an epoch.
-        second: a later one.
-        alpha: level of the tests of all mounts.
-        redundancy: of both; None if their variances are known.
+        second: a later epoch.
+        alpha: level of the tests of all mounts together.
+        redundancy: redundancy of both epochs; None if their variances are known.
     """
     scale = known_scale(first, second)
     ours, theirs = _mounts(first, 1.0), _mounts(second, scale or 1.0)
@@ -291,7 +292,7 @@ def mount_changes(
 
 
 def _mounts(result: Solution, scale: float) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return values and covariance of the mounts of a result that were adjusted, by camera."""
+    """Return values and covariance of the adjusted mounts of a result, by camera."""
     mounts, Q = result.estimate.mounts, result.mount_covariance
     if mounts is None or Q is None:
         return {}
@@ -305,35 +306,35 @@ def _mounts(result: Solution, scale: float) -> dict[str, tuple[FloatArray, Float
 
 @dataclass(frozen=True)
 class Common:
-    """Correlation of an epoch with those that it was adjusted together with: C_12 = U_1 diag(signs) U_2'."""
+    """Correlation of an epoch with epochs adjusted together with it: C_12 = U_1 diag(signs) U_2'."""
 
-    given: tuple[str, ...]  # values that were given to several, g of them
-    columns: FloatArray  # U, those of the given values first, object unit, (3 k, q)
+    given: tuple[str, ...]  # given values that several epochs share, (g,)
+    columns: FloatArray  # U, with the columns of the given values first, object unit, (3 k, q)
     signs: FloatArray  # (q,)
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """One epoch: a result, and what it was given."""
+    """One epoch: a result with its given values."""
 
     name: str
     result: Solution
     bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
     control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
-    interior: tuple[tuple[str, str, float, float], ...] = ()  # camera, parameter, value and sigma observed
-    sigma0: float = 1.0  # of unit weight, by which the covariance of the result is scaled
-    sigma0_px: float | None = None  # a posteriori of an image coordinate, the median; None where not known
-    common: Common | None = None  # with the other epochs, of those adjusted together
+    interior: tuple[tuple[str, str, float, float], ...] = ()  # (camera, parameter, observed value, sigma)
+    sigma0: float = 1.0  # sigma0 that scales the covariance of the result
+    sigma0_px: float | None = None  # median a posteriori sigma of an image coordinate; None if unknown
+    common: Common | None = None  # correlation with the epochs adjusted together with it, if any
 
 
 Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, standard deviation, value
 
 
 def given_observations(epoch: Epoch) -> Iterator[tuple[str, Observed]]:
-    """Yield bars and coordinates of control that an epoch was given with a standard deviation, by name.
+    """Yield the observed scale bars and coordinates of control of an epoch, with their names.
 
     Args:
-        epoch: with its covariance, by whose rows the gradients count.
+        epoch: has its covariance; the columns of the gradients count its rows.
     """
     names, x = epoch.result.network.points, epoch.result.estimate.points
     bars, row = epoch.bars, epoch.result.covariance_rows(np.arange(len(names)))

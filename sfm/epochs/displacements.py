@@ -1,7 +1,7 @@
-"""Displacements between two epochs in the datum of the points that did not move, tested and with their power.
+"""Displacements between two epochs in the datum of the stable points, with tests and their power.
 
-The search for the stable points is that of `sfm.comparison.congruency`; every other point is tested in their
-datum, with the level shared out among the points.
+`sfm.comparison.congruency` searches for the stable points. Every other point is tested in their datum, and
+the level is divided among the points.
 
 Source: Caspary (2000), Concepts of network and deformation analysis, secs. 7 and 8; Niemeier (2008),
 Ausgleichungsrechnung, secs. 12.2 to 12.4; Baarda (1968) for the power of a test.
@@ -35,9 +35,9 @@ class Displacements:
     differences: Differences
     congruency: Congruency  # the search for the stable points, and the datum of those
     detectable: (
-        FloatArray  # smallest displacement, in its worst direction, found with POWER, object unit, (n,)
+        FloatArray  # smallest displacement found with POWER, in the worst direction, object unit, (n,)
     )
-    cause: Cause | None  # what explains the differences; None where single points moved, or nothing does
+    cause: Cause | None  # cause of the differences; None if single points moved, or without a cause
     alpha: float
 
     @property
@@ -47,12 +47,12 @@ class Displacements:
 
     @property
     def stable(self) -> BoolArray:
-        """The set that is proposed; all of reference where no majority of them agrees, (n,)."""
+        """Stable points; all reference points if no majority agrees, (n,)."""
         return self.congruency.stable
 
     @property
     def agreed(self) -> bool:
-        """Whether a majority of the reference agrees."""
+        """Whether a majority of the reference points agrees."""
         return self.congruency.agreed
 
     @property
@@ -62,12 +62,12 @@ class Displacements:
 
     @property
     def displacement(self) -> FloatArray:
-        """In the datum of the stable points, object unit, (n, 3)."""
+        """Displacements in the datum of the stable points, object unit, (n, 3)."""
         return self.congruency.difference
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of all displacements together, object unit^2, (3 n, 3 n)."""
+        """Joint covariance of all displacements, object unit^2, (3 n, 3 n)."""
         return self.congruency.covariance
 
     @property
@@ -78,7 +78,7 @@ class Displacements:
 
     @property
     def undecided(self) -> BoolArray:
-        """Points of reference that left the stable set, and did not move by their separate test, (n,)."""
+        """Reference points that are not stable, but did not move by their own test, (n,)."""
         return self.reference & ~self.stable & ~self.moved
 
     @property
@@ -95,11 +95,11 @@ def find_displacements(
 
     Args:
         found: the differences of two epochs.
-        reference: points that are taken as stable until a test shows otherwise, (n,); all if not given.
-        alpha: probability of saying that something moved where nothing did.
+        reference: points that are assumed stable until a test shows otherwise, (n,); all if not given.
+        alpha: probability of reporting a displacement if nothing moved.
 
     Raises:
-        GeometryError: fewer than four points of reference, or a covariance that is singular beyond its datum.
+        GeometryError: fewer than four reference points, or a covariance that is singular beyond its datum.
     """
     tested = congruency(
         *(found.difference, found.covariance, found.xyz),
@@ -122,13 +122,13 @@ def find_displacements(
 
 
 def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None) -> float:
-    """Return the displacement, in standard deviations, that a test of m coordinates finds with a power.
+    """Return the displacement, in standard deviations, that a test of m coordinates finds with a given power.
 
     Args:
         alpha: level of the test.
-        power: probability of finding it.
-        m: coordinates that are tested together.
-        redundancy: of the variance; None if it is known.
+        power: probability of finding the displacement.
+        m: number of coordinates that are tested together.
+        redundancy: redundancy of the variance; None if the variance is known.
 
     Returns:
         The square root of the noncentrality.
@@ -146,9 +146,9 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
 
 
 def _detectable(found: Congruency, redundancy: int | None) -> FloatArray:
-    """Return the smallest displacement of each point that would be found, in its worst direction, (n,).
+    """Return the smallest detectable displacement of each point in its worst direction, (n,).
 
-    A stable point is found by the drop of Omega, another one by a separate test in the datum.
+    A stable point is tested by the drop of Omega, any other point by its own test in the datum.
     """
     shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(found.level.tolist())}
     variance = point_blocks(found.covariance, 3)

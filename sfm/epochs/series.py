@@ -1,9 +1,9 @@
-"""Epochs of one object: each against the first and the one before, motion of blocks, verdict.
+"""Series of epochs of one object: each epoch against the first and the previous one, and blocks.
 
-Motion and strain of groups of points: a block that tilted is separated from one that changed its shape. The
-displacements of a group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c, small
-rotations omega and the symmetric strain E, or the part of it that is asked for. Least squares with the full
-covariance of the displacements, in the datum of the stable points outside of the group; what is left shows
+The motion of a group of points shows whether a block tilted or changed its shape. The displacements of a
+group are d = t + omega x (X - c) + E (X - c), with a translation t of its centre c, small rotations omega,
+and the symmetric strain E or a part of it, depending on the model. They are fitted by least squares with the
+full covariance of the displacements, in the datum of the stable points outside the group. The residuals show
 whether the group moved as the model assumes.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12; Caspary (2000), Concepts of network and deformation
@@ -40,9 +40,9 @@ PARTS = (
     ("scale", ("scale",)),
     ("shear", ("eXX-eYY", "eXX-eZZ", "eXY", "eXZ", "eYZ")),
 )
-MODELS = {"rigid": 2, "similarity": 3, "affine": 4}  # parts of PARTS that each has
+MODELS = {"rigid": 2, "similarity": 3, "affine": 4}  # number of PARTS of each model
 MIN_POINTS = {"rigid": 3, "similarity": 3, "affine": 4}
-RANK = 1e-9  # of the largest singular value below which a group does not determine a model
+RANK = 1e-9  # of the largest singular value; below it a group does not determine a model
 
 
 @dataclass(frozen=True)
@@ -55,23 +55,23 @@ class Part:
 
     @property
     def significant(self) -> bool:
-        """Whether it is more than chance."""
+        """Whether it is larger than chance explains."""
         return self.statistic > self.critical
 
 
 @dataclass(frozen=True)
 class BlockMotion:
-    """How a group of points moved."""
+    """Motion of a group of points."""
 
     name: str
     points: tuple[str, ...]
     model: str  # rigid | similarity | affine
-    centre: FloatArray  # to which the translation belongs, object unit, (3,)
-    parameters: tuple[str, ...]  # names, p of them
+    centre: FloatArray  # reference of the translation, object unit, (3,)
+    parameters: tuple[str, ...]  # names of the parameters, (p,)
     value: FloatArray  # object unit, rad and ratios, (p,)
     sigma: FloatArray  # (p,)
     parts: tuple[Part, ...]
-    statistic: float  # of what is left over its degrees of freedom; NaN without any
+    statistic: float  # of the residuals, over their degrees of freedom; NaN without any
     critical: float
 
     @property
@@ -98,13 +98,13 @@ class EpochPair:
     """Displacements between two epochs, by points and by groups."""
 
     displacements: Displacements
-    groups: tuple[BlockMotion, ...]  # those asked for
-    together: BlockMotion | None  # of all points that moved, as one rigid block; None where they are too few
-    mounts: tuple[MountChange, ...] = ()  # of the cameras of rigs that both have
+    groups: tuple[BlockMotion, ...]  # the requested groups
+    together: BlockMotion | None  # all points that moved as one rigid block; None if they are too few
+    mounts: tuple[MountChange, ...] = ()  # of the cameras on rigs of both epochs
 
     @property
     def blocks(self) -> tuple[BlockMotion, ...]:
-        """The groups asked for, and the points that moved."""
+        """The requested groups, and the block of all points that moved."""
         return self.groups if self.together is None else (*self.groups, self.together)
 
 
@@ -113,19 +113,19 @@ class EpochSeries:
     """Epochs of one object in their order."""
 
     names: tuple[str, ...]
-    first: Epoch  # of which displacements are, in its frame
-    since_first: tuple[EpochPair, ...]  # of every epoch from the second on, against the first
-    since_previous: tuple[EpochPair, ...]  # against the one before
+    first: Epoch  # reference of the displacements, which are in its frame
+    since_first: tuple[EpochPair, ...]  # every epoch from the second on, against the first
+    since_previous: tuple[EpochPair, ...]  # every epoch from the second on, against the previous one
     cameras: tuple[SharedCamera, ...] = ()  # with one interior orientation in all epochs adjusted together
 
     @property
     def pairs(self) -> tuple[EpochPair, ...]:
-        """Every pair of epochs once: those with the first, then those with the one before."""
+        """Every pair of epochs once: those with the first epoch, then those with the previous one."""
         return (*self.since_first, *self.since_previous[1:])
 
     @property
     def changed(self) -> bool:
-        """Whether anything moved between any two of them."""
+        """Whether anything moved between any two epochs."""
         return any(pair.displacements.changed for pair in self.pairs)
 
 
@@ -139,20 +139,21 @@ def analyse_epochs(
     alpha: float = ALPHA,
     together: bool = False,
 ) -> EpochSeries:
-    """Test what moved between epochs.
+    """Test which points moved between epochs.
 
     Args:
-        epochs: two or more, in their order.
-        reference: names or patterns (`R*`) of the points that may carry the datum; all common ones if empty.
-        groups: names or patterns of the points of each group whose motion is asked for.
-        model: of the motion of groups: rigid, similarity or affine.
+        epochs: two or more epochs, in their order.
+        reference: names or patterns (`R*`) of the points that may carry the datum; all common points if
+            empty.
+        groups: names or patterns of the points of each group whose motion is requested.
+        model: model of the motion of groups: rigid, similarity or affine.
         alpha: level of the tests of every pair of epochs.
         together: whether all epochs are adjusted as one, with one interior orientation of each camera that
-            took photographs of several, see `adjust_together`.
+            took photographs in several epochs, see `adjust_together`.
 
     Raises:
-        GeometryError: fewer than two epochs, two of one name, a point of reference that an epoch lacks, too
-            few points, or what `epoch_differences` and `block_motion` refuse.
+        GeometryError: fewer than two epochs, two epochs of one name, a reference point missing in an epoch,
+            too few points, or as in `epoch_differences` and `block_motion`.
 
     Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.
     """
@@ -190,7 +191,7 @@ def analyse_epochs(
 
 
 def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:
-    """Return the points of reference among the common ones; one that an epoch lacks is an error."""
+    """Return the reference points among the common points; a point missing in an epoch is an error."""
     chosen = np.zeros(len(found.points), dtype=bool)
     for pattern in patterns:
         hits = _matching(found.points, pattern)
@@ -228,17 +229,17 @@ def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
 
 
 def _together(found: Displacements) -> BlockMotion | None:
-    """Return the motion of all points that moved as one block; None where that shows nothing."""
+    """Return the motion of all points that moved as one block; None if it is not determined or checked."""
     if found.moved.sum() <= MIN_POINTS["rigid"]:
         return None
     try:
         return block_motion(found, found.moved, name=MOVED)
-    except GeometryError:  # they lie on a line: their rotation about it is not determined
+    except GeometryError:  # points on a line do not determine their rotation about it
         return None
 
 
 def verdict_of_epochs(found: EpochSeries) -> Verdict:
-    """Return the verdict on epochs with the remarks on every pair, those with the first epoch first."""
+    """Return the verdict on epochs with the remarks on every pair; pairs with the first epoch come first."""
     remarks = [one for pair in found.pairs for one in remarks_of_pair(pair.displacements)]
     remarks += [
         remark(
@@ -263,7 +264,7 @@ def verdict_of_epochs(found: EpochSeries) -> Verdict:
 
 
 def remarks_of_pair(found: Displacements) -> Iterator[Remark]:
-    """Yield what two epochs show."""
+    """Yield the remarks on two epochs."""
     d = found.differences
     first, second = d.names
     length = np.linalg.norm(found.displacement, axis=1)
@@ -297,14 +298,14 @@ def block_motion(
 
     Args:
         found: displacements of two epochs.
-        group: the points, (n,).
-        name: of the group.
-        model: rigid (translation and rotation), similarity (scale, too) or affine (shear, too).
+        group: points of the group, (n,).
+        name: name of the group.
+        model: rigid (translation and rotation), similarity (also scale) or affine (also shear).
         alpha: level of each test; that of the displacements if not given.
 
     Raises:
-        GeometryError: too few points, on a line or in a plane where the model needs more, or all stable
-            points among them.
+        GeometryError: too few points, points on a line or in a plane that do not determine the model, or too
+            few stable points outside the group.
     """
     if model not in MODELS:
         raise GeometryError(f"group {name}: model '{model}', expected one of {', '.join(MODELS)}")
@@ -364,7 +365,7 @@ def block_motion(
 
 
 def _columns(xyz: FloatArray, centre: FloatArray, parts: int) -> FloatArray:
-    """Return how the points move with each parameter, (3 k, p)."""
+    """Return the derivatives of the coordinates of k points by the parameters, (3 k, p)."""
     motion = similarity_motions(xyz, centre=centre)
     columns = [motion[:, :, : (0, 3, 6, 7, 7)[parts]]]
     if parts == MODELS["affine"]:

@@ -1,13 +1,13 @@
-"""All epochs adjusted together, where one camera took their photographs.
+"""Joint adjustment of all epochs, if one camera took their photographs.
 
-Every epoch is adjusted from its image points by itself; the conditions that its interior orientation c is the
-same in all of them, B x = 0, then make one adjustment of it. With the covariance Q of all epochs,
+Every epoch is first adjusted by itself from its image points. The conditions that the interior orientation is
+the same in all epochs, B x = 0, then turn this into one adjustment. With the covariance Q of all epochs,
 
     M = B Q B',  x' = x - Q B' M^-1 B x,  Q' = Q - Q B' M^-1 B Q,
 
-to the first order in the corrections, which are of the size of standard deviations. A value given alike
-to epochs (bars, control, a calibration) is one observation and correlates them before. T = (B x)' M^-1 B x
-over the number of conditions shows whether the camera is the same at all.
+to first order in the corrections, which are of the size of standard deviations. A given value that epochs
+share (bars, control, a calibration) is a single observation, and correlates them beforehand. T = (B x)' M^-1
+B x over the number of conditions tests whether the camera is the same.
 
 Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Models, secs. 3.2.7 (constraints)
 and 4.2 (their test); Niemeier (2008), Ausgleichungsrechnung, sec. 12.2.
@@ -33,13 +33,15 @@ from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
 
 ALPHA = 0.01  # level of the test whether a camera is the same
-MAX_NAMED = 4  # cameras that a message names
-SAME_SIGMA = 0.05  # of a standard deviation, by which an adjustment from stored tables may differ, and of it
+MAX_NAMED = 4  # cameras that an error message lists
+# Largest difference between the stored result and an adjustment from its tables: of coordinates in standard
+# deviations, and of the standard deviations relatively.
+SAME_SIGMA = 0.05
 
 
 @dataclass(frozen=True)
 class SharedCamera:
-    """A camera whose interior orientation was made one."""
+    """A camera with one interior orientation in several epochs."""
 
     name: str
     epochs: tuple[str, ...]
@@ -49,7 +51,7 @@ class SharedCamera:
 
     @property
     def same(self) -> bool:
-        """Whether the epochs agree on it."""
+        """Whether the epochs agree on the camera."""
         return self.statistic <= self.critical
 
 
@@ -60,24 +62,26 @@ class _Alone:
     epoch: Epoch
     points: IntArray  # of the covariance, (k,)
     values: FloatArray  # of the parameters of shared cameras, (p,)
-    names: tuple[tuple[str, str], ...]  # camera and parameter of each
-    covariance: FloatArray  # of these, then of X Y Z of the points, (p + 3 k, p + 3 k)
-    given: dict[str, tuple[FloatArray, float]]  # Q g / s of each given value, (p + 3 k,), and the value
+    names: tuple[tuple[str, str], ...]  # (camera, parameter) of each value
+    covariance: FloatArray  # of these values, then of X Y Z of the points, (p + 3 k, p + 3 k)
+    given: dict[
+        str, tuple[FloatArray, float]
+    ]  # Q g / (s sigma0) of each given value, (p + 3 k,), and the value
 
 
 @checked_arguments()
 def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[SharedCamera, ...]]:
-    """Adjust epochs as one, with one interior orientation of each camera that took photographs of several.
+    """Adjust epochs together, with one interior orientation of each camera that several epochs share.
 
     Args:
-        epochs: two or more, with their image points and what they were given.
+        epochs: two or more epochs, with their image points and given values.
 
     Returns:
-        The epochs with their common coordinates, covariances and what correlates them; and the cameras.
+        The epochs with adjusted coordinates, covariances and correlations; and the shared cameras.
 
     Raises:
-        GeometryError: no camera of one name in two epochs, one that is not described alike, one that changed
-            between them, or a result that its tables do not lead to again.
+        GeometryError: no camera of one name in two epochs, a camera with different settings, a camera that
+            changed between the epochs, or a result that its tables do not reproduce.
 
     Source: Koch (1999), secs. 3.2.7 and 4.2.
     """
@@ -131,7 +135,7 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
 
 
 def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
-    """Return the cameras of several epochs by name, and the numbers of these epochs."""
+    """Return the cameras that several epochs share by name, with the indices of these epochs."""
     found: dict[str, list[int]] = {}
     for k, epoch in enumerate(epochs):
         for camera in epoch.result.estimate.cameras:
@@ -165,7 +169,7 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
 
 
 def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
-    """Adjust an epoch from its image points as its survey did, and report it where that leads elsewhere."""
+    """Adjust an epoch from its image points as its survey did; refuse it if the result differs."""
     result = epoch.result
     network = _network_of(epoch)
     control = result.datum == "control"
@@ -208,7 +212,7 @@ def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
 
 
 def _network_of(epoch: Epoch) -> Network:
-    """Return the network with what the survey was given, and with the weights that it used."""
+    """Return the network with the given values and the weights of the survey."""
     result = epoch.result
     seen = result.network.image_points
     if epoch.sigma0_px is None:
@@ -234,7 +238,7 @@ def _network_of(epoch: Epoch) -> Network:
 
 
 def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray) -> None:
-    """Refuse an adjustment that is not the one of the result: other weights, or values that were not kept."""
+    """Refuse an adjustment that does not reproduce the stored result, whose tables are then incomplete."""
     stored = epoch.result
     sigma = np.sqrt(np.diagonal(Q).reshape(-1, 3).sum(axis=1))
     moved = np.linalg.norm(a.estimate.points[points] - stored.estimate.points[points], axis=1)
@@ -252,7 +256,7 @@ def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray
 
 
 def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
-    """Return what two epochs or more were given alike."""
+    """Return the given values that two or more epochs share."""
     keys: dict[str, None] = {}
     for k, one in enumerate(alone):
         for key, (_, value) in one.given.items():
@@ -263,7 +267,7 @@ def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
 
 
 def _given_columns(one: _Alone, keys: tuple[str, ...]) -> FloatArray:
-    """Return the columns of what is shared, zero where this epoch was not given it, (p + 3 k, g)."""
+    """Return the columns of shared given values, zero for those not given in this epoch, (p + 3 k, g)."""
     columns = {f"{key} = {value:.12g}": column for key, (column, value) in one.given.items()}
     nothing = np.zeros(len(one.covariance))
     found = [columns.get(key, nothing) for key in keys]
@@ -273,7 +277,7 @@ def _given_columns(one: _Alone, keys: tuple[str, ...]) -> FloatArray:
 def _conditions(
     alone: Sequence[_Alone], shared: dict[str, list[int]]
 ) -> tuple[list[FloatArray], list[tuple[str, int, str]]]:
-    """Return B of each epoch, (q, p), and camera, later epoch and parameter of each condition."""
+    """Return B of each epoch, (q, p), and (camera, later epoch, parameter) of each condition."""
     rows: list[tuple[str, int, str]] = [
         (name, later, parameter)
         for name, (first, *others) in shared.items()
@@ -307,7 +311,7 @@ def _tested(
 
 
 def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
-    """Say of a camera that changed which parameter did so most."""
+    """Describe a camera that changed, with the parameter that changed most."""
     first, worst, which, where = None, 0.0, "", ""
     for one in alone:
         if one.epoch.name not in camera.epochs:
