@@ -1,1 +1,1 @@
-"""Many surveys in one go; begin with `run.run_batch`, which hands single surveys to workers (`job`)."""
+"""Batches of surveys; begin with `run.run_batch`, which passes single surveys to workers (`job`)."""

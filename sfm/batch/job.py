@@ -1,8 +1,8 @@
-"""One survey of a batch, as a worker runs it, and which results `--resume` may keep.
+"""One survey of a batch, run by a worker, and the check whether `--resume` may keep an earlier result.
 
-A result that lies in the folder of a batch may have come with the survey, with a log and a manifest that fit.
-So whoever finishes a result notes it in the user's cache folder, by its path and the hash of its manifest,
-which has the hashes of its files.
+A result in the folder of a batch may come from a stranger, together with a matching log and manifest.
+Therefore every finished result is noted in the user's cache folder, by its path and the hash of its manifest,
+which contains the hashes of its files.
 """
 
 from __future__ import annotations
@@ -43,28 +43,28 @@ from sfm.survey.measuring.tie_points import natural_points_of
 
 LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
-LOGS = "logs"  # folder of the logs of surveys that have no result
+LOGS = "logs"  # folder of the logs of surveys without a result
 
 
 @dataclass(frozen=True)
 class SurveyJob:
-    """Input of a worker that runs a survey."""
+    """Job of a worker: a survey to run."""
 
     file: Path  # the survey file
     out: Path  # folder of the batch
-    folder: str  # name of the survey's folder in it
+    folder: str  # name of the survey's folder in the batch
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
-    owner: Owner | None  # of the folder of the batch, who asked for this
-    pictures_mb: float = BUDGET_MB  # what the pictures inside a report may take, 10^6 bytes
+    owner: Owner | None  # owner of the batch folder, who started this run
+    pictures_mb: float = BUDGET_MB  # largest size of the pictures inside a report, 10^6 bytes
 
 
 @dataclass(frozen=True)
 class Comparers:
-    """Programs that surveys are compared with: functions of a module, so that they travel to workers."""
+    """Programs to compare surveys with, as functions of a module, which can be sent to workers."""
 
-    others_of: Callable[[Survey], OtherPrograms]  # those that a survey asks for
-    writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # writes its model
+    others_of: Callable[[Survey], OtherPrograms]  # returns the programs that a survey requests
+    writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # returns the writer of its model
 
 
 @dataclass(frozen=True)
@@ -82,19 +82,19 @@ class PhotographNote:
 
 @dataclass(frozen=True)
 class MeasuredPhotograph:
-    """A photograph as the worker that measured it hands it to the one that goes on."""
+    """A measured photograph, passed from the worker that measured it to the worker that runs the survey."""
 
     note: PhotographNote
-    held: dict[str, tuple[Measured, bool]]  # as of a MeasuredStore; computers may have no common one
+    held: dict[str, tuple[Measured, bool]]  # as in `MeasuredStore`; computers may not share a store
 
 
 @dataclass(frozen=True)
 class SurveyRow:
-    """A survey in the tables of a batch; None where there is no result."""
+    """A survey in the tables of a batch; values are None without a result."""
 
-    survey: str  # its name
+    survey: str  # name of the survey
     file: str  # survey file
-    folder: str  # folder of the result or of the log
+    folder: str  # folder of the result or the log
     status: str  # done | failed | set aside
     verdict: str = ""  # good | fair | bad
     sigma0_px: float | None = None
@@ -103,38 +103,38 @@ class SurveyRow:
     photographs_total: int | None = None
     points: int | None = None
     comparison: str = ""  # agrees | differs | none
-    seconds: float = 0.0  # of computing, photographs included
+    seconds: float = 0.0  # computing time, including photographs
     reason: str = ""  # why there is no result, one line
-    fault: bool = False  # whether that is an error of the program, not of the survey
+    fault: bool = False  # whether the reason is an error of the program, not of the survey
 
     @property
     def succeeded(self) -> bool:
-        """Whether there is a result that can be depended on."""
+        """Whether there is a dependable result."""
         return self.status == "done" and self.verdict != "bad"
 
 
 def lock_of(out: Path, folder: str) -> Path:
-    """Return the lock of a survey's folder, the same as that of a single run into it."""
+    """Return the lock of a survey's folder, the same as for a single run into it."""
     return out / f".{folder}.lock"
 
 
 def measure_one(
     job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, send: Send
 ) -> MeasuredPhotograph:
-    """Measure one photograph; why it cannot be read is part of what is returned."""
+    """Measure one photograph; if it cannot be read, the result states why."""
     begun = time.perf_counter()
     store = MeasuredStore.of_user()
     try:
         with when_compiling(lambda: send({"compiling": True})):
             note = _measure(survey, image, path, store)
-    except Exception as error:  # an unforeseen one fails the survey, which comes upon it again
+    except Exception as error:  # an unforeseen error recurs when the survey runs, and fails it there
         note = PhotographNote(image, failed=as_plain(error_in_words(error)))
     send({"photograph": image})
     return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
 
 
 def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
-    """Measure what a survey asks for in a photograph, and keep it in the store."""
+    """Measure the targets or texture of a photograph as the survey requests, and store them."""
     if survey.tie_points is not None:
         natural, stored = natural_points_of(path, survey.tie_points, store)
         return PhotographNote(image, features=len(natural), stored=stored)
@@ -146,16 +146,16 @@ def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -
 def reconstruct(
     job: SurveyJob, comparers: Comparers, photographs: list[MeasuredPhotograph], *, send: Send
 ) -> SurveyRow:
-    """Run a survey whose photographs are measured, and write its result.
+    """Run a survey with measured photographs, and write its result.
 
     Args:
-        job: the survey.
-        comparers: what to compare it with.
-        photographs: what came of its photographs.
+        job: the survey to run.
+        comparers: programs to compare it with.
+        photographs: its measured photographs.
         send: receives the stages.
 
     Returns:
-        Its row, with a reason if there is no result.
+        The row of the survey, with a reason if there is no result.
 
     Raises:
         OutputError: the result or the log cannot be written.
@@ -176,17 +176,17 @@ def reconstruct(
             row = _run(job, survey, comparers, held, log, lambda: before + time.perf_counter() - begun)
         except Exception as error:
             if isinstance(error, OutputError) and not isinstance(error, FolderInUseError):
-                log.note("failed", reason=str(error))  # others will not be written, either
+                log.note("failed", reason=str(error))  # other surveys cannot be written either
                 raise
             seconds = round(before + time.perf_counter() - begun, 3)
             row = SurveyRow(name, str(job.file), job.folder, "failed", seconds=seconds)
             return failed_row(log, error, row)
-    remove_log(live)  # the result has it
+    remove_log(live)  # the result contains it
     return row
 
 
 def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
-    """Return the row of a survey that an error has ended, and write the error into its log.
+    """Return the row of a survey that an error ended, and write the error into its log.
 
     Raises:
         OutputError: the log cannot be written.
@@ -200,7 +200,7 @@ def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
 
 
 def fingerprint(survey: SurveyFile) -> str:
-    """Return a SHA-256 of what a survey reads: tables by content, photographs by name, size and date.
+    """Return a SHA-256 of the input of a survey: tables by content, photographs by name, size and date.
 
     Raises:
         KolinearError: photographs are missing.
@@ -208,7 +208,7 @@ def fingerprint(survey: SurveyFile) -> str:
     """
     digest = hashlib.sha256(survey.path.read_bytes())
     for table in survey.tables():
-        if table.is_file():  # its reader reports what cannot be read; a pipe would never end
+        if table.is_file():  # an unreadable table is reported by its reader; a pipe would never end
             with table.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
     if survey.observations is None:
@@ -220,7 +220,7 @@ def fingerprint(survey: SurveyFile) -> str:
 
 
 def finished_row(job: SurveyJob) -> SurveyRow | None:
-    """Return the row of a result that this version has written from the same inputs, None without one."""
+    """Return the row of a result that this version wrote from the same inputs, or None."""
     try:
         entries = read_log(job.out / job.folder / LOG)
     except OSError:
@@ -238,7 +238,7 @@ def finished_row(job: SurveyJob) -> SurveyRow | None:
 
 
 def _is_sound(row: SurveyRow) -> bool:
-    """Whether the values of a row that was read are such as this program writes."""
+    """Return whether the values of a row from a file are possible values of this program."""
     numbers = (row.sigma0_px, row.rms_px, row.photographs, row.photographs_total, row.points, row.seconds)
     return (
         row.verdict in VERDICTS
@@ -280,16 +280,16 @@ def _run(
 
 
 def _refuse_ended(job: SurveyJob) -> None:
-    """Raise OutputError where the run that asked for a survey is over.
+    """Raise OutputError if the run that started a survey has ended.
 
-    Workers of a cluster work on when it was killed, and another run may have the folder by now.
+    Workers of a cluster continue after their run was killed, and another run may own the folder by then.
     """
     if owner_of(job.out / LOCK) != job.owner:
         raise OutputError(f"{job.out}: the run that asked for survey {job.folder} is over")
 
 
 def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
-    """Return the row of a survey from the last line of its log; TypeError if that is something else."""
+    """Return the row of a survey from the last line of its log; raises TypeError if a value is missing."""
     names = {field.name for field in fields(SurveyRow)} - {"file", "folder", "status", "seconds", "fault"}
     known = {key: value for key, value in entries.items() if key in names}
     return SurveyRow(file=str(job.file), folder=job.folder, status="done", seconds=seconds, **known)
@@ -297,7 +297,7 @@ def _row(job: SurveyJob, entries: dict[str, Any], seconds: float) -> SurveyRow:
 
 @dataclass(frozen=True)
 class _Sending(Silent):
-    """Progress that reports to the watched batch which stage begins, and nothing else."""
+    """Progress that only reports the beginning of stages to the batch."""
 
     send: Send
 
@@ -306,7 +306,7 @@ class _Sending(Silent):
 
 
 def note_finished(folder: Path) -> None:
-    """Note that a result is by this user; where there is no room it is computed again at `--resume`."""
+    """Note that this user computed a result; if that fails, `--resume` computes it again."""
     with suppress(OSError, OutputError):
         entry = _entry(folder)
         make_user_folder(entry.parents[1])
@@ -315,23 +315,23 @@ def note_finished(folder: Path) -> None:
 
 
 def was_finished(folder: Path) -> bool:
-    """Whether a result was noted, and has the same manifest as then.
+    """Return whether a result was noted, with the same manifest as now.
 
     Raises:
-        OutputError: others can write where results are noted.
+        OutputError: other users can write into the folder of the notes.
     """
     try:
-        os.utime(_entry(folder))  # asked for now
+        os.utime(_entry(folder))  # marks the note as used now
     except OSError:
         return False
     return True
 
 
 def remove_old_notes() -> None:
-    """Remove notes not asked for in months.
+    """Remove notes not used for months.
 
     Raises:
-        OutputError: others can write where results are noted.
+        OutputError: other users can write into the folder of the notes.
     """
     remove_unused(_notes())
 
@@ -341,6 +341,6 @@ def _notes() -> Path:
 
 
 def _entry(folder: Path) -> Path:
-    """Return the file that notes a result as it is now."""
+    """Return the file that notes the present state of a result."""
     key = hashlib.sha256(os.fsencode(f"{folder.absolute()}\0{sha256_of(folder / MANIFEST)}")).hexdigest()
     return _notes() / key[:2] / key

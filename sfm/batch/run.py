@@ -1,7 +1,7 @@
-"""Many surveys in one go: run by an engine in other processes, continued after any end, reported in tables.
+"""Batch of surveys, run by an engine in other processes, which can be resumed after any interruption.
 
-A survey's folder appears whole or not at all and carries the fingerprint of what it was computed from. So
-what is finished can be read from the folders alone, whatever ended the run before.
+A survey's folder appears complete or not at all, and contains the fingerprint of its input. The folders alone
+therefore show which surveys are finished, however an earlier run ended.
 """
 
 from __future__ import annotations
@@ -47,26 +47,27 @@ from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 
-SURVEY_NAME = "survey.toml"  # what a folder is searched for
+SURVEY_NAME = "survey.toml"  # searched for in folders
 
 
 class Watch(Protocol):
-    """Whoever looks on while a batch runs."""
+    """Observer of a running batch."""
 
     def planned(self, names: Sequence[str]) -> None:
-        """These surveys are part of the batch, by the names of their folders."""
+        """Receive the surveys of the batch, by the names of their folders."""
 
     def received(self, name: str, message: dict[str, Any]) -> None:
-        """A survey has {"photographs": count}, begins {"stage": name}, has measured {"photograph": name}.
+        """Receive a message of a survey.
 
-        Kernels that it needs may be {"compiling": True} first, in its worker.
+        The survey has {"photographs": count}, begins {"stage": name}, or has measured {"photograph": name}.
+        With {"compiling": True} its worker compiles kernels first.
         """
 
     def finished(self, name: str, row: SurveyRow, *, kept: bool) -> None:
-        """A survey is at its end; `kept` where an earlier run finished it."""
+        """Receive the end of a survey; `kept` if an earlier run finished it."""
 
     def remark(self, text: str) -> None:
-        """Something that a person may want to know."""
+        """Receive a remark for people."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class _Plan:
 
     file: Path
     folder: str
-    survey: SurveyFile | Exception  # why its file cannot be read
+    survey: SurveyFile | Exception  # or why its file cannot be read
 
 
 def run_batch(
@@ -94,13 +95,13 @@ def run_batch(
     Args:
         files: survey files.
         out: folder of the batch; every survey gets a folder in it.
-        engine: runs the work; it is entered here, since what workers leave can be cleared when they are gone.
-        comparers: what the surveys are compared with.
+        engine: runs the work; it is entered here, so that leftovers of workers are removed after they ended.
+        comparers: programs to compare the surveys with.
         watch: receives the events.
-        resume: keep what an earlier run finished from the same inputs; else everything is run, and only
-            what was measured in photographs is taken from an earlier run.
+        resume: whether results that an earlier run finished from the same inputs are kept; else every survey
+            is run, and only measurements in photographs are taken from an earlier run.
         allow_outside: whether survey files may name files outside their folders.
-        pictures_mb: what the pictures inside a report may take, 10^6 bytes; the rest lies beside it.
+        pictures_mb: largest size of the pictures inside a report, 10^6 bytes; the others are files beside it.
 
     Returns:
         One row per survey in the order of the files.
@@ -110,7 +111,7 @@ def run_batch(
         BackendError: no worker is left.
     """
     refuse_foreign_pages(Path(out))
-    out = Path(os.path.abspath(out))  # it has no links
+    out = Path(os.path.abspath(out))  # it contains no links
     plans = _plan(files, allow_outside=allow_outside)
     for plan in plans:
         refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
@@ -138,7 +139,7 @@ def run_batch(
 
 @contextmanager
 def _no_empty_folders(out: Path) -> Iterator[None]:
-    """Take away again what was made for a batch that has come to nothing."""
+    """Remove folders made for a batch that produced nothing."""
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     try:
         yield
@@ -149,18 +150,18 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
 
 
 def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
-    """Return the survey files that names on the command line mean, each once.
+    """Return the survey files for the names on the command line, each once.
 
     Args:
-        names: files; folders, which mean every survey.toml in and below them or else for the *.toml
-            files in them; globs, for shells that leave them as they are.
+        names: files, folders or globs. A folder stands for every survey.toml in and below it, or if there is
+            none, for the *.toml files in it. Globs are for shells that do not expand them.
 
     Raises:
         SurveyFileError: a name matches nothing.
     """
     found: dict[Path, None] = {}
     for name in names:
-        if not name:  # as of an unset variable of the shell; for Path it is the current folder
+        if not name:  # such as an unset variable of the shell; for Path it means the current folder
             raise SurveyFileError("an empty name stands for no survey")
         path = Path(name)
         if path.exists() or not glob.has_magic(name):
@@ -173,7 +174,7 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
 
 
 def _matches(path: Path) -> list[Path]:
-    """Return what a glob on the command line matches; with `**` in it no links out of its folder count."""
+    """Return the matches of a glob on the command line; with `**`, links out of its folder are refused."""
     first = next(k for k, part in enumerate(path.parts) if glob.has_magic(part))
     folder, pattern = Path(*path.parts[:first]), Path(*path.parts[first:])
 
@@ -191,10 +192,15 @@ def _matches(path: Path) -> list[Path]:
 
 
 def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
-    """Return how many workers can be busy at a time, at least 1: the photographs and the surveys without."""
+    """Return how many workers can be busy at a time: one per photograph or survey without any, at least 1.
+
+    Args:
+        files: survey files.
+        allow_outside: whether survey files may name files outside their folders.
+    """
     calls = 0
     for file in files:
-        with suppress(Exception):  # what is wrong is reported by the run
+        with suppress(Exception):  # the run reports errors
             survey = read_survey_file(file, allow_outside=allow_outside)
             calls += len(find_photographs(survey)) if survey.observations is None else 1
     return max(1, calls)
@@ -216,14 +222,14 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
     for file in files:
         try:
             read.append((file, read_survey_file(file, allow_outside=allow_outside)))
-        except Exception as error:  # an unforeseen one fails this survey alone
+        except Exception as error:  # an unforeseen error only fails this survey
             read.append((file, error))
     names = [_folder_name(file, survey) for file, survey in read]
     often = Counter(name.casefold() for name in names)
     plans = []
     for (file, survey), name in zip(read, names, strict=True):
         reserved = name.casefold() in (LOGS, MANIFEST, *PAGES)
-        if often[name.casefold()] > 1 or reserved:  # distinguished by what stays the same from run to run
+        if often[name.casefold()] > 1 or reserved:  # a suffix that is the same in every run
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
         plans.append(_Plan(file, name, survey))
     return tuple(plans)
@@ -245,13 +251,13 @@ def _run(
     allow_outside: bool,
     pictures_mb: float,
 ) -> dict[str, SurveyRow]:
-    """Run what is not finished; what was near dying workers is run again alone, to see whose fault it is."""
+    """Run the unfinished surveys; those with workers that died run again, alone, to find the one at fault."""
     rows: dict[str, SurveyRow] = {}
     works: dict[str, Work] = {}
 
     def finish(name: str, row: SurveyRow, *, kept: bool = False) -> None:
         if row.status == "done" and not kept:
-            note_finished(out / name)  # here, too: workers on other computers have another cache folder
+            note_finished(out / name)  # also here: workers on other computers have another cache folder
         rows[name] = row
         works.pop(name, None)
         watch.finished(name, row, kept=kept)
@@ -278,7 +284,7 @@ def _run(
             except Exception as error:
                 finish(plan.folder, _without_result(plan, out, "failed", error))
                 continue
-            if earlier is not None:  # its log may be there still, of a run killed at the last moment
+            if earlier is not None:  # a run killed at the last moment may have left its log
                 remove_log(out / LOGS / f"{plan.folder}.jsonl")
                 finish(plan.folder, earlier, kept=True)
                 continue
@@ -309,7 +315,7 @@ def _run(
 
 
 def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
-    """Return a survey as the engine takes it: a part for each of its photographs, and the rest."""
+    """Return a survey as work for the engine: a part for each photograph, and the whole."""
     parts: tuple[Call, ...] = ()
     if survey.observations is None:
         given = read_survey(job.file, allow_outside=job.allow_outside)
@@ -323,14 +329,14 @@ def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
 
 
 def _without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
-    """Return the row of a survey that no worker has brought to its end, and write its log."""
+    """Return the row of a survey that no worker finished, and write its log."""
     name = plan.survey.name if isinstance(plan.survey, SurveyFile) else plan.folder
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
         return failed_row(log, error, SurveyRow(name, as_plain(str(plan.file)), plan.folder, status))
 
 
 def _clean(out: Path, plans: Sequence[_Plan]) -> None:
-    """Remove what killed workers left half-written, but not what others are writing beside this batch."""
+    """Remove half-written files of killed workers, but not files that others write beside this batch."""
     for plan in plans:
         if any(out.glob(f".{glob.escape(plan.folder)}.*")):
             with suppress(FolderInUseError), locked(lock_of(out, plan.folder)):

@@ -1,4 +1,4 @@
-"""The table of a batch: on the terminal while it runs, and as batch.csv, batch.json and index.html."""
+"""Table of a batch: on the terminal while it runs, and then as batch.csv, batch.json and index.html."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ from sfm.report.page import Column, Link, Mark, Note, Page, Section, Table, Tile
 from sfm.report.pages import texts_of
 from sfm.report.phrases import fixed
 
-PAGES = ("batch.json", "batch.csv", "index.html")  # the first states whose they are
+PAGES = ("batch.json", "batch.csv", "index.html")  # the first identifies them
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red", "": "red"}
-RECENT = 8  # finished surveys that stay in sight
+RECENT = 8  # finished surveys that remain visible
 REFRESHES_PER_SECOND = 4
-MEASURING_SHARE = 0.5  # of a survey's time, in small ones; the rest is its adjustment and report
-MIN_DONE_SHARE = 0.05  # of a batch that must be done before the time left is stated
+MEASURING_SHARE = 0.5  # of the time of a small survey; the rest is adjustment and report
+MIN_DONE_SHARE = 0.05  # of a batch that must be done before the remaining time is stated
 
 
 @dataclass
 class _Line:
-    """A survey under way."""
+    """A survey in progress."""
 
-    begun: float | None = None  # by a worker, time.monotonic()
+    begun: float | None = None  # when a worker began it, time.monotonic()
     stage: str = "waiting"
-    photographs: int = 0  # measured
-    total: int = 0  # to be measured
+    photographs: int = 0  # number of measured photographs
+    total: int = 0  # number of photographs to measure
 
 
 class BatchTable:
-    """Looks on while a batch runs; a live table on a terminal, else a line for every finished survey."""
+    """Observer of a batch: a live table on a terminal, else a line for every finished survey."""
 
     def __init__(self, console: Console, *, verbose: bool = False) -> None:
         self._console = console
@@ -75,11 +75,11 @@ class BatchTable:
         self._live.stop()
 
     def planned(self, names: Sequence[str]) -> None:
-        """Begin: so many surveys are to be run."""
+        """Begin with the surveys to run."""
         self._left, self._begun = len(names), time.monotonic()
 
     def received(self, name: str, message: dict[str, Any]) -> None:
-        """Note what a survey is at."""
+        """Note a message of a survey."""
         line = self._lines.setdefault(name, _Line())
         if "photographs" in message:
             line.total = int(message["photographs"])
@@ -115,7 +115,7 @@ class BatchTable:
         self._console.print(Text(text), soft_wrap=True)
 
     def _render(self) -> RenderableType:
-        """Return the table as it is now."""
+        """Return the present table."""
         now = time.monotonic()
         table = RichTable(box=None, padding=(0, 2, 0, 0), caption=self._sum(now), caption_justify="left")
         for name in ("survey", "stage", "photographs", "seconds"):
@@ -144,7 +144,7 @@ class BatchTable:
 
 
 def outcome_of(row: SurveyRow) -> str:
-    """Return how a survey ended, in a few words."""
+    """Return a short text on how a survey ended."""
     if row.status != "done":
         return f"{row.status}: {row.reason}"
     sigma0 = "" if row.sigma0_px is None else f", sigma0 {row.sigma0_px:.4f} px"
@@ -152,7 +152,7 @@ def outcome_of(row: SurveyRow) -> str:
 
 
 def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None:
-    """Print the outcome of a batch: how many worked, which did not and why, and where the page is."""
+    """Print the outcome of a batch: the number of results, failed surveys with reasons, and its page."""
     count = [(name, n) for name, n in totals(rows).items() if name != "surveys"]
     parts = [counted(len(rows), "survey")]
     parts += [f"{n} {name}" for name, n in count if n or name == "done"]
@@ -160,14 +160,16 @@ def print_batch(console: Console, rows: Sequence[SurveyRow], page: Path) -> None
     for row in rows:
         if not row.succeeded:
             outcome = outcome_of(row) if row.status != "done" else f"{outcome_of(row)}: see its report"
-            where = "" if row.reason.startswith(row.file) else f" ({row.file})"  # not twice
+            where = (
+                "" if row.reason.startswith(row.file) else f" ({row.file})"
+            )  # the reason may already state the file
             console.print(Text(f"  {row.survey}{where}: {outcome}", style="red"), soft_wrap=True)
     console.print(Text(f"Index: {page}", style="bold"), soft_wrap=True)
 
 
 @contextmanager
 def stopping_at_terminate() -> Iterator[None]:
-    """Take a request to terminate, as computers make before they shut down, like Ctrl-C."""
+    """Treat a request to terminate, as before a shutdown of the computer, like Ctrl-C."""
 
     def stop(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -186,10 +188,10 @@ def _duration(seconds: float) -> str:
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
-    """Write batch.json, batch.csv and index.html, each whole or not at all.
+    """Write batch.json, batch.csv and index.html, each completely or not at all.
 
     Args:
-        rows: one per survey.
+        rows: one row per survey.
         out: folder of the batch.
 
     Raises:
@@ -202,9 +204,9 @@ def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise OutputError where a folder has files of these names that no batch has written, or a changed one.
+    """Raise OutputError if a folder has files of these names that no batch wrote, or that were changed.
 
-    So it does where the path is no text that they can contain, or leads through a link.
+    It is also raised if the path contains invisible characters, or leads through a link.
     """
     if not is_plain(str(out)):
         raise OutputError(
@@ -218,7 +220,7 @@ def refuse_foreign_pages(out: Path) -> None:
 
 
 def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
-    """Return how many surveys ended in which way."""
+    """Return the number of surveys by their outcome."""
     count = Counter(row.status for row in rows)
     bad = sum(row.status == "done" and not row.succeeded for row in rows)
     return {
@@ -231,7 +233,7 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
 
 
 def batch_remarks(rows: Sequence[SurveyRow]) -> tuple[Remark, ...]:
-    """Return how the surveys of a batch ended, by name."""
+    """Return the remarks on the outcomes of the surveys of a batch."""
     kinds = {
         "surveys_failed": [row.survey for row in rows if row.status == "failed"],
         "surveys_set_aside": [row.survey for row in rows if row.status == "set aside"],
@@ -246,8 +248,8 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
     """Return the page with a line for every survey.
 
     Args:
-        rows: one per survey.
-        name: of the batch.
+        rows: one row per survey.
+        name: name of the batch.
     """
     good = sum(row.succeeded for row in rows)
     headline = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
@@ -281,7 +283,7 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
 
 
 def _surveys(rows: Sequence[SurveyRow], above: str) -> Table:
-    """Return the surveys with what came of them."""
+    """Return the table of surveys with their results."""
     columns = (
         *(Column("survey"), Column("file"), Column("result"), Column("photographs", format=str)),
         *(Column("points", format="z.0f"), Column("sigma0, px", format="z.4f")),
@@ -304,7 +306,7 @@ def _surveys(rows: Sequence[SurveyRow], above: str) -> Table:
 
 
 def _without(rows: Sequence[SurveyRow], above: str) -> Table:
-    """Return the surveys that have no result, and why."""
+    """Return the table of surveys without a result, with the reasons."""
     cells = [
         (
             *(row.survey, _below(row.file, above), Mark(row.status, "bad"), row.reason),
@@ -320,9 +322,9 @@ def _below(file: str, above: str) -> str:
 
 
 def _common_folder(rows: Sequence[SurveyRow]) -> str:
-    """Return the folder that all survey files are below, empty if there is none but the root."""
+    """Return the common folder of all survey files, empty if it is only the root."""
     try:
         common = os.path.commonpath([Path(row.file).parent for row in rows])
-    except ValueError:  # none at all, or several drives
+    except ValueError:  # no files, or several drives
         return ""
     return "" if common == Path(common).anchor else common

@@ -1,1 +1,1 @@
-"""Files: read with bounds, written whole or not at all, locked, and named in plain text."""
+"""Files: read with limits, written completely or not at all, locked, and with names in plain text."""

@@ -1,14 +1,16 @@
 """Covariances of a result, in files beside its tables.
 
     point_covariance.npy    upper triangle, by rows, of the matrix of X Y Z of every row of points.csv
-    point_covariance_points.csv    id of the points that it is of, where it is not of all
+    point_covariance_points.csv    ids of the points of this matrix, if it does not have all points
     covariances.npz    image_names (m,), exterior (m, 6, 6)    X0, Y0, Z0, omega, phi, kappa of a photograph
                        camera_names (a,), interior_0 (f, f) ...    free parameters of each camera
-                       rig_parameters (s,), rigs (s, s)    of all of these and X, Y, Z, omega, phi, kappa
-                      of each mount, together; where there are rigs
-                      point_names (n,), points (n, 3, 3)    X, Y, Z of a point; of surveys, not read again
+                       rig_parameters (s,), rigs (s, s)    joint matrix of all of these and of X, Y, Z,
+                           omega, phi, kappa of each mount; only with rigs
+                       point_names (n,), points (n, 3, 3)    X, Y, Z of a point; only of surveys, not read
+                       back
 
-In object units and rad; arrays of NumPy, from which nothing is run. Sizes are checked before they are read.
+Units are object units and rad. The files are NumPy arrays without executable content, and their sizes are
+checked before they are read.
 
 Source: NumPy, Enhancement Proposal 1 (a simple file format for NumPy arrays).
 """
@@ -34,26 +36,24 @@ if TYPE_CHECKING:
 
 NAME = "point_covariance.npy"
 ARRAYS = "covariances.npz"
-MAX_BYTES = 2**31  # of the arrays unpacked
+MAX_BYTES = 2**31  # of the unpacked arrays
 POINTS_NAME = "point_covariance_points.csv"
-MAX_POINTS = 1000  # of whom a matrix is kept: 36 MB
-MAX_WORK = (
-    5_000_000  # points times points of the sample: the matrix of many points takes their product in time
-)
+MAX_POINTS = 1000  # of a stored matrix, which then takes 36 MB
+MAX_WORK = 5_000_000  # points times points of the sample: the time of their matrix grows with this product
 SEED = 1
-UNCODED = re.compile(r"u\d+")  # names that Kolinear gives to points without one, anew in every run
+UNCODED = re.compile(r"u\d+")  # new names in every run of points without a name
 HEADER_BYTES = 128  # of a one-dimensional array
-SAME = 1e-6  # relative difference from the standard deviations of the table, which are the same numbers
+SAME = 1e-6  # largest relative difference from the standard deviations in the table
 
 
 def points_kept_together(names: tuple[str, ...]) -> IntArray:
-    """Return the points whose joint covariance is kept: all of up to 1000, a sample of more, in rising order.
+    """Return the points whose joint covariance is stored, in rising order: all, or a sample of over 1000.
 
-    Points with real names come first, since another result knows them too; the others are drawn at
-    random, so that they lie where the points lie.
+    Points with real names come first, since other results have them too. The others are drawn at random, so
+    that they are distributed like all points.
 
     Args:
-        names: of all points.
+        names: names of all points.
     """
     n = len(names)
     if n <= MAX_POINTS:
@@ -70,10 +70,10 @@ def write_covariance(
     """Write the covariance of the points into a folder.
 
     Args:
-        folder: that of points.csv.
-        covariance: of the points in the order of that table, object unit^2, (3 k, 3 k).
-        names: of all points.
-        points: which of them the covariance is of, in rising order, (k,); all if None.
+        folder: folder of points.csv.
+        covariance: joint covariance of k points in the order of that table, object unit^2, (3 k, 3 k).
+        names: names of all points.
+        points: indices of the k points, in rising order, (k,); all points if None.
     """
     np.save(folder / NAME, covariance[np.triu_indices(len(covariance))], allow_pickle=False)
     if points is not None:
@@ -84,15 +84,15 @@ def write_covariance(
 def read_covariance(
     folder: Path, names: tuple[str, ...], sigma: FloatArray
 ) -> tuple[FloatArray | None, IntArray | None]:
-    """Read the covariance of the points, None where there is no such file.
+    """Read the covariance of the points, None if there is no such file.
 
     Args:
-        folder: that of points.csv.
-        names: ids of points.csv, n of them.
-        sigma: standard deviations of points.csv, which must be those of the file, (n, 3).
+        folder: folder of points.csv.
+        names: ids of points.csv, (n,).
+        sigma: standard deviations of points.csv, which must agree with the file, (n, 3).
 
     Returns:
-        The matrix (3 k, 3 k), and which points it is of (k,), None for all of them.
+        The matrix, (3 k, 3 k), and the indices of its points, (k,), None for all points.
 
     Raises:
         SurveyFileError: the file belongs to another table or is damaged.
@@ -133,12 +133,12 @@ def read_covariance(
 
 
 def write_covariances(folder: Path, solution: Solution, *, points: bool = False) -> None:
-    """Write covariances.npz: those of each exterior and each interior orientation as arrays, as far as known.
+    """Write covariances.npz, the known covariances of exterior orientation, interior orientation and rigs.
 
     Args:
-        folder: of the result.
-        solution: with its covariances.
-        points: whether those of each point are written, too.
+        folder: folder of the result.
+        solution: has its covariances.
+        points: whether the covariance of each point is written too.
     """
     network = solution.network
     arrays: dict[str, Any] = {}
@@ -157,8 +157,8 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
     """Return a result with the covariances of exterior orientation, interior orientation and rigs.
 
     Args:
-        folder: of the result; the file may be missing.
-        result: as in the tables beside it.
+        folder: folder of the result; the file may be missing.
+        result: the result from the tables in this folder.
 
     Raises:
         SurveyFileError: the file is damaged or belongs to other tables.

@@ -1,6 +1,6 @@
-"""CSV tables with named columns, read as untrusted, and point clouds written as PLY.
+"""CSV tables with named columns, read as untrusted files, and point clouds written as PLY.
 
-Their size is bounded before memory is allocated, and every refusal names the line and the column.
+The size of a table is checked before memory is allocated. Every error message states the line and the column.
 
 Source: RFC 4180; Turk, The PLY polygon file format (1994).
 """
@@ -25,46 +25,46 @@ from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
 
 SIGMAS = ("sx", "sy", "sz")
 COLOURS = ("red", "green", "blue")
-# Room for the largest networks that are adjusted here; memory grows with the rows, some 100 bytes each.
+# Enough for the largest networks that are adjusted here; each row takes about 100 bytes of memory.
 MAX_TABLE_BYTES = 2_000_000_000
 MAX_ROWS = 20_000_000
 MAX_LINE = 10_000  # characters
-MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger ones overflow
+MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger numbers overflow
 
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Columns of a CSV file or of arrays, with what is needed to state where something is wrong."""
+    """Columns of a CSV file or of arrays, with the position of each row for error messages."""
 
-    path: Path  # of arrays what they are
-    names: tuple[str, ...]  # of the columns of text
+    path: Path  # path of the file, or name of the arrays
+    names: tuple[str, ...]  # names of the columns of text
     texts: tuple[tuple[str, ...], ...]  # one tuple per column of text
     values: FloatArray  # columns of numbers, (rows, columns)
     line: IntArray  # line of each row in the file, (rows,)
-    word: str = "line"  # what the numbers count: row of arrays
-    numbers: tuple[str, ...] = ()  # of the columns of numbers
+    word: str = "line"  # "line" for files, "row" for arrays
+    numbers: tuple[str, ...] = ()  # names of the columns of numbers
 
     def place(self, row: int) -> str:
-        """Return in words where a row is."""
+        """Return the position of a row, for error messages."""
         return f"{self.path}, {self.word} {self.line[row]}"
 
     def keys(self, column: str) -> tuple[str, ...]:
-        """Return a column of names that are all different."""
+        """Return a column of unique names; raise SurveyFileError if a name occurs twice."""
         values = self.texts[self.names.index(column)]
         self.refuse_duplicates(values, (column,))
         return values
 
     def places(self, column: str, known: Sequence[str], source: str, *, what: str = "") -> IntArray:
-        """Return the place of each name of a column among those known from another file, (rows,).
+        """Return the index of each name of a column in a list from another file, (rows,).
 
         Args:
-            column: of names.
-            known: all names that there may be.
-            source: the file with them.
-            what: they are; the column says it if not given.
+            column: a column of names.
+            known: all known names.
+            source: file of the known names, for the error message.
+            what: what the names stand for, for the error message; the name of the column if not given.
 
         Raises:
-            SurveyFileError: a name is not among them.
+            SurveyFileError: a name is unknown.
         """
         place = {name: k for k, name in enumerate(known)}
         names = self.texts[self.names.index(column)]
@@ -74,7 +74,7 @@ class CsvTable:
         return np.array([place[name] for name in names], dtype=np.int64)
 
     def part(self, names: tuple[str, ...]) -> FloatArray:
-        """Return columns of numbers, NaN for those that the file does not have, (rows, columns)."""
+        """Return columns of numbers, NaN for columns that the file does not have, (rows, columns)."""
         found = np.full((len(self.line), len(names)), np.nan)
         for k, name in enumerate(names):
             if name in self.numbers:
@@ -82,13 +82,25 @@ class CsvTable:
         return found
 
     def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
-        """Raise SurveyFileError for the first value of a mask, both (rows, columns)."""
+        """Raise SurveyFileError for the first wrong value.
+
+        Args:
+            values: numbers, (rows, columns).
+            wrong: which of them are wrong, (rows, columns).
+            columns: names of the columns.
+            needed: description of the needed values.
+        """
         for k, c in np.argwhere(wrong)[:1]:
             where = f"{self.place(k)}: column {columns[c]}"
             raise SurveyFileError(f"{where} contains {values[k, c]:g}, needed {needed}")
 
     def refuse_duplicates(self, keys: tuple[object, ...], columns: tuple[str, ...]) -> None:
-        """Raise SurveyFileError if a key comes twice."""
+        """Raise SurveyFileError if a key occurs twice.
+
+        Args:
+            keys: one key per row, a name or a tuple of names.
+            columns: names of the columns of a key.
+        """
         if len(set(keys)) == len(keys):
             return
         first: dict[object, int] = {}
@@ -112,19 +124,20 @@ def read_table(
     ignored: tuple[str, ...] | None = (),
     blank: tuple[str, ...] = (),
 ) -> CsvTable:
-    """Read a CSV file whose header names its columns.
+    """Read a CSV file with a header of column names.
 
     Args:
-        path: the file, UTF-8, comma separated, `.` as decimal sign.
+        path: the file, UTF-8, comma separated, with a decimal point.
         texts: columns of names.
         numbers: columns of numbers.
-        optional: columns of numbers that come all together or not at all.
+        optional: columns of numbers that are all present or all missing.
         aliases: (other name, name) of columns.
-        ignored: further columns that may be there; None for any.
-        blank: columns of numbers whose cells may be empty, which is NaN.
+        ignored: further columns that may be present; None for any.
+        blank: columns of numbers whose cells may be empty, which gives NaN.
 
     Raises:
-        SurveyFileError: unreadable, too large, wrong columns, or not a finite number of bearable size.
+        SurveyFileError: the file is unreadable, too large or has wrong columns, or a number is not finite or
+            too large.
     """
     header = tuple(dict(aliases).get(name, name) for name in read_header(path))
     wanted = (*texts, *numbers)
@@ -173,17 +186,17 @@ def array_table(
     *,
     blank: tuple[str, ...] = (),
 ) -> CsvTable:
-    """Return arrays as a table, as if they had been read from a file.
+    """Return arrays as a table, with the same checks as for a file.
 
     Args:
-        what: the arrays are, for messages.
+        what: name of the arrays, for error messages.
         texts: columns of names.
-        numbers: columns of numbers, as long.
+        numbers: columns of numbers, of the same length.
         blank: columns of numbers that may be NaN.
 
     Raises:
-        SurveyFileError: columns of different length, none at all, a bad name, or not a finite number of
-            bearable size.
+        SurveyFileError: columns of different lengths, no rows, a bad name, or a number that is not finite or
+            too large.
     """
     rows = len(next(iter(texts.values())))
     for name, column in texts.items():
@@ -204,7 +217,7 @@ def array_table(
 
 
 def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and cells of every row below the header that is not empty."""
+    """Yield line number and cells of every nonempty row below the header."""
     with _opened(path) as file:
         lines = _Lines(path, file)
         reader = csv.reader(lines)
@@ -231,12 +244,12 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
 
 
 class _Lines:
-    """The lines of a file: no row of them longer than a line can be, and not more than twice the rows."""
+    """The lines of a file, with limits on the length of a row and the number of lines."""
 
     def __init__(self, path: Path, file: TextIO) -> None:
         self.path, self.file = path, file
         self.number = 0
-        self.characters = 0  # of the row so far, which quoted cells spread over lines
+        self.characters = 0  # of the row so far; quoted cells may span several lines
 
     def __iter__(self) -> _Lines:
         return self
@@ -260,7 +273,7 @@ def read_header(path: Path) -> tuple[str, ...]:
     """Return the names of the columns.
 
     Raises:
-        SurveyFileError: the file cannot be read or is no CSV table.
+        SurveyFileError: the file cannot be read or is not a CSV table.
     """
     with _opened(path) as file:
         try:
@@ -272,7 +285,7 @@ def read_header(path: Path) -> tuple[str, ...]:
 
 
 def _opened(path: Path) -> TextIO:
-    """Open a table that is a file of bearable size."""
+    """Open a table if it is a file within the size limit."""
     try:
         if path.exists() and not path.is_file():  # reading a pipe would never end
             raise SurveyFileError(f"{path}: not a file, a CSV table is needed")
@@ -285,7 +298,7 @@ def _opened(path: Path) -> TextIO:
 
 
 def _name(cell: str, where: str) -> str:
-    """Return a name; one that is empty, very long or contains invisible characters is refused."""
+    """Return a name; refuse empty or very long names and invisible characters."""
     name = from_cell(cell.strip())
     if not name:
         raise SurveyFileError(f"{where} is empty, a name is needed")
@@ -297,7 +310,7 @@ def _name(cell: str, where: str) -> str:
 
 
 def _number(cell: str, where: str) -> float:
-    """Return a number as programs write it; Python's float() takes 1_0 and digits of all scripts, too."""
+    """Return a number as programs write it; float() would also accept 1_0 and digits of other scripts."""
     text = cell.strip()
     try:
         value = float(text) if text.isascii() and "_" not in text else math.nan
@@ -319,18 +332,18 @@ def write_ply(
     colours: Sequence[tuple[int, int, int]] | None = None,
     unit: str = "",
 ) -> None:
-    """Write points; those with NaN are left out.
+    """Write points as PLY; points with NaN are left out.
 
     Args:
-        path: the file; whoever wants it whole or not at all gives one of `sfm.files.whole_files`.
+        path: the file; a path from `sfm.files.whole_files` makes it appear completely or not at all.
         xyz: coordinates, (n, 3).
-        names: of the points, which follow as comments "name <id>" in their order; none without.
+        names: names of the points, written as comments "name <id>" in their order, if given.
         sigma: standard deviations, (n, 3).
         colours: red, green and blue of each point, 0 to 255.
-        unit: of lengths, for a comment.
+        unit: unit of lengths, for a comment.
 
     Raises:
-        OutputError: a name has spaces that a comment does not keep.
+        OutputError: a name has spaces that a comment does not preserve.
     """
     if any(" ".join(name.split()) != name for name in names):
         raise OutputError("PLY: names of points cannot begin or end with a space or have two in a row")

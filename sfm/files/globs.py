@@ -1,4 +1,4 @@
-"""Files that a glob names, looked for in a bounded number of places, and through no links that may not be."""
+"""Search for the files of a glob, with a limited number of entries and a check of every link on the way."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from pathlib import Path
 from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 
-MAX_ENTRIES = 500_000  # files and folders that are looked at
-BELOW = "**"  # a folder and all below it
+MAX_ENTRIES = 500_000  # files and folders that are examined
+BELOW = "**"  # a folder and everything below it
 
 
 def why_no_folder(path: Path) -> str:
-    """Return why something is no folder: a file, or nothing, with the nearest name there is."""
+    """Return why a path is no folder: it is a file, or it does not exist, with the most similar name."""
     return (
         "is a file, a folder is needed" if path.exists() else f"there is no such folder{nearest_name(path)}"
     )
 
 
 def nearest_name(path: Path) -> str:
-    """Return a question for the name beside a path that does not exist which is most like it, or nothing."""
+    """Return a question for the most similar name beside a missing path, or an empty text."""
     try:
         names = sorted(os.listdir(path.parent))[:MAX_ENTRIES]
     except OSError:
@@ -42,19 +42,19 @@ def find_files(
     folders: bool = False,
     hidden: bool = True,
 ) -> list[Path]:
-    """Return the files that a glob names, sorted; `**` follows no links.
+    """Return the files that match a glob, sorted; `**` follows no links.
 
     Args:
-        folder: where to look.
-        pattern: glob relative to it.
-        enter: called with every link to a folder, and every `..`, before what is in it is looked at; raises
-            where it may not be.
-        folders: whether folders are returned, too.
+        folder: folder to search.
+        pattern: glob relative to the folder.
+        enter: called with every link to a folder, and every `..`, before its content is examined; raises if
+            it must not be entered.
+        folders: whether folders are returned too.
         hidden: whether wildcards match names that begin with a dot.
 
     Raises:
-        SurveyFileError: there is too much to look through.
-        ValueError: the pattern is no relative glob.
+        SurveyFileError: there are too many files and folders to search.
+        ValueError: the pattern is not a relative glob.
     """
     given = Path(pattern)
     parts = [
@@ -96,7 +96,7 @@ def find_files(
 
 
 def _entries(path: Path, part: str, *, hidden: bool) -> Iterator[tuple[Path, bool]]:
-    """Yield what is in a folder, and whether it matches a part of a glob."""
+    """Yield the entries of a folder, and whether they match a part of a glob."""
     if part != BELOW and not has_magic(part):
         child = path / part
         if child.exists():
@@ -108,5 +108,5 @@ def _entries(path: Path, part: str, *, hidden: bool) -> Iterator[tuple[Path, boo
             for entry in entries:
                 shown = hidden or not entry.name.startswith(".") or part.startswith(".")
                 yield path / entry.name, shown and matches(os.path.normcase(entry.name)) is not None
-    except PermissionError:  # as pathlib's and the shell's globs do
+    except PermissionError:  # ignored, as in globs of pathlib and the shell
         return

@@ -1,19 +1,18 @@
-"""Folders opened part for part and through no link, their lock, and the list of files written.
+"""Safe access to folders: opening without following links, locks, and the list of written files.
 
-A folder that comes from somebody else may hold links at every path that is written. So no part of such a path
-may be a link but those of the system in its root folder (as /tmp of macOS). A folder is opened before
-something is made, opened or moved in it, so that nothing can be put in its place meanwhile; Windows cannot
-open files by such a handle, there its path is checked only.
+A folder from somebody else may contain links at every path that is written. Therefore no part of such a path
+may be a link, except for links of the system in its root folder (such as /tmp of macOS). A folder is opened
+before anything is made, opened or moved in it, so that nobody can replace it meanwhile. Windows cannot open
+files through such a handle, so there only the path is checked.
 
-The lock of a folder: one run at a time writes into it, and everybody can read who. The operating system keeps
-the lock and releases it when the process ends, however it ends. So a lock file that is free is stale by that
-alone, and no process number has to be trusted. It lies beside what it locks, where the runs of other
-computers on the same disk see it.
+A lock lets only one run at a time write into a folder, and shows everybody its owner. The operating system
+holds the lock, and releases it when the process ends for any reason. A lock file that is not locked is
+therefore stale, and no process number has to be trusted. The file is beside the locked folder, where runs on
+other computers with the same disk see it.
 
-The list of the files that Kolinear wrote into a folder, with their hashes: by it they are known again.
-
-A folder or file that may be replaced has such a list, manifest.json. It is replaced only while it is as it
-was written: files that were added, edited or linked by a person are named, and left alone.
+The list of the files that Kolinear wrote into a folder, manifest.json, has their hashes, and identifies them
+later. A folder or file that may be replaced has such a list. It is only replaced while it is unchanged. Files
+that a person added, edited or linked are reported and left alone.
 
 Source: POSIX.1-2008, openat() and O_NOFOLLOW.
 """
@@ -39,13 +38,13 @@ from sfm.errors import FolderInUseError, OutputError, SurveyFileError
 
 MANIFEST = "manifest.json"
 WRITER = "kolinear"
-MAX_MANIFEST_BYTES = 20_000_000  # some 100,000 files
-LITTER = (".DS_Store", "Thumbs.db")  # which systems leave in every folder that is looked at
-NAMED = 3  # files that a message names
+MAX_MANIFEST_BYTES = 20_000_000  # about 100,000 files
+LITTER = (".DS_Store", "Thumbs.db")  # systems leave these in every folder that is viewed
+NAMED = 3  # files that an error message lists
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
-TEXT_AT = 1  # Windows keeps others from reading the locked byte, the first
+TEXT_AT = 1  # Windows does not let others read the locked byte, which is the first
 HAS_HANDLES = {os.open, os.mkdir, os.rename, os.stat} <= os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")
-# Linux opens folders that one may pass but not list by O_PATH.
+# With O_PATH, Linux opens folders that one may traverse but not list.
 _FOLDER = getattr(os, "O_PATH", os.O_RDONLY) | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _PLAIN_FILE = _NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
@@ -53,10 +52,13 @@ _PLAIN_FILE = _NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 
 
 @contextmanager
 def disk_errors(message: str) -> Iterator[None]:
-    """Say what went wrong where the disk refuses: the message, a colon and the reason of the system.
+    """Turn disk errors into messages: the given message, a colon, and the reason of the system.
+
+    Args:
+        message: beginning of the error message.
 
     Raises:
-        OutputError: in place of every OSError.
+        OutputError: replaces every OSError.
     """
     try:
         yield
@@ -66,15 +68,15 @@ def disk_errors(message: str) -> Iterator[None]:
 
 @contextmanager
 def open_folder(path: Path, *, make: bool = False) -> Iterator[int | None]:
-    """Open a folder for what is done in it by `dir_fd`; its handle is None where the system has none.
+    """Open a folder for use as `dir_fd`; its handle is None on systems without such handles.
 
     Args:
         path: the folder.
-        make: whether it is made, with what is above it, if it is not there.
+        make: whether the folder, and the folders above it, are made if they do not exist.
 
     Raises:
-        OutputError: a link is in the path.
-        OSError: it is no folder, or cannot be opened or made.
+        OutputError: the path contains a link.
+        OSError: the path is no folder, or it cannot be opened or made.
     """
     refuse_links(path)
     if not HAS_HANDLES:
@@ -90,9 +92,9 @@ def open_folder(path: Path, *, make: bool = False) -> Iterator[int | None]:
 
 
 def _walk(path: Path, *, make: bool) -> int:
-    """Open a folder, each part of its absolute path in the one before."""
+    """Open a folder from its absolute path, each part relative to the handle of the part before."""
     handle = os.open(path.anchor, _FOLDER)
-    flags = _FOLDER  # links in the root folder are the system's
+    flags = _FOLDER  # links in the root folder belong to the system
     for part in path.parts[1:]:
         try:
             if make and not _is_there(part, handle):
@@ -114,14 +116,14 @@ def _is_there(name: str, folder: int) -> bool:
 
 
 def open_new_folder(path: Path, beside: int | None) -> int | None:
-    """Make and open a folder that was not there, for this user alone.
+    """Make and open a new folder that only this user can access.
 
     Args:
         path: the folder.
-        beside: handle of the folder that it is made in.
+        beside: handle of the containing folder.
 
     Raises:
-        OSError: it is there, or cannot be made.
+        OSError: the folder exists already, or cannot be made.
     """
     if beside is None:
         path.mkdir(0o700)
@@ -131,13 +133,13 @@ def open_new_folder(path: Path, beside: int | None) -> int | None:
 
 
 def move(source: Path, source_folder: int | None, target: Path, target_folder: int | None) -> None:
-    """Rename a file or folder, which replaces a file or an empty folder and follows no link.
+    """Rename a file or folder; this replaces a file or an empty folder, and follows no link.
 
     Args:
-        source: its path.
-        source_folder: handle of the folder that it is in.
-        target: its path afterwards.
-        target_folder: handle of the folder that this is in.
+        source: present path.
+        source_folder: handle of the folder that contains it.
+        target: new path.
+        target_folder: handle of the folder that contains the new path.
 
     Raises:
         OSError: it cannot be moved.
@@ -149,15 +151,16 @@ def move(source: Path, source_folder: int | None, target: Path, target_folder: i
 
 
 def open_regular_file(path: Path, flags: int) -> int:
-    """Open a regular file that has no second name, following no link, and return its handle.
+    """Open a regular file with only one name, without following links, and return its handle.
 
     Args:
         path: the file.
-        flags: of os.open; what they create is new or written by the program, by the caller's check.
+        flags: flags of os.open; if they create or write, the caller has checked that the file is new or
+            written by the program.
 
     Raises:
-        OutputError: a link is in the path, or it is no such file.
-        OSError: it cannot be opened.
+        OutputError: the path contains a link, or is not a regular file with one name.
+        OSError: the file cannot be opened.
     """
     refuse_links(path)
     with open_folder(path.parent) as folder:
@@ -171,18 +174,18 @@ def open_regular_file(path: Path, flags: int) -> int:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and what is above it, if they are not there.
+    """Make a folder and the folders above it, if they do not exist.
 
     Raises:
-        OutputError: a link is in the path.
-        OSError: it cannot be made.
+        OutputError: the path contains a link.
+        OSError: the folder cannot be made.
     """
     with open_folder(path, make=True):
         pass
 
 
 def refuse_links(path: Path) -> None:
-    """Raise OutputError if a part of a path that is to be written is a symbolic link or a junction."""
+    """Raise OutputError if any part of a path to write is a symbolic link or a junction."""
     absolute = Path.cwd() / path
     for part in (*reversed(absolute.parents), absolute):
         link = part.is_symlink() or getattr(os.path, "isjunction", lambda _: False)(part)
@@ -197,18 +200,18 @@ def refuse_links(path: Path) -> None:
 def refuse_links_out(folder: Path, *below: str) -> None:
     """Raise SurveyFileError if a file in a folder of somebody else is a link that leaves the folder.
 
-    A folder that is not there is for its reader to refuse.
+    A missing folder is not refused here, but by its reader.
 
     Args:
         folder: the folder.
-        below: files in folders of it that are read, too.
+        *below: files in its subfolders that are read too.
     """
     try:
         there = os.scandir(folder) if folder.is_dir() else ()
         links = [Path(entry.path) for entry in there if entry.is_symlink() and not entry.is_dir()]
         read = (*links, *(folder / name for name in below))
         leaving = [path for path in read if not path.resolve().is_relative_to(folder.resolve())]
-    except (OSError, RuntimeError) as error:  # a circle of links
+    except (OSError, RuntimeError) as error:  # circular links
         raise SurveyFileError(f"{folder}: the folder cannot be read ({error.__class__.__name__})") from error
     for path in sorted(leaving):
         raise SurveyFileError(f"{path}: a link that leaves its folder; the file itself is needed there")
@@ -216,9 +219,9 @@ def refuse_links_out(folder: Path, *below: str) -> None:
 
 @dataclass(frozen=True)
 class Owner:
-    """The owner of a lock, or the one that left it behind."""
+    """The present owner of a lock, or the owner that left a stale lock."""
 
-    process: int  # number of the process
+    process: int  # process number
     computer: str
     since: str  # date and time, UTC
 
@@ -228,18 +231,18 @@ class Owner:
 
 @contextmanager
 def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
-    """Hold the lock file `path`, which is gone afterwards.
+    """Hold the lock file `path`, and remove it afterwards.
 
     Args:
-        path: the lock file; its folder is made if it is not there.
-        folder: what it locks, for the message; else the folder that it is in.
+        path: the lock file; its folder is made if it does not exist.
+        folder: the locked folder, for error messages; the folder of the lock file if not given.
 
     Yields:
-        The owner of a stale lock that was taken over, a run that was killed; None if there was none.
+        The owner of a stale lock, which is a killed run; None if there was none.
 
     Raises:
         FolderInUseError: another run has the lock.
-        OutputError: the file cannot be written, or is no lock.
+        OutputError: the file cannot be written, or is not a lock.
     """
     with disk_errors(f"{path}: the lock cannot be written"):
         make_folder(path.parent)
@@ -255,15 +258,15 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
         yield before
     finally:
         if ours:
-            os.ftruncate(handle, 0)  # an empty one has no owner, where an open file cannot be removed
+            os.ftruncate(handle, 0)  # without an owner, for systems that cannot remove an open file
             with suppress(OSError):
-                path.unlink()  # while it is still held: whoever waits for it opens a new one
+                path.unlink()  # while it is still locked: a waiting run then opens a new file
         unlock_descriptor(handle)
         os.close(handle)
 
 
 def owner_of(path: Path) -> Owner | None:
-    """Read who owns the lock file `path`, or has left it behind; None if that is not stated."""
+    """Return the owner of the lock file `path`, or the owner that left it; None if it is not stated."""
     try:
         handle = open_regular_file(path, os.O_RDONLY)
     except (OSError, OutputError):
@@ -275,7 +278,7 @@ def owner_of(path: Path) -> Owner | None:
 
 
 def _open_and_lock(path: Path, folder: Path) -> int:
-    """Open and lock the file that is at `path` now, not one that its owner has just removed."""
+    """Open and lock the file that is now at `path`, not a file that its owner has just removed."""
     while True:
         handle = open_regular_file(path, os.O_RDWR | os.O_CREAT)
         if not lock_descriptor(handle, blocking=False):
@@ -299,7 +302,7 @@ def _write_owner(handle: int) -> None:
 
 
 def _owner(handle: int) -> Owner | None:
-    """Read who owns a lock; None if that is not stated."""
+    """Return the owner of a lock; None if it is not stated."""
     try:
         os.lseek(handle, TEXT_AT, os.SEEK_SET)
         found = json.loads(os.read(handle, MAX_OWNER_BYTES))
@@ -309,16 +312,16 @@ def _owner(handle: int) -> Owner | None:
 
 
 def refuse_foreign_folder(out: Path) -> None:
-    """Raise OutputError unless a folder is absent, empty, or as Kolinear wrote it, by its manifest.
+    """Raise OutputError unless a folder is absent, empty, or unchanged by its manifest since it was written.
 
-    It is called before the work starts, too, so that no one waits for a result that has no place.
+    It is also called before the work starts, so that nobody waits for a result that cannot be written.
     """
     refuse_links(out)
     try:
         mode = out.lstat().st_mode
     except FileNotFoundError:
         return
-    except OSError as error:  # a file is above it
+    except OSError as error:  # such as a file in place of a folder above it
         raise OutputError(f"{out}: cannot be written here: {error.strerror}") from error
     if not stat.S_ISDIR(mode):
         raise OutputError(f"{out}: a file has this name, --out needs a folder")
@@ -328,11 +331,11 @@ def refuse_foreign_folder(out: Path) -> None:
 
 
 def refuse_foreign_files(folder: Path, names: Iterable[str]) -> None:
-    """Raise OutputError where files of some names are in a folder, other than Kolinear wrote them.
+    """Raise OutputError if a folder has files of some names that Kolinear did not write, or changed ones.
 
     Args:
-        folder: where they are to be written; it may hold files of other names.
-        names: of the files.
+        folder: folder to write into; it may contain files of other names.
+        names: names of the files to write.
     """
     wanted = (*names, MANIFEST)
     for name in wanted:
@@ -343,7 +346,7 @@ def refuse_foreign_files(folder: Path, names: Iterable[str]) -> None:
 
 
 def _foreign(folder: Path, names: Iterable[str]) -> list[str]:
-    """Return what of a folder Kolinear has not written, or not as it is now, in words."""
+    """Return texts on the files of a folder that Kolinear did not write, or that were changed."""
     known, foreign = read_manifest(folder), []
     for name in names:
         if name not in known:
@@ -361,12 +364,12 @@ def _refuse(folder: Path, foreign: list[str], needed: str) -> None:
 
 
 def manifest_text(hashes: dict[str, list[str]]) -> str:
-    """Return a manifest with the SHA-256 that each file may have."""
+    """Return the text of a manifest with the SHA-256 values that each file may have."""
     return json.dumps({"written_by": WRITER, "files": hashes}, indent=1, ensure_ascii=True) + "\n"
 
 
 def read_manifest(folder: Path) -> dict[str, list[str]]:
-    """Return the hashes that files of a folder may have, by name; none without a list that can be read."""
+    """Return the hashes that files of a folder may have, by name; empty without a readable manifest."""
     try:
         handle = open_regular_file(folder / MANIFEST, os.O_RDONLY)
         with os.fdopen(handle, "rb") as file:
@@ -374,14 +377,14 @@ def read_manifest(folder: Path) -> dict[str, list[str]]:
         found: Any = json.loads(data)
         files = found["files"]
         if found["written_by"] == WRITER and all(isinstance(hashes, list) for hashes in files.values()):
-            return {**files, MANIFEST: [hashlib.sha256(data).hexdigest()]}  # it is ours if it can be read
+            return {**files, MANIFEST: [hashlib.sha256(data).hexdigest()]}  # a readable manifest is ours
     except (OSError, OutputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
     return {}
 
 
 def names_below(folder: Path) -> list[str]:
-    """Return the names of all that is in and below a folder but folders; a link to one is none.
+    """Return the names of all files in and below a folder; a link to a folder counts as a file.
 
     Raises:
         OSError: a folder cannot be read.
@@ -400,8 +403,8 @@ def names_below(folder: Path) -> list[str]:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file; of anything that is not a regular one, a text that is none."""
+    """Return the SHA-256 of a regular file; for anything else, a random text that is no hash."""
     if not stat.S_ISREG(path.lstat().st_mode):
-        return f"no file {os.urandom(16).hex()}"  # which no list can hold
+        return f"no file {os.urandom(16).hex()}"  # no manifest can contain this
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,10 +1,10 @@
-"""Numbers and names as plain text; JSON and TOML from files that are not trusted.
+"""Numbers and names as plain text, and JSON and TOML from untrusted files.
 
-Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, after spaces, too, and
-some begin a cell after each semicolon. In every such place of a text an apostrophe is put before it where CSV
-is written, and taken away where it is read; apostrophes that are there already get one more, so that texts
-come back as they were. Control characters (a tab or carriage return begins formulas, too) are no part of
-names, and written out in other texts.
+Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, even after spaces. Some also
+begin a new cell after each semicolon. Writing CSV inserts an apostrophe at every such position of a text, and
+reading removes it. Existing apostrophes get one more, so that texts are restored exactly. Control characters
+are not allowed in names, since a tab or carriage return also begins formulas. In other texts they are written
+as escapes.
 
 Source: OWASP, "CSV Injection"; Unicode Standard 15, property Default_Ignorable_Code_Point, and UAX 9 for
 bidirectional characters.
@@ -35,10 +35,10 @@ from pydantic import (
 
 from sfm.errors import SurveyFileError
 
-MAX_TOML_BYTES = 1_000_000  # such a file is written by people; anything larger is another file
-MAX_SAID = 200  # characters of the text of the parser
-MAX_KEY_PARTS = 16  # of a dotted key: the parser takes time and memory with their square; 3 are of use
-# Usual mistakes in TOML: what the line looks like, and what to write.
+MAX_TOML_BYTES = 1_000_000  # people write such files; a larger file is something else
+MAX_SAID = 200  # characters of the parser's message
+MAX_KEY_PARTS = 16  # of a dotted key: time and memory of the parser grow with their square; 3 are useful
+# Usual mistakes in TOML: (pattern of the line, advice).
 SLIPS = (
     (
         re.compile(r"=\s*(?:[-+]?\d+,\d+\s*(?:#.*)?$|\[[^\]\"']*\d,0\d)"),
@@ -56,82 +56,91 @@ _SECTION = re.compile(r"^\s*\[{1,2}\s*([^\[\]]+?)\s*\]{1,2}\s*(?:#.*)?$")
 _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_KEY_PARTS}}}")
 MAX_JSON_BYTES = 100_000_000  # names of four million points, for which reading takes 2 GB
-MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor and no scan is larger
-MAX_PIXEL_MM = 1e3  # of a pixel; COLMAP's models without a size have 1 mm
-MAX_NAME = 500  # characters of a name that is read from a file
+MAX_SIDE_PX = 1_000_000  # of a photograph; no sensor or scan is larger
+MAX_PIXEL_MM = 1e3  # of a pixel; it is 1 mm for COLMAP's models without a pixel size
+MAX_NAME = 500  # characters of a name in a file
 BLOCK = 10_000  # rows that are written at a time
-SHOWN = 40  # characters of what was found that a message repeats
-# Invisible characters, and those that change how the text around them is seen: categories Cc, Cf, Cs, Zl and
-# Zp, and all else that is ignored by default.
+SHOWN = 40  # characters of a found value that an error message repeats
+# Invisible characters, and characters that change the display of the text around them: categories Cc, Cf, Cs,
+# Zl
+# and Zp, and all others that are ignorable by default.
 _HIDDEN = re.compile(
     r"[\x00-\x1f\x7f-\x9f\xad\u034f\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u115f\u1160\u17b4\u17b5"
     r"\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f\u3164\ud800-\udfff\ufe00-\ufe0f\ufeff\uffa0"
     r"\ufff0-\ufffb\U000110bd\U000110cd\U00013430-\U0001343f\U0001bca0-\U0001bca3\U0001d173-\U0001d17a"
     r"\U000e0000-\U000e0fff]"
 )
-_START = r"(\A|;)"  # of a cell, also where a spreadsheet separates cells by semicolons
+_START = r"(\A|;)"  # of a cell; some spreadsheets separate cells by semicolons
 _NUMBER = r"\d+(?:\.\d*)?(?:[eE][-+]?\d+)? *(?:\Z|;)"
-_FORMULA = (
-    rf"('*\s*(?:[=+@\uff1d\uff0b\uff20]|[-\uff0d](?!{_NUMBER})))"  # also in the width of Chinese letters
-)
+_FORMULA = rf"('*\s*(?:[=+@\uff1d\uff0b\uff20]|[-\uff0d](?!{_NUMBER})))"  # including full-width characters
 _BARE, _QUOTED = re.compile(_START + _FORMULA), re.compile(_START + "'" + _FORMULA)
 
 
 def or_none(value: float) -> float | None:
-    """Return a number for JSON, which knows no NaN and no infinity."""
+    """Return a number for JSON, which has no NaN or infinity, or None."""
     return float(value) if math.isfinite(value) else None
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV (RFC 4180), each row as long as the header."""
+    """Return a table as CSV (RFC 4180).
+
+    Args:
+        header: names of the columns.
+        rows: rows of cells, each as long as the header.
+    """
     return "".join(csv_blocks(header, rows))
 
 
 def csv_blocks(header: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
-    """Yield a table as CSV, block by block of its rows, see `csv_text`.
+    """Yield a table as CSV in blocks of rows, see `csv_text`.
 
-    Column by column, since a survey of natural texture has millions of cells, most of them numbers.
+    Cells are converted column by column, since a survey of natural texture has millions of cells, most of
+    them numbers.
+
+    Args:
+        header: names of the columns.
+        rows: rows of cells, each as long as the header.
     """
     yield ",".join(map(_quoted, header)) + "\n"
     rows = iter(rows)
     while block := list(islice(rows, BLOCK)):
         columns = [_column(values) for values in zip(*block, strict=True)]
         if len(columns) == 1:
-            columns = [[cell or '""' for cell in columns[0]]]  # an empty line is no row
+            columns = [[cell or '""' for cell in columns[0]]]  # an empty line would be no row
         yield "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
 
 
 def as_cell(text: str) -> str:
-    """Return a text with an apostrophe before everything in it that a spreadsheet takes for a formula."""
+    """Return a text with an apostrophe before every part that a spreadsheet would take as a formula."""
     return _BARE.sub(r"\1'\2", text)
 
 
 def from_cell(cell: str) -> str:
-    """Return the text that `as_cell` has made this of."""
+    """Return the original text of a cell from `as_cell`."""
     return _QUOTED.sub(r"\1\2", cell)
 
 
 def is_plain(text: str) -> bool:
-    """Whether a name is fit for tables and terminals: no control, bidirectional or invisible characters.
+    """Return whether a name suits tables and terminals: no control, bidirectional or invisible characters.
 
-    On Linux the name of a file is any bytes; those that are no UTF-8 come as lone surrogates (PEP 383), which
-    are none of these either.
+    On Linux a file name may have any bytes. Bytes that are no UTF-8 appear as lone surrogates (PEP 383),
+    which are not plain either.
     """
     return _HIDDEN.search(text) is None
 
 
 def is_name(text: str) -> bool:
-    """Whether a text is fit for a name that is read from a file."""
+    """Return whether a text is acceptable as a name from a file."""
     return 0 < len(text) <= MAX_NAME and is_plain(text)
 
 
 def shown(text: str) -> str:
-    """Return the beginning of a text as a message can repeat it."""
+    """Return the beginning of a text, for an error message."""
     return as_plain(text[:SHOWN])
 
 
 def as_plain(text: str) -> str:
-    r"""Return a text with what is not plain in it written out, as \xff or \n."""
+    r"""Return a text with its characters that are not plain written as escapes, such as \xff or \n."""
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1].replace("\\udc", "\\x"), text)
 
 
@@ -144,12 +153,12 @@ def _column(values: Sequence[object]) -> list[str]:
 
 
 def _quoted(cell: str) -> str:
-    """Return a cell in quotes, if it needs them."""
+    """Return a cell, in quotes if it needs them."""
     return '"' + cell.replace('"', '""') + '"' if "," in cell or '"' in cell else cell
 
 
 def _cell(value: object) -> str:
-    """Return the text as it is in the table."""
+    """Return the cell of a value."""
     if isinstance(value, str):
         return _text_cell(value)
     if isinstance(value, float | np.floating):
@@ -159,7 +168,7 @@ def _cell(value: object) -> str:
 
 @lru_cache(maxsize=4096)
 def _text_cell(text: str) -> str:
-    """Return the cell of a text; most are names of photographs that are in thousands of rows."""
+    """Return the cell of a text; cached, since names of photographs are in thousands of rows."""
     return _quoted(as_cell(as_plain(text)))
 
 
@@ -176,7 +185,7 @@ Pixel = Annotated[FiniteFloat, Field(gt=0, le=MAX_PIXEL_MM, strict=True)]
 
 
 class Content(BaseModel):
-    """The part of a file that is read; the rest is ignored."""
+    """The declared part of a file; the rest is ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -185,15 +194,15 @@ ContentT = TypeVar("ContentT", bound=Content)
 
 
 def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
-    """Read a file.
+    """Read and check a JSON file.
 
     Args:
         path: the file.
-        content: what must be in it.
-        what: the file is, for the message.
+        content: declaration of its content.
+        what: name of such a file with its article, for error messages.
 
     Raises:
-        SurveyFileError: unreadable, too large, no JSON, or something in it is not what it must be.
+        SurveyFileError: the file is unreadable, too large or no JSON, or a value is not as declared.
     """
     try:
         size = path.stat().st_size
@@ -207,7 +216,7 @@ def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
 
 
 def _first_error(path: Path, error: ValidationError, what: str) -> str:
-    """Say the first thing that is wrong: where, what was found, what is needed."""
+    """Describe the first error: its position, the value found, and the value needed."""
     first = error.errors(include_url=False)[0]
     message = " ".join(first["msg"].split())
     if first["type"] == "json_invalid":
@@ -225,15 +234,15 @@ def _first_error(path: Path, error: ValidationError, what: str) -> str:
 
 
 def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple[str, dict[str, Any]]:
-    """Return the text of a file and its table.
+    """Return the text of a TOML file and its table.
 
     Args:
         path: the file.
-        what: it is, with its article, for messages.
-        repeated: sections of which a file may have several, each in [[ ]].
+        what: name of such a file with its article, for error messages.
+        repeated: sections that may occur several times, each in [[ ]].
 
     Raises:
-        SurveyFileError: unreadable, too large, or no TOML.
+        SurveyFileError: the file is unreadable, too large, or no TOML.
     """
     try:
         if path.exists() and not path.is_file():  # reading a pipe would never end
@@ -241,7 +250,7 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
         size = path.stat().st_size
         if size > MAX_TOML_BYTES:
             raise SurveyFileError(f"{path}: {size} bytes, {what} has at most {MAX_TOML_BYTES}")
-        text = path.read_text(encoding="utf-8-sig")  # editors of Windows put a byte order mark first
+        text = path.read_text(encoding="utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
         raise SurveyFileError(f"{path}: {what} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -262,7 +271,7 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
 
 
 def _slip(text: str, message: str, repeated: Collection[str]) -> str:
-    """Return where and what is wrong in words; the text of the parser where it is nothing usual."""
+    """Return position and advice for a usual mistake; for others the message of the parser."""
     found = re.search(r"\(at line (\d+), column \d+\)$", message)
     number = int(found[1]) if found else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
@@ -277,7 +286,7 @@ def _slip(text: str, message: str, repeated: Collection[str]) -> str:
 
 
 def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
-    """Return where a section that is there twice is first, and what to write."""
+    """Return where a duplicate section occurs first, with advice."""
     found = (_SECTION.match(one) for one in lines[: number - 1])
     first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
     shown = as_plain(name[:MAX_SAID])
@@ -287,7 +296,7 @@ def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]
 
 
 def _cut(message: str) -> str:
-    """Return the text of the parser without the middle of a long key; the place comes last."""
+    """Return the parser's message without the middle of a long key; its end states the position."""
     kept = (
         message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
     )

@@ -1,15 +1,17 @@
-"""The tables of a result, rigs included: columns stated once for writers and readers.
+"""The tables of a result: their columns, declared once for writers and readers.
 
-Degrees in files, lengths in the object unit of the survey, sigmas are standard deviations a posteriori (those
-of image points: as measured). Numbers are written with enough digits to give the same number back.
+Angles in files are in degrees, and lengths in the object unit of the survey. Sigmas are a posteriori standard
+deviations, except for image points, whose sigmas are as measured. Numbers are written with enough digits to
+reproduce them exactly.
 
-Rigs have two tables: where their cameras are mounted, and which photographs are of one moment.
+Rigs have two tables, for the mounts of their cameras and for the moments of photographs:
 
     mounts.csv     camera,rig,X,Y,Z,omega_deg,phi_deg,kappa_deg,sX,sY,sZ,somega_deg,sphi_deg,skappa_deg
     moments.csv    image,moment
 
 Mounts are in the image axes of the reference camera of the rig, whose row is 0. A standard deviation of 0
-means held fixed, an empty cell adjusted and not known. Photographs that moments.csv does not name are alone.
+means held fixed. An empty cell means adjusted, with an unknown standard deviation. Photographs that
+moments.csv does not list belong to no rig.
 
 Source: RFC 4180 for CSV; docs/reference/results.md describes each column.
 """
@@ -32,40 +34,40 @@ from sfm.solution import Solution
 MOUNTS, MOMENTS = "mounts.csv", "moments.csv"
 VALUES = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 SIGMAS = ("sX", "sY", "sZ", "somega_deg", "sphi_deg", "skappa_deg")
-IN_FILES = np.repeat([1.0, np.degrees(1.0)], 3)  # degrees there
+IN_FILES = np.repeat([1.0, np.degrees(1.0)], 3)  # factors from internal units to those of files
 KINDS = (
     "name",  # text
     "number",
-    "blank",  # numbers whose cells may be empty
-    "optional",  # the same, which may also be missing as a whole
-    "flag",  # 0 or 1, may be missing as a whole
-    "further",  # for people and other programs, not read again
+    "blank",  # numbers; cells may be empty
+    "optional",  # numbers; cells may be empty, and the whole group may be missing
+    "flag",  # 0 or 1; the whole group may be missing
+    "further",  # for people and other programs, not read back
 )
 
 
 class ResultTable:
-    """A table of a result: groups of columns that are known together or not at all."""
+    """A table of a result: groups of columns that are either all known or all unknown."""
 
     def __init__(self, stem: str, *groups: str) -> None:
-        """State the columns of a table.
+        """Declare the columns of a table.
 
         Args:
-            stem: of the name of its file.
-            groups: kind and names of each group, as "number: X Y Z"; of the optional ones the first must be
-                there for the others to be read.
+            stem: name of its file without the ending.
+            *groups: kind and names of each group, such as "number: X Y Z"; other optional groups are only
+                read if the first optional group is present.
         """
         self.file = f"{stem}.csv"
         self.groups = tuple(_group(text) for text in groups)
 
     def names_of(self, *kinds: str) -> tuple[str, ...]:
-        """Return the names of the columns of some kinds, of all without any."""
+        """Return the names of the columns of the given kinds; of all kinds if none is given."""
         return tuple(one for kind, names in self.groups if kind in (kinds or KINDS) for one in names)
 
     def read(self, folder: Path) -> CsvTable:
         """Read the names and numbers of the table of a result.
 
         Raises:
-            SurveyFileError: what is missing or wrong, with file and line number.
+            SurveyFileError: something is missing or wrong; the message has file and line number.
         """
         path, blank = folder / self.file, self.names_of("blank", "optional")
         optional = [names for kind, names in self.groups if kind == "optional"]
@@ -88,9 +90,9 @@ class ResultTable:
         """Write the table of a result.
 
         Args:
-            folder: of the result.
-            values: of each group an array (n, columns), a sequence for each column, or of a single column one
-                sequence; None leaves the group out.
+            folder: folder of the result.
+            *values: values of each group: an array, (n, columns), a sequence for each column, or one sequence
+                for a single column; None leaves the group out.
         """
         header: list[str] = []
         columns: list[Sequence[object]] = []
@@ -101,7 +103,7 @@ class ResultTable:
         self._save(folder, header, zip(*columns, strict=True))
 
     def write_rows(self, folder: Path, rows: Iterable[Sequence[object]]) -> None:
-        """Write the table of a result from rows of all columns."""
+        """Write the table of a result from rows with all columns."""
         self._save(folder, self.names_of(), rows)
 
     def _save(self, folder: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -130,7 +132,7 @@ EXTERIOR = "X0 Y0 Z0 omega phi kappa"
 
 
 def _covariance_table(stem: str, what: str, parts: str) -> ResultTable:
-    """Return a table of the upper triangles of covariance matrices."""
+    """Return a table for the upper triangles of covariance matrices."""
     names = parts.split()
     pairs = (f"{one}_{other}" for k, one in enumerate(names) for other in names[k:])
     return ResultTable(stem, f"name: {what}", f"further: {' '.join(pairs)}")
@@ -196,12 +198,12 @@ def write_solution(
     """Write the tables of points, photographs, cameras and image points.
 
     Args:
-        folder: of the result.
-        solution: with coordinates of all points and photographs.
-        seen: its k image points, those rejected included.
-        rejected: which of them were rejected, (k,).
-        further: further columns of points, photographs and image points, as a survey has them; without them
-            columns of which nothing is known are left out, too.
+        folder: folder of the result.
+        solution: has coordinates of all points and photographs.
+        seen: all k image points, including rejected ones.
+        rejected: which image points were rejected, (k,).
+        *further: further columns of points, photographs and image points, for a survey; without them, columns
+            without any known value are left out too.
     """
     network, estimate = solution.network, solution.estimate
     every = bool(further)
@@ -242,7 +244,7 @@ def write_solution(
 
 
 def _sigmas(covariance: FloatArray | None) -> FloatArray | None:
-    """Return the standard deviations of covariance matrices (n, d, d), NaN where not known, (n, d)."""
+    """Return the standard deviations of covariance matrices, (n, d, d), NaN if unknown, (n, d)."""
     if covariance is None:
         return None
     variance = np.einsum("nii->ni", covariance)
@@ -250,7 +252,7 @@ def _sigmas(covariance: FloatArray | None) -> FloatArray | None:
 
 
 def write_rigs(folder: Path, solution: Solution) -> None:
-    """Write the mounts and moments of a solution with rigs into a folder; nothing without."""
+    """Write the mounts and moments of a solution with rigs into a folder; nothing without rigs."""
     network, mounts = solution.network, solution.estimate.mounts
     if mounts is None or network.moment is None:
         return
@@ -283,12 +285,12 @@ def read_rigs(
     """Read mounts, and the moment of each photograph; None without rigs.
 
     Args:
-        folder: of the result.
-        cameras: names of its cameras, a of them.
-        network: its photographs and their cameras.
+        folder: folder of the result.
+        cameras: names of its cameras, (a,).
+        network: has its photographs and their cameras.
 
     Raises:
-        SurveyFileError: what is wrong, with file and line number.
+        SurveyFileError: something is wrong; the message has file and line number.
     """
     path = folder / MOUNTS
     if not path.is_file():
@@ -318,7 +320,7 @@ def read_moments(path: Path) -> Iterator[tuple[str, str]]:
     """Yield photographs and their moments from a table image,moment.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, or a photograph comes twice.
+        SurveyFileError: the table is unreadable, has wrong columns, or has a photograph twice.
     """
     table = read_table(path, ("image", "moment"), (), ignored=None)
     return zip(table.keys("image"), table.texts[1], strict=True)
@@ -345,14 +347,14 @@ def _read_moments(path: Path, cameras: Sequence[str], network: Network, mounts: 
 def refuse_moments(
     where: str, cameras: Sequence[str], network: Network, mounts: Mounts, moment: IntArray
 ) -> None:
-    """Raise SurveyFileError where photographs of one moment are not of different cameras of one rig.
+    """Raise SurveyFileError if photographs of one moment are not from different cameras of one rig.
 
     Args:
-        where: what they were read from.
-        cameras: their names.
-        network: the photographs.
-        mounts: of the cameras.
-        moment: of each photograph, (m,).
+        where: source of the moments, for the error message.
+        cameras: names of the cameras.
+        network: has the photographs.
+        mounts: mounts of the cameras.
+        moment: moment of each photograph, (m,).
     """
     first: dict[int, int] = {}
     taken: dict[tuple[int, int], int] = {}

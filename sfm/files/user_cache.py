@@ -1,6 +1,6 @@
-"""Folders that only this user writes, and temporary folders for what a run sets aside.
+"""Cache folders that only this user can write, and temporary folders of a run.
 
-They may be removed at any time.
+The cache folders may be removed at any time.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from sfm.files.open_folders import locked
 
 PREFIX = "kolinear-scratch-"
 LOCK = ".lock"
-KEPT_SECONDS = 90 * 86400  # entries not asked for are removed then
-WRITING_SECONDS = 86400  # what is half-written for longer was left by a killed run
+KEPT_SECONDS = 90 * 86400  # unused entries are removed after this time
+WRITING_SECONDS = 86400  # older half-written entries were left by a killed run
 
 
 def user_folder(name: str, what: str) -> Path:
-    """Return a folder in the user's cache folder (XDG_CACHE_HOME); it need not be there yet.
+    """Return a folder in the user's cache folder (XDG_CACHE_HOME), which may not exist yet.
 
     Args:
-        name: of the folder.
-        what: is kept in it, for the message.
+        name: name of the folder.
+        what: description of its content, for the error message.
 
     Raises:
-        OutputError: others can write into it.
+        OutputError: other users can write into it.
     """
     folder = user_cache_path("kolinear", appauthor=False).resolve() / name
-    with suppress(OSError):  # there is none
+    with suppress(OSError):  # it does not exist
         status = folder.lstat()
         if hasattr(os, "geteuid") and (
             not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077
@@ -49,16 +49,16 @@ def user_folder(name: str, what: str) -> Path:
 
 
 def make_user_folder(folder: Path) -> None:
-    """Make such a folder for the user alone, if it is not there.
+    """Make a folder that only the user can access, if it does not exist.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be made.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
 def remove_unused(folder: Path) -> None:
-    """Remove entries not asked for in months, and what a killed run left half-written."""
+    """Remove entries not used for months, and half-written entries of killed runs."""
     now = time.time()
     for path in folder.glob("*/*"):
         with suppress(OSError):
@@ -72,13 +72,15 @@ def remove_unused(folder: Path) -> None:
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make an empty folder of this user alone, which is gone afterwards; after a kill, when the next begins.
+    """Provide an empty folder that only this user can access, and remove it afterwards.
+
+    If the run is killed, the next scratch folder removes it.
 
     Yields:
         Path of the folder.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: the folder cannot be made.
     """
     remove_abandoned()
     folder = Path(tempfile.mkdtemp(prefix=PREFIX)).resolve()
@@ -91,15 +93,15 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def remove_abandoned() -> None:
-    """Remove this user's scratch folders whose run has ended: their lock is free."""
+    """Remove this user's scratch folders whose run has ended, as their free lock shows."""
     for folder in Path(tempfile.gettempdir()).resolve().glob(f"{PREFIX}*"):
-        with suppress(OSError, OutputError):  # another user's, or at work
+        with suppress(OSError, OutputError):  # of another user, or in use
             status = folder.lstat()
             if not stat.S_ISDIR(status.st_mode) or (hasattr(os, "geteuid") and status.st_uid != os.geteuid()):
                 continue
             if (folder / LOCK).exists():
                 with locked(folder / LOCK):
                     shutil.rmtree(folder / "files", ignore_errors=True)
-            elif time.time() - status.st_mtime < WRITING_SECONDS:  # a run is just making it
+            elif time.time() - status.st_mtime < WRITING_SECONDS:  # a run may just be making it
                 continue
             shutil.rmtree(folder, ignore_errors=True)

@@ -1,7 +1,7 @@
-"""Files and folders that appear whole or not at all, and never by way of a link that somebody has laid there.
+"""Files and folders that appear completely or not at all, and are never written through a link.
 
-New files are made under unpredictable names and moved to their place by one rename, which
-follows no link. Existing files are replaced only where it is known to be written by the program.
+New files are made under unpredictable names and moved to their final path by one rename, which follows no
+link. An existing file is only replaced if the program is known to have written it.
 """
 
 from __future__ import annotations
@@ -33,54 +33,55 @@ from sfm.files.open_folders import (
     sha256_of,
 )
 
-SYNCED = 8  # files that are brought to the disk at a time
-ROOM_BYTES = 1 << 20  # what is written on trial to learn why a library could not write
-RANDOM = r"\.[a-z0-9_]{8}\."  # in the name of what is being written
+SYNCED = 8  # files that are flushed to the disk at a time
+ROOM_BYTES = 1 << 20  # size of a trial file, which shows why a library could not write
+RANDOM = r"\.[a-z0-9_]{8}\."  # in the names of unfinished files and folders
 
 
 @contextmanager
 def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Iterator[Path]:
-    """Give a folder to write into, which takes the place of `out` when everything is in it.
+    """Provide a folder to write into, which replaces `out` when it is complete.
 
     Args:
-        out: the folder; absent, empty, or an unchanged earlier one, which is kept until the new one is there.
-        what: what is written, for the message, if the path alone does not show it.
-        replaceable: whether it gets a list of its files, by which a later one may take its place.
+        out: final folder; it must be absent, empty, or an unchanged earlier folder, which is kept until the
+            new one is complete.
+        what: description of the content for error messages, if the path alone does not show it.
+        replaceable: whether it gets a list of its files, which lets a later folder replace it.
 
     Yields:
         An empty folder beside `out`.
 
     Raises:
-        OutputError: the folder cannot be written; nothing is left of it then.
+        OutputError: the folder cannot be written; nothing of it remains.
     """
     refuse_foreign_folder(out)
     with _new_folder(out, what) as part, _naming_disk_errors(out, part.path, what):
-        part.path.chmod(0o755)  # it was made for the user alone
+        part.path.chmod(0o755)  # it was made readable for this user only
         yield part.path
         if replaceable:
             write_manifest(part.path, {n: [sha256_of(part.path / n)] for n in names_below(part.path)})
         _sync_all(list(part.path.rglob("*")))
         _sync(part.path)
-        refuse_foreign_folder(out)  # as it is now
+        refuse_foreign_folder(out)  # it may have changed since the first check
         _put_in_place(part, out)
 
 
 @contextmanager
 def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterator[Path]:
-    """Give a file to write, which is at `path` when it is finished.
+    """Provide a file to write, which is moved to `path` when it is finished.
 
-    It lies in a separate folder, so that what a library leaves beside its file goes with it.
+    It is in a separate folder, so that other files that a library leaves beside it are removed.
 
     Args:
-        path: the file.
-        what: what is written, for the message, if the path alone does not show it.
-        replaces: whether the caller knows an earlier file to be written by the program, which is replaced.
+        path: final path of the file.
+        what: description of the content for error messages, if the path alone does not show it.
+        replaces: whether an earlier file is replaced, which the caller knows to be written by the program.
 
     Yields:
         Path of the file to write.
 
     Raises:
-        OutputError: the file cannot be written, or another is there; nothing is left of it then.
+        OutputError: the file cannot be written, or another file exists; nothing of it remains.
     """
     if not replaces:
         refuse_existing(path)
@@ -88,7 +89,7 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
         yield part.path / path.name
         _sync(part.path / path.name)
         if not replaces:
-            refuse_existing(path)  # as it is now
+            refuse_existing(path)  # it may have appeared since the first check
         part.refuse_exchanged()
         move(part.path / path.name, part.handle, path, part.beside)
         _sync(path.parent)
@@ -96,17 +97,17 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
 
 @contextmanager
 def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
-    """Give a folder to write files into, which then go into `folder`, beside files of other names.
+    """Provide a folder to write files into, which are then moved into `folder`, beside files of other names.
 
     Args:
-        folder: it gets a list of them, by which later ones may take their place.
-        what: what is written, for the message, if the path alone does not show it.
+        folder: final folder; it gets a list of these files, which lets later files replace them.
+        what: description of the content for error messages, if the path alone does not show it.
 
     Yields:
-        An empty folder; what is made in it is files.
+        An empty folder for files only.
 
     Raises:
-        OutputError: they cannot be written, or files of these names are there that Kolinear has not written.
+        OutputError: the files cannot be written, or files of these names exist that Kolinear did not write.
     """
     with _new_folder(folder / MANIFEST, what) as part, _naming_disk_errors(folder, part.path, what):
         yield part.path
@@ -116,7 +117,8 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
         hashes.pop(MANIFEST, None)
         _sync_all([part.path / name for name in names])
         for name in names:
-            # Listed before they are there, beside those that are: whatever ends the run, they are known.
+            # New and existing hashes are listed before the files are moved, so both are known if the run
+            # ends.
             there = [sha256_of(folder / name)] if name in hashes and (folder / name).exists() else []
             hashes[name] = [*there, sha256_of(part.path / name)]
         write_manifest(folder, hashes)
@@ -127,16 +129,16 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise OutputError if something is where a new file is to be written."""
+    """Raise OutputError if the path of a new file exists already."""
     refuse_links(path)
     if os.path.lexists(path):
         raise OutputError(f"{path}: is there already and is left alone, a new name is needed")
 
 
 def refuse_unwritable(path: Path) -> None:
-    """Raise OutputError unless something new can be written to a place, before it takes time to make it.
+    """Raise OutputError unless a new file or folder can be written to a path, before any work for it.
 
-    A folder is made on trial in the nearest one above it that is there, and goes again.
+    As a trial, a temporary folder is made in the nearest existing folder above it.
     """
     refuse_existing(path)
     above = next(part for part in (Path.cwd() / path).parents if os.path.lexists(part))
@@ -145,15 +147,18 @@ def refuse_unwritable(path: Path) -> None:
 
 
 def write_manifest(folder: Path, hashes: dict[str, list[str]]) -> None:
-    """List files of a folder with the SHA-256 that each may have."""
+    """Write the list of a folder's files with the SHA-256 values that each may have."""
     with whole_file(folder / MANIFEST, replaces=True) as part:
         part.write_text(manifest_text(hashes), encoding="utf-8")
 
 
 def remove_leftovers(out: Path) -> None:
-    """Remove what killed runs have left beside a place, and restore what they had moved away.
+    """Remove leftovers of killed runs beside a path, and restore a folder that they had moved away.
 
-    Only for a caller whose lock shows that no one is writing there.
+    The caller must have a lock, which shows that no other run is writing there.
+
+    Args:
+        out: path of a file or folder.
     """
     ours = re.compile(rf"\.{re.escape(out.name)}{RANDOM}(old|part)")
     if not out.parent.is_dir():
@@ -169,7 +174,7 @@ def remove_leftovers(out: Path) -> None:
 
 
 def refuse_full(folder: Path) -> None:
-    """Raise the OSError that a megabyte more in a folder meets, if any: full disk, limit of size or quota.
+    """Raise the OSError of writing one more megabyte into a folder, if any: full disk, size limit or quota.
 
     Libraries report that they could not write, but not why.
     """
@@ -181,21 +186,21 @@ def refuse_full(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class _Part:
-    """A new folder under a name that cannot be known before, and the folder it lies in."""
+    """A new folder with an unpredictable name, and the folder that contains it."""
 
     path: Path
-    handle: int | None  # of it; None where the system has none
-    beside: int | None  # of the folder it lies in
+    handle: int | None  # handle of this folder; None on systems without such handles
+    beside: int | None  # handle of the containing folder
 
     def refuse_exchanged(self) -> None:
-        """Raise OutputError if another folder is now where libraries have written by its path."""
+        """Raise OutputError if another folder has taken the path, through which libraries wrote."""
         if self.handle is not None and not os.path.samestat(os.fstat(self.handle), os.stat(self.path)):
             raise OutputError(f"{self.path}: was exchanged while it was written")
 
 
 @contextmanager
 def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
-    """Make an empty folder beside a place that is to be written, and what is above it; it goes afterwards."""
+    """Make a temporary empty folder beside the path to write, with all folders above it."""
     refuse_links(out)
     path = out.parent / f".{out.name}.{secrets.token_hex(4)}.{ending}"
     with ExitStack() as stack:
@@ -210,7 +215,7 @@ def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
 
 @contextmanager
 def _naming_disk_errors(out: Path, part: Path, what: str) -> Iterator[None]:
-    """Let errors speak of `out`, not of a part of it that will not be found."""
+    """Let error messages name `out` instead of its temporary part."""
     try:
         yield
     except OSError as error:
@@ -226,9 +231,9 @@ def _subject(what: str) -> str:
 
 
 def _sync(path: Path) -> None:
-    """Have a file on the disk before it has its name, so that a power cut leaves none empty."""
+    """Flush a file to the disk before it gets its name, so that a power cut leaves no empty file."""
     if path.is_dir() and os.name == "nt":
-        return  # Windows knows no handles of folders
+        return  # Windows has no handles of folders
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
         os.fsync(handle)
@@ -237,14 +242,14 @@ def _sync(path: Path) -> None:
 
 
 def _sync_all(paths: Sequence[Path]) -> None:
-    """Have files on the disk, which takes several at a time."""
+    """Flush files to the disk, several at a time."""
     with ThreadPoolExecutor(SYNCED) as pool:
         for _ in pool.map(_sync, paths):
             pass
 
 
 def _put_in_place(part: _Part, out: Path) -> None:
-    """Rename the finished folder to its place; an earlier one is kept until the new one is there."""
+    """Rename the finished folder to its final path; an earlier folder is kept until then."""
     part.refuse_exchanged()
     if not out.exists():
         move(part.path, part.beside, out, part.beside)

@@ -1,1 +1,1 @@
-"""Photographs as untrusted files: `reading` (pixels), `exif` (camera, time, satellite position)."""
+"""Photographs as untrusted files: `reading` (pixels) and `exif` (camera, time, satellite position)."""

@@ -1,4 +1,8 @@
-"""EXIF data of a photograph, checked before use: camera, sensor, time and satellite position."""
+"""EXIF data of a photograph, checked before use: camera, sensor, time and satellite position.
+
+Files that are too large, truncated, or of formats that must be converted first are refused before any pixels
+are decoded.
+"""
 
 from __future__ import annotations
 
@@ -21,45 +25,45 @@ from PIL import ExifTags, Image
 from sfm.conventions import FloatArray
 from sfm.errors import PhotographError
 
-# warnings.catch_warnings is not safe in threads, and photographs are read in several.
+# warnings.catch_warnings is not thread-safe, and several threads read photographs.
 _PILLOW = Lock()
-FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM", "WEBP")  # by the names of Pillow, which finds none unasked
+FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM", "WEBP")  # Pillow's names; it tries no other formats
 # WGS 84: semi-major axis, m, and flattening (NIMA TR8350.2, 2000).
 SEMI_MAJOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
 ORIGIN_DECIMALS = 3  # of the degrees of an origin: 0.001 deg are 111 m
-MAX_HEIGHT_M = 100_000.0  # beyond it a number is no height of a camera
+MAX_HEIGHT_M = 100_000.0  # a larger number is no height of a camera
 BELOW = (1, 3)  # GPSAltitudeRef: below sea level, below the reference of EXIF 3.0
-MIN_SIGMA_M = 0.001  # no receiver on a camera is better, and smaller numbers are in another unit or unknown
+MIN_SIGMA_M = 0.001  # no receiver on a camera is better; smaller numbers have another unit or mean unknown
 VOID = "V"  # GPSStatus of a receiver without a fix
-# Of a telephone under open sky, where it states none, to the east, to the north and of the height, m.
+# Default standard deviations of a telephone under open sky, to the east, to the north and of the height, m.
 # Source: van Diggelen and Enge (2015), ION GNSS+, for the plane; heights are twice as uncertain.
 USUAL_SIGMAS_M = (5.0, 5.0, 10.0)
-# Standard deviations that receivers for real-time kinematics state in XMP data, m.
+# Standard deviations of receivers for real-time kinematics in XMP data, m.
 STATED_IN_XMP = re.compile(rb"RtkStd(Lon|Lat|Hgt)\s*(?:=\s*[\"']|>)\s*([0-9.eE+-]{1,20})")
 
 
 @dataclass(frozen=True)
 class SatellitePosition:
-    """Where a receiver was when a photograph was taken."""
+    """Position of the receiver when a photograph was taken."""
 
     latitude_deg: float
     """north of the equator, WGS 84"""
     longitude_deg: float
     """east of Greenwich, -180 to 180"""
     height_m: float
-    """as stated, above the ellipsoid or sea level; NaN where it is not stated"""
+    """as stated, above the ellipsoid or sea level; NaN if not stated"""
     sigma_m: tuple[float, float, float]
-    """standard deviations to the east, to the north and of the height that the receiver states, else NaN"""
+    """stated standard deviations to the east, to the north and of the height, else NaN"""
 
 
-# Beyond these EXIF data describe no camera: principal distance and pixel in mm.
+# Limits of principal distance and pixel, mm; EXIF data beyond them describe no camera.
 FOCAL_MM = (0.1, 1e5)
 PIXEL_MM = (1e-5, 1.0)
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """Size and camera as the file of a photograph states them; None where it does not."""
+    """Size and camera data in the file of a photograph; None if it does not state a value."""
 
     size_px: tuple[int, int]
     """width and height as stored, px"""
@@ -72,7 +76,7 @@ class Metadata:
     focal_35mm: float | None
     """focal length of the same angle of view on 36 mm x 24 mm film, mm"""
     pixel_mm: tuple[float, float] | None
-    """width and height of a pixel, from the resolution of the focal plane or the 35 mm equivalent, mm"""
+    """width and height of a pixel from the focal plane resolution or the 35 mm equivalent, mm"""
     orientation: int
     """EXIF orientation, 1 = as stored; never applied to the pixels"""
     serial: str | None = None
@@ -80,11 +84,11 @@ class Metadata:
     lens: str | None = None
     """model of the lens"""
     taken_px: tuple[int, int] | None = None
-    """width and height as the camera states them, px"""
+    """original width and height that the camera states, px"""
     taken: datetime | None = None
-    """when, by the clock of the camera"""
+    """time of exposure by the clock of the camera"""
     position: SatellitePosition | None = None
-    """where, by satellite navigation"""
+    """position by satellite navigation"""
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -94,17 +98,17 @@ def read_metadata(path: str | Path) -> Metadata:
         path: a photograph.
 
     Returns:
-        The metadata; a file without EXIF data gives its size only.
+        The metadata; a file without EXIF data only gives its size.
 
     Raises:
-        PhotographError: no such file or no photograph.
+        PhotographError: the file does not exist or is not a photograph.
     """
     path = Path(path)
     with opened_header(path, path) as image:
         size = image.size
         try:
             exif = image.getexif()
-        except Exception:  # damaged EXIF data, on which Pillow fails in many ways, are as good as none
+        except Exception:  # Pillow fails in many ways on damaged EXIF data, which are ignored
             exif = Image.Exif()
         camera, gps = _directory(exif, ExifTags.IFD.Exif), _directory(exif, ExifTags.IFD.GPSInfo)
         xmp = image.info.get("xmp", b"")
@@ -128,7 +132,7 @@ def read_metadata(path: str | Path) -> Metadata:
 
 
 def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:
-    """Return a directory of EXIF data by tag, empty where it is damaged."""
+    """Return a directory of EXIF data by tag, empty if it is damaged."""
     try:
         return exif.get_ifd(which)
     except Exception:  # see `read_metadata`
@@ -136,10 +140,10 @@ def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:
 
 
 def _moment(camera: Any) -> datetime | None:
-    """Return when a photograph was taken, with the fraction of the second where it is stated."""
+    """Return the time of exposure, with the fraction of the second if it is stated."""
     text = _text(camera.get(ExifTags.Base.DateTimeOriginal))
     try:
-        moment = datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S")  # cameras know no zone
+        moment = datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S")  # cameras state no time zone
     except ValueError:
         return None
     digits = _text(camera.get(ExifTags.Base.SubsecTimeOriginal)) or ""
@@ -163,7 +167,7 @@ def _pixel_from_exif(
     full = _positive(camera.get(ExifTags.Base.ExifImageWidth))
     width = height = None
     if unit_mm and across and down and full:
-        scale = full / size[0]  # the resolution is that of the picture as taken
+        scale = full / size[0]  # the resolution refers to the original picture
         width, height = unit_mm / across * scale, unit_mm / down * scale
     elif focal and equivalent:
         diagonal_mm = math.hypot(36.0, 24.0) * focal / equivalent
@@ -194,7 +198,7 @@ def _text(value: Any) -> str | None:
 
 @dataclass(frozen=True)
 class LocalSystem:
-    """Axes to the east, the north and upwards (WGS 84) at a place of height 0."""
+    """Axes to the east, to the north and up (WGS 84) at an origin of height 0."""
 
     latitude_deg: float
     longitude_deg: float
@@ -202,12 +206,12 @@ class LocalSystem:
     def coordinates(
         self, latitude_deg: npt.ArrayLike, longitude_deg: npt.ArrayLike, height_m: npt.ArrayLike
     ) -> FloatArray:
-        """Return east, north and up of places, m, (k, 3).
+        """Return east, north and up of positions, m, (k, 3).
 
         Args:
-            latitude_deg: (k,).
-            longitude_deg: (k,).
-            height_m: above the ellipsoid, (k,).
+            latitude_deg: latitudes, deg, (k,).
+            longitude_deg: longitudes, deg, (k,).
+            height_m: heights above the ellipsoid, m, (k,).
         """
         origin = _geocentric(np.array([self.latitude_deg]), np.array([self.longitude_deg]), np.zeros(1))
         places = _geocentric(
@@ -225,21 +229,21 @@ class LocalSystem:
 
 
 def local_coordinates(positions: Sequence[SatellitePosition]) -> tuple[LocalSystem, FloatArray]:
-    """Return a local system about positions and their coordinates in it.
+    """Return a local system at the middle of positions, and their coordinates in it.
 
-    The origin is the median position with rounded degrees, at height 0, so that upward coordinates are the
-    stated heights but for the curvature of the Earth.
+    The origin is the median position with rounded degrees, at height 0. Except for the curvature of the
+    Earth, upward coordinates are therefore the stated heights.
 
     Args:
-        positions: at least one.
+        positions: at least one position.
 
     Returns:
-        The system, and east, north and up, m, (k, 3); up is NaN where no height is stated.
+        The system, and east, north and up, m, (k, 3); up is NaN if no height is stated.
     """
     latitude = np.array([one.latitude_deg for one in positions])
     longitude = np.array([one.longitude_deg for one in positions])
     height = np.array([one.height_m for one in positions])
-    x, y, z = np.median(_normals(latitude, longitude), axis=0)  # knows of no date line
+    x, y, z = np.median(_normals(latitude, longitude), axis=0)  # not affected by the date line
     origin = LocalSystem(
         round(math.degrees(math.atan2(z, math.hypot(x, y))), ORIGIN_DECIMALS) + 0.0,  # no -0
         round(math.degrees(math.atan2(y, x)), ORIGIN_DECIMALS) + 0.0,
@@ -252,14 +256,14 @@ def local_coordinates(positions: Sequence[SatellitePosition]) -> tuple[LocalSyst
 
 
 def satellite_position(gps: Mapping[int, Any], xmp: bytes = b"") -> SatellitePosition | None:
-    """Return the position that the data of a photograph state; None where they state none.
+    """Return the position in the data of a photograph, or None.
 
-    Latitude and longitude of 0, which writers use for unknown, numbers out of range, hemispheres that are not
-    named and receivers without a fix are no position.
+    These are no positions: latitude and longitude 0, which writers use for unknown; numbers out of range;
+    missing hemispheres; and receivers without a fix.
 
     Args:
-        gps: the GPS data of EXIF, by tag.
-        xmp: the XMP data, with the standard deviations of real-time kinematics, if they are stated.
+        gps: GPS data of EXIF, by tag.
+        xmp: XMP data, which may state standard deviations of real-time kinematics.
 
     Source: CIPA DC-008, Exif 2.32 and 3.0, GPS attribute information.
     """
@@ -297,7 +301,7 @@ def _normals(latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
 
 
 def _degrees(value: Any, hemisphere: Any, letters: str, most: float) -> float:
-    """Return degrees from degrees, minutes and seconds, NaN where they are none within +-most."""
+    """Return degrees from degrees, minutes and seconds, NaN if they are invalid or beyond +-most."""
     parts = value if isinstance(value, tuple | list) else (value,)
     numbers = [_number(one) for one in parts]
     if not 1 <= len(numbers) <= 3 or not all(one >= 0 for one in numbers):
@@ -308,7 +312,7 @@ def _degrees(value: Any, hemisphere: Any, letters: str, most: float) -> float:
 
 
 def _letter(value: Any) -> str:
-    """Return the first letter of a text of EXIF, in capitals; some writers store bytes."""
+    """Return the first letter of an EXIF text as a capital; some writers store bytes."""
     text = value.decode("ascii", "replace") if isinstance(value, bytes) else str(value or "")
     return text[:1].upper()
 
@@ -323,27 +327,27 @@ def _number(value: Any) -> float:
 
 
 def _sigma(value: float) -> float:
-    """Return a standard deviation, NaN where it is none; writers use 0 for unknown."""
+    """Return a standard deviation, NaN if it is too small; writers use 0 for unknown."""
     return value if value >= MIN_SIGMA_M else math.nan
 
 
 Image.init()
-# Endings of what cameras and telephones write and is not read, and what makes photographs of it.
+# Endings of files of cameras and telephones that must be converted first.
 PHONE = (".heic", ".heif", ".hif", ".avif")
 RAW = (".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
        ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f")  # fmt: skip
 MAX_FILE_BYTES = 2**30
 MAX_PIXELS = 250_000_000  # the largest aerial scans; digital backs have 151 million
-# A larger picture in fewer bytes is a decompression bomb; one sole grey value is 250 px per byte in a JPEG.
+# A larger picture in fewer bytes is a decompression bomb; a JPEG of a single grey value has 250 px per byte.
 BOMB_PIXELS, BOMB_PX_PER_BYTE = 16_000_000, 500
-MAX_SCANNED_PIXELS = 2_500_000_000  # pixels times scans of a progressive JPEG, some 20 s of decoding
+MAX_SCANNED_PIXELS = 2_500_000_000  # pixels times scans of a progressive JPEG: about 20 s of decoding
 
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of a photograph's file.
 
     Raises:
-        PhotographError: no such file, an empty one, or more than a photograph can have.
+        PhotographError: the file does not exist, is empty, must be converted first, or is too large.
     """
     _refuse_unconverted(path)
     try:
@@ -362,7 +366,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def conversion_of(path: Path) -> str:
-    """Return what a file is that must be converted first, by its ending, and how; empty for all others."""
+    """Return, by its ending, what kind of file must be converted first, and how; empty for other files."""
     if path.suffix.lower() in PHONE:
         return (
             "a HEIF file, which is not read; convert all at full size and quality, such as with "
@@ -377,17 +381,21 @@ def conversion_of(path: Path) -> str:
 
 
 def _refuse_unconverted(path: Path) -> None:
-    """Refuse files that must be converted first; some raw files would be read as their small preview."""
+    """Refuse files that must be converted first; of some raw files the small preview would be read."""
     if words := conversion_of(path):
         raise PhotographError(f"{path.name}: {words}")
 
 
 @contextmanager
 def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image]:
-    """Open the header of a photograph; nothing is decoded.
+    """Open the header of a photograph without decoding pixels.
+
+    Args:
+        path: path of the photograph, for its ending and error messages.
+        source: the same path, or the content of the file.
 
     Raises:
-        PhotographError: no such file, no photograph of a known format, or one that claims to be too large.
+        PhotographError: the file does not exist, has no known format, or claims to be too large.
     """
     _refuse_unconverted(path)
     with _PILLOW, warnings.catch_warnings(action="ignore"):
@@ -397,7 +405,7 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
             image = _unbounded_open(source)
         except PhotographError:
             raise
-        except Exception as error:  # Pillow stumbles over damaged headers in many ways
+        except Exception as error:  # Pillow fails on damaged headers in many ways
             raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
         with image:
             if image.width * image.height > MAX_PIXELS:
@@ -409,7 +417,7 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
 
 
 def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
-    """Open a header without the limit of Pillow, which is below that of aerial scans."""
+    """Open a header without Pillow's limit, which is below the size of aerial scans."""
     limit = Image.MAX_IMAGE_PIXELS
     Image.MAX_IMAGE_PIXELS = None
     try:
@@ -419,10 +427,15 @@ def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
 
 
 def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
-    """Refuse a file that claims far more pixels than its bytes can hold, or that takes too long to decode.
+    """Refuse a file that claims far more pixels than its bytes can contain, or that takes too long to decode.
+
+    Args:
+        path: path of the photograph, for error messages.
+        size: width and height in its header, px.
+        data: content of the file.
 
     Raises:
-        PhotographError: more pixels than the bytes can hold, or too many scans.
+        PhotographError: more pixels than the bytes can contain, or too many scans.
     """
     pixels = size[0] * size[1]
     if pixels > BOMB_PIXELS and pixels > BOMB_PX_PER_BYTE * len(data):
@@ -437,6 +450,10 @@ def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
 
 def refuse_truncated(path: Path, data: bytes) -> None:
     """Refuse JPEG and PNG files whose end is missing; OpenCV would return them half grey.
+
+    Args:
+        path: path of the photograph, for the error message.
+        data: content of the file.
 
     Raises:
         PhotographError: the end is missing.
@@ -459,7 +476,7 @@ def refuse_truncated(path: Path, data: bytes) -> None:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Whether the chunks of a PNG lie within the file; OpenCV takes memory for what they claim."""
+    """Return whether the chunks of a PNG are within the file; OpenCV allocates memory for their claims."""
     at = 8
     while at + 12 <= len(data):
         kind = data[at + 4 : at + 8]

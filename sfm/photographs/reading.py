@@ -1,4 +1,4 @@
-"""Reading the pixels of photographs."""
+"""Reading of the pixels of photographs."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from sfm.conventions import AnyArray
 from sfm.errors import PhotographError
 from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 
-# PhotographError states what is wrong with a file; OpenCV's warnings on private TIFF tags do not help.
+# PhotographError states the fault of a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 CHANNELS = ("luminance", "red", "green", "blue")
-# IEC 61966-2-1 (sRGB): linear below this signal, a power above it.
+# IEC 61966-2-1 (sRGB): linear below this signal, a power law above it.
 SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
 
 
 @checked_arguments()
 def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray:
-    """Read one photograph as stored: never turned by its EXIF orientation, all bits kept.
+    """Read one photograph as stored, with all bits; it is never rotated by its EXIF orientation.
 
     Args:
         path: JPEG, TIFF, PNG or another format that OpenCV reads.
-        channel: luminance (Rec. 601), red, green or blue; grey photographs are the same in all.
+        channel: luminance (Rec. 601), red, green or blue; all are the same for grey photographs.
 
     Returns:
-        Intensities, shape (H, W), uint8 or uint16.
+        Intensities, (H, W), uint8 or uint16.
 
     Raises:
-        PhotographError: no such file, no photograph, truncated, or neither 8 nor 16 bit.
+        PhotographError: the file does not exist, is not a photograph, is truncated, or has neither 8 nor 16
+            bit.
 
     Example:
         >>> import tempfile
@@ -73,10 +74,10 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
 
 
 class PhotographFiles(Sequence[AnyArray]):
-    """Photographs that are read from their files whenever one is asked for, and not kept."""
+    """Photographs that are read from their files on every access, and not kept in memory."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read nothing yet of these files."""
+        """Take the paths of the files, without reading them."""
         self._paths = tuple(paths)
 
     def __len__(self) -> int:
@@ -87,18 +88,18 @@ class PhotographFiles(Sequence[AnyArray]):
     @overload
     def __getitem__(self, k: slice) -> PhotographFiles: ...
     def __getitem__(self, k: int | slice) -> AnyArray | PhotographFiles:
-        """Return one photograph, (H, W), see `read_photograph`; of several, their files."""
+        """Return one photograph, (H, W), see `read_photograph`; a slice gives `PhotographFiles`."""
         return PhotographFiles(self._paths[k]) if isinstance(k, slice) else read_photograph(self._paths[k])
 
 
 def take_back_srgb(photograph: AnyArray) -> AnyArray:
-    """Return the light behind the intensities of a photograph with the tone curve of sRGB, as uint16.
+    """Return the linear light of a photograph with the tone curve of sRGB, as uint16.
 
-    A tone curve moves the place at which an edge is half bright, inwards around dark targets. Centres of
-    circles stay, corners of tags do not.
+    A tone curve moves the half-bright position of an edge, inwards around dark targets. Centres of circles
+    are not affected, but corners of tags are.
 
     Args:
-        photograph: intensities, shape (H, W), uint8 or uint16.
+        photograph: intensities, (H, W), uint8 or uint16.
 
     Source: IEC 61966-2-1.
     """

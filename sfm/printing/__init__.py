@@ -1,1 +1,1 @@
-"""Sheets of coded targets to be printed in true scale, see `sheet`."""
+"""Sheets of coded targets for printing at true scale, see `sheet`."""

@@ -1,4 +1,4 @@
-"""Sheet: coded targets laid out on pages and written as vector graphics in true scale."""
+"""Sheets of coded targets, laid out on pages and written as vector graphics at true scale."""
 
 from __future__ import annotations
 
@@ -39,19 +39,20 @@ PAGES_MM = {
 }
 MM_PER_INCH = 25.4
 POINTS_PER_INCH = 72.0
-MARGIN_MM = 10.0  # what desktop printers leave white
-RULER_MM = 100.0  # length of the ruler, read on the print to find its scale
-FOOT_MM = 16.0  # room for the ruler and the text beside it
+MARGIN_MM = 10.0  # not printed by desktop printers
+RULER_MM = 100.0  # length of the ruler, which shows the scale of the print
+FOOT_MM = 16.0  # room for the ruler and its text
 LABEL_MM = 4.0  # room for the id below a target
-# Radius that stays clear around a target, in radii of its ring, so that neighbours are not taken for code.
+# Clear radius around a target, in radii of its ring, so that neighbours are not read as code.
 CLEAR = 1.35
-# Printers of 600 dots per inch put 24 dots across the smallest target, 6 across a module of the smallest tag,
-# and across the narrowest ring of the smallest concentric tag.
+# Printers of 600 dots per inch print 24 dots across the smallest target, and 6 across a module of the
+# smallest tag
+# or the narrowest ring of the smallest concentric tag.
 MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
 DEFAULT_TARGETS = 100
-MAX_LETTERS = 40  # of the name of a code table, so that the line with it stays on the page
-MAX_SHEET_BYTES = 100_000_000  # of 10,000 targets
-CHECK = "print without scaling and check"  # stands on every page; a file with it is an earlier sheet
+MAX_LETTERS = 40  # of the name of a code table, so that its line fits on the page
+MAX_SHEET_BYTES = 100_000_000  # for 10,000 targets
+CHECK = "print without scaling and check"  # on every page; a file with this text is an earlier sheet
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,8 @@ class Page:
     """One page of targets; plane coordinates in mm from the lower left corner of the page, y up."""
 
     number: IntArray  # code numbers on the page, (k,)
-    centre: FloatArray  # their centres, mm, (k, 2)
-    marks: Marks  # dots, arcs and rectangles, value 1 = printed, 0 = left as the background
+    centre: FloatArray  # centres of the targets, mm, (k, 2)
+    marks: Marks  # dots, arcs and rectangles, value 1 = printed, 0 = background
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,12 @@ class Sheet:
     """Coded targets on pages of one size."""
 
     family: str
-    diameter_mm: float  # of the dot, or of all of a concentric tag; side of the square of a tag
-    ring_mm: float  # outer diameter of the ring; side of the square of a tag
+    diameter_mm: float  # of the dot, or of a whole concentric tag; side of a square tag
+    ring_mm: float  # outer diameter of the ring; side of a square tag
     size_mm: tuple[float, float]  # width and height of a page
     pages: tuple[Page, ...]
     dark: bool  # dark on white; else white on dark squares
-    whole: str = ""  # word for what of a target has the diameter, where that is all of it
+    whole: str = ""  # word for the part with the diameter, if that is the whole target
 
 
 def lay_out_sheet(
@@ -90,18 +91,19 @@ def lay_out_sheet(
     Args:
         family: arcs, ring12, ring14, ring20, a family of tags, cctag3, cctag4 or the path of a code table.
         numbers: code numbers, (k,); None for the first DEFAULT_TARGETS of the family.
-        diameter_mm: diameter of the dot, or of the outer edge of concentric rings, or side of a square tag.
+        diameter_mm: diameter of the dot, or of the outer edge of concentric rings, or side of a square tag,
+            mm.
         page: one of PAGES_MM.
-        dark: dark targets on white; else white ones on dark squares.
+        dark: whether the targets are dark on white; else they are white on dark squares.
         ring_radii: inner and outer radius of the rings in radii of the dot; else those of the family.
 
     Returns:
-        The sheet, with as many pages as it takes.
+        The sheet, with as many pages as needed.
 
     Raises:
-        SurveyFileError: unknown page or family, impossible radii, a number twice, or a target that is too
-            small to be printed or larger than the page.
-        GeometryError: the family has no such number.
+        SurveyFileError: an unknown page or family, impossible radii, a number twice, or a target that is too
+            small to print or larger than the page.
+        GeometryError: the family does not have a number.
     """
     codes = code_family(family)
     if codes is None:
@@ -124,7 +126,7 @@ def lay_out_sheet(
     if numbers is None:
         numbers = codes.number if isinstance(codes, CodeFamily) else np.arange(codes.count)
         numbers = numbers[:DEFAULT_TARGETS]
-        if codes.name.startswith("arcs"):  # their number is the code
+        if codes.name.startswith("arcs"):  # their number of arcs is the code
             numbers = np.arange(1, MAX_ARCS + 1)
     values, count = np.unique(numbers, return_counts=True)
     if (count > 1).any():
@@ -164,7 +166,7 @@ def lay_out_sheet(
 
 
 def _target(at: FloatArray, half: float, number: int, codes: Family) -> Marks:
-    """Return the marks of one target about a centre (2,); half its diameter in mm."""
+    """Return the marks of one target; centre `at`, (2,), and half its diameter in mm."""
     if isinstance(codes, TagFamily):
         return square_tag(0, at, half, number, codes, 1.0, 0.0)
     if isinstance(codes, ConcentricFamily):
@@ -173,17 +175,17 @@ def _target(at: FloatArray, half: float, number: int, codes: Family) -> Marks:
 
 
 def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
-    """Write a sheet as PDF (one file) or SVG (one file a page) in true scale.
+    """Write a sheet as PDF (one file) or SVG (one file per page) at true scale.
 
     Args:
         sheet: result of `lay_out_sheet`.
         path: file name ending in .pdf or .svg; several SVG pages get -1, -2, ... before the ending.
 
     Returns:
-        The files written; all of them appear, or none.
+        The written files; either all of them appear, or none.
 
     Raises:
-        OutputError: another ending, something else than a sheet is there, or the file cannot be written.
+        OutputError: another ending, a file at this path that is no sheet, or the file cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{path}: a sheet is written as .pdf or .svg")
@@ -202,7 +204,7 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
 
 
 def _refuse_other_files(path: Path) -> None:
-    """Raise OutputError where something is that is no earlier sheet: it would be lost."""
+    """Raise OutputError if the path exists and is no earlier sheet, which would be lost."""
     with disk_errors(f"{path}: the sheet cannot be written"):
         if path.is_dir():
             raise OutputError(f"{path}: is a folder, needed the name of a file")
@@ -211,7 +213,7 @@ def _refuse_other_files(path: Path) -> None:
 
 
 def _head(path: Path) -> bytes:
-    """Return as much of a file as a sheet can have."""
+    """Return the beginning of a file, up to the largest size of a sheet."""
     with path.open("rb") as file:
         return file.read(MAX_SHEET_BYTES)
 
@@ -225,7 +227,7 @@ class _Path:
 
 
 def _outlines(sheet: Sheet, page: Page) -> list[_Path]:
-    """Return everything that is filled on a page."""
+    """Return all filled outlines of a page."""
     half = CLEAR * sheet.ring_mm / 2
     paths = [] if sheet.dark else [_rectangle(x - half, y - half, 2 * half, 2 * half) for x, y in page.centre]
     marks = page.marks
@@ -266,7 +268,7 @@ def _rectangle(x: float, y: float, width: float, height: float, *, white: bool =
 def _arc(
     x: float, y: float, radius: float, start: float, length: float
 ) -> list[tuple[str, tuple[float, ...]]]:
-    """Return cubic curves along an arc, true to 3e-7 of the radius in steps of an eighth of a turn.
+    """Return cubic curves along an arc, in steps of an eighth of a turn, accurate to 3e-7 of the radius.
 
     Source: Goldapp (1991), Comput. Aided Geom. Des. 8(3): handles of 4/3 tan(angle / 4).
     """
@@ -285,7 +287,7 @@ def _arc(
 
 
 def _texts(sheet: Sheet, k: int) -> list[tuple[float, float, float, str]]:
-    """Return x, y (mm), height (mm) and words of what is written on page k."""
+    """Return x, y (mm), height (mm) and text of every label on page k."""
     page = sheet.pages[k]
     below = CLEAR * sheet.ring_mm / 2 + 0.5 * LABEL_MM
     height = 0.6 * LABEL_MM
@@ -322,12 +324,12 @@ def _svg(sheet: Sheet, k: int) -> str:
     return "\n".join([*lines, "</svg>", ""])
 
 
-# Mean advance of Helvetica's letters and figures in parts of its size, to centre what is written.
+# Mean advance of Helvetica's letters and figures over its size, to centre texts.
 HELVETICA_WIDTH = 0.5
 
 
 def _pdf_text(words: str) -> str:
-    """Return words as the inside of a PDF string of WinAnsiEncoding, what that has not as a question mark.
+    """Return words as the inside of a PDF string in WinAnsiEncoding, with ? for characters it does not have.
 
     Source: ISO 32000-1:2008, sec. 7.3.4.2 (literal strings) and annex D.2 (Windows code page 1252).
     """
@@ -336,7 +338,7 @@ def _pdf_text(words: str) -> str:
 
 
 def _pdf(sheet: Sheet) -> bytes:
-    """Return the sheet as PDF 1.4 with one content stream a page.
+    """Return the sheet as PDF 1.4 with one content stream per page.
 
     Source: ISO 32000-1:2008, secs. 7.5 (file structure), 8.5 (paths), 9.4 (text).
     """

@@ -1,1 +1,1 @@
-"""The running program: progress, engines of a batch, unforeseen faults, and where it is installed."""
+"""The running program: progress, engines of a batch, unforeseen faults, and the installation."""

@@ -1,7 +1,7 @@
-"""Engine: what a batch needs of whoever spreads its work over processes and computers.
+"""Interface of an engine, which distributes the work of a batch over processes and computers.
 
-A piece of work has parts, which run side by side anywhere, and a whole, which is called with what the parts
-returned. Functions are called with a further keyword `send`, with which they report while they work.
+A piece of work has parts, which run in parallel anywhere, and a whole, which is called with the results of
+the parts. Functions get an additional keyword `send`, with which they report during their work.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-Send = Callable[[dict[str, Any]], None]  # takes plain values only: text, numbers, lists
+Send = Callable[[dict[str, Any]], None]  # accepts only plain values: text, numbers, lists
 
 
 @dataclass(frozen=True)
 class Call:
-    """A function and what it is called with; both travel to other processes."""
+    """A function and its arguments; both are sent to other processes."""
 
-    function: Callable[..., Any]  # of a module, not a lambda
+    function: Callable[..., Any]  # a function of a module, not a lambda
     arguments: tuple[Any, ...]
 
 
@@ -25,14 +25,14 @@ class Call:
 class Work:
     """One piece of work."""
 
-    key: str  # different for every piece of a run
+    key: str  # unique for every piece of a run
     parts: tuple[Call, ...]
-    whole: Call  # is given the list of the parts' results as last argument
+    whole: Call  # gets the list of the parts' results as its last argument
 
 
 @dataclass(frozen=True)
 class Sent:
-    """A function at work sent a message."""
+    """A running function sent a message."""
 
     key: str
     message: dict[str, Any]
@@ -48,7 +48,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Lost:
-    """Workers died, again and again, on a piece of work or beside it, or it raised an unforeseen error."""
+    """Workers died repeatedly on a piece of work or beside it, or it raised an unforeseen error."""
 
     key: str
     reason: str  # one line
@@ -62,13 +62,17 @@ class Engine(Protocol):
 
     @property
     def workers(self) -> int:
-        """How many calls run at a time."""
+        """Number of calls that run at a time."""
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens; `works` is drawn from as there is room for more.
+        """Run all work and yield the events; more of `works` is taken when there is room.
 
-        A KolinearError of a called function is raised here. If the iterator is closed, what has not begun is
-        dropped.
+        A KolinearError of a called function is raised here. If the iterator is closed, work that has not
+        begun is dropped.
+
+        Args:
+            works: pieces of work.
+            at_a_time: number of pieces in progress at a time.
 
         Raises:
             BackendError: no worker is left.

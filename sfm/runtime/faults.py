@@ -1,7 +1,6 @@
 """Unforeseen errors and lack of memory, reported in one line with the step that failed.
 
-A fault is an error of the program, not of what it was given. Its traceback is kept in a
-file for whoever mends it.
+A fault is an error of the program, not of its input. Its traceback is stored in a file for the developers.
 """
 
 from __future__ import annotations
@@ -16,17 +15,18 @@ from pathlib import Path
 
 from sfm.errors import KolinearError, one_line
 
-BAD_INPUT = 2  # exit code where a person must put something right
+BAD_INPUT = 2  # exit code if a person must correct something
 FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h
 OPENCV_NO_MEMORY = -4  # cv::Error::StsNoMem
-# The C library on a shared library that finds no room (dlopen), and Python on a thread without a stack.
+# Messages of the C library if a shared library finds no room (dlopen), and of Python if a thread finds no
+# stack.
 NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
-MAX_LETTERS = 200  # of the message of an error
+MAX_LETTERS = 200  # characters of an error message
 
 
 @contextmanager
 def working_on(what: str) -> Iterator[None]:
-    """Note on unforeseen errors what was at work; the innermost comes first."""
+    """Add a note on the running step to unforeseen errors; the innermost step comes first."""
     try:
         yield
     except KolinearError:
@@ -37,12 +37,12 @@ def working_on(what: str) -> Iterator[None]:
 
 
 def is_fault(error: Exception) -> bool:
-    """Whether the program is wrong, rather than what it was given, the disk or the size of the memory."""
+    """Return whether an error is a fault of the program, not of its input, the disk or the memory size."""
     return not (isinstance(error, KolinearError | OSError) or _is_out_of_memory(error))
 
 
 def error_in_words(error: Exception) -> str:
-    """Return an error in one line; of a fault where it is, of missing memory what was too large."""
+    """Return an error in one line; a fault with its position in the code, a lack of memory with the step."""
     if isinstance(error, KolinearError | OSError):
         return str(error)
     message = one_line(error)[:MAX_LETTERS]
@@ -58,7 +58,7 @@ def error_in_words(error: Exception) -> str:
 
 
 def ending_of(error: Exception) -> tuple[str, int]:
-    """Return the line that a program ends with, and its exit code; the traceback of a fault is kept."""
+    """Return the last line of a program and its exit code; the traceback of a fault is stored."""
     text = error_in_words(error)
     if not is_fault(error):
         return text, BAD_INPUT
@@ -68,7 +68,7 @@ def ending_of(error: Exception) -> tuple[str, int]:
 
 
 def keep_traceback(error: Exception) -> Path | None:
-    """Write a traceback into a new file that only this user can read; None if there is no place for it."""
+    """Write a traceback into a new file that only this user can read; None if that fails."""
     from importlib.metadata import version
 
     lines = (f"kolinear {version('kolinear')}, Python {sys.version}\n", f"{sys.argv}\n\n")
@@ -82,7 +82,7 @@ def keep_traceback(error: Exception) -> Path | None:
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error is of memory, or one that it was raised in the handling of."""
+    """Return whether an error, or an error that caused it, is a lack of memory."""
     while error is not None:
         said = isinstance(error, ImportError | RuntimeError) and any(one in str(error) for one in NO_MEMORY)
         if said or isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:

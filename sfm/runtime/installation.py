@@ -1,21 +1,20 @@
-"""The installation: public names, foreign packages among them, and settings of the current folder.
+"""The installation: public names, foreign packages of the same names, and settings in the current folder.
 
-Public names are imported when they are first asked for, and listed once, in the stub of their package.
+Public names are imported on first use. They are listed once, in the stub `__init__.pyi` of their package,
+which type checkers and editors read. Every row of the stub is one public name, `from module import name as
+name`, or one room, `from . import room as room`. A new name only needs a new row.
 
-`__init__.pyi` is what type checkers and editors read. Every row of it is one public name, `from module import
-name as name`, or one room, `from . import room as room`; a new name is a new row and nothing else.
+Two other projects on the registry have packages with the names of Kolinear's two packages, and a user may
+have a folder of such a name. Installers silently merge packages of one name into one folder, in which the
+last `__init__.py` remains. Therefore Kolinear finds its packages by their path, and refuses to run if files
+of other projects are among them.
 
-Kolinear's two packages found by their place, and whether files of other projects lie among them. Two projects
-on the registry have packages of the same names, and a user may have a folder of such a name. Python packages
-of one name are merged into one folder without a word, and the `__init__.py` of whichever came last is left.
-
-Settings of libraries and libraries themselves in the current folder, which may have come with a survey.
-
-numba reads `.numba_config.yaml` there, which can name a folder of compiled functions; they are pickles, and
-so programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. And cv2 puts its
-libraries and a colon before LD_LIBRARY_PATH; where that is empty, nothing follows the colon, by which the
-linker of every process that is started afterwards understands the current folder. Python looks there first
-for modules in the processes of multiprocessing and Dask, which are started with `python -c`.
+The current folder may contain settings of libraries, or libraries, that came with a survey of a stranger.
+numba reads `.numba_config.yaml` there, which can name a folder of compiled functions. These are pickles, and
+thus programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. cv2 puts its
+libraries and a colon before LD_LIBRARY_PATH. If this is empty, nothing follows the colon, and the linker of
+every later process searches the current folder. Python searches it first for modules in processes of
+multiprocessing and Dask, which are started with `python -c`.
 
 Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
 """
@@ -35,19 +34,19 @@ SETTINGS = (".numba_config.yaml", "matplotlibrc")
 LIBRARIES = "LD_LIBRARY_PATH"
 MODULES, SAFE_PATH = "PYTHONPATH", "PYTHONSAFEPATH"
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
-"""a file that each of the others has, PyPI's sfm and adapters, and Kolinear has not"""
+"""a file of each of the other projects, PyPI's sfm and adapters, that Kolinear does not have"""
 Face = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
 
 
 def public_names(package: str, folder: str) -> Face:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package by its stub.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package from its stub.
 
     Args:
         package: name of the package.
-        folder: of the package, with its `__init__.pyi`.
+        folder: folder of the package, with its `__init__.pyi`.
 
     Raises:
-        AttributeError: by `__getattr__`, where a name is not public.
+        AttributeError: from `__getattr__`, if a name is not public.
     """
     module_of = _listed(package, os.path.join(folder, "__init__.pyi"))
     names = sorted(module_of)
@@ -75,12 +74,12 @@ def _listed(package: str, stub: str) -> dict[str, str]:
 
 
 ROOT = os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
-COMMANDS = ("kolinear", "kolinear.exe", "-m")  # who starts these reads one line and no traceback
+COMMANDS = ("kolinear", "kolinear.exe", "-m")  # these print one line and no traceback
 BAD_INPUT = 2
 
 
 def refuse_mixed_installation() -> None:
-    """Raise InstallationError where another project's files lie in Kolinear's packages; two calls of stat."""
+    """Raise InstallationError if Kolinear's packages have files of other projects; two calls of stat."""
     for file in FOREIGN:
         path = os.path.join(ROOT, file)
         if os.path.exists(path):
@@ -96,10 +95,10 @@ def refuse_mixed_installation() -> None:
 
 
 def load_adapters() -> None:
-    """Import the package `adapters` beside sfm, also where the search path finds another of that name first.
+    """Import the package `adapters` beside sfm, even if the search path has another one of that name first.
 
     Raises:
-        InstallationError: another package of that name is imported already.
+        InstallationError: another package of that name is already imported.
     """
     installed = os.path.join(ROOT, "adapters")
     loaded = sys.modules.get("adapters")
@@ -121,7 +120,7 @@ def load_adapters() -> None:
 
 
 def refuse_folder_settings() -> None:
-    """Raise KolinearError where the current folder contains settings of a library; before any is imported."""
+    """Raise KolinearError if the current folder has settings of a library; call it before importing any."""
     for name in SETTINGS:
         if os.path.lexists(name):
             raise KolinearError(
@@ -132,9 +131,9 @@ def refuse_folder_settings() -> None:
 
 @contextmanager
 def closed_current_folder() -> Iterator[None]:
-    """Take the current folder out of where processes that are started look for modules and libraries.
+    """Keep new processes from searching the current folder for modules and libraries.
 
-    The path of libraries is never left empty meanwhile, so that OpenCV can be imported before or after.
+    Meanwhile the path of libraries is never empty, so that OpenCV can be imported before or after.
     """
     before = {name: os.environ.get(name) for name in (SAFE_PATH, MODULES, LIBRARIES)}
     os.environ[SAFE_PATH] = "1"
@@ -155,5 +154,5 @@ def closed_current_folder() -> Iterator[None]:
 
 
 def _folders(variable: str) -> str:
-    """Return a path of folders without empty ones, which mean the current folder."""
+    """Return a path of folders without empty entries, which mean the current folder."""
     return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)

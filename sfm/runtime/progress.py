@@ -1,15 +1,14 @@
-"""Progress of a run: its stage and share done, and the memory given back between stages.
+"""Progress of a run, by its stages and their steps; and freed memory, returned between stages.
 
-Functions deep in a stage that know what they do, and of how many parts how many are done, call `report_step`.
-Whoever watches the stage is found by the context that `StageClock` sets, so that no call in between passes it
-on; without a stage, as where a function is used by itself, the report is ignored.
+Functions deep inside a stage call `report_step` with their step, and with the number of parts done if they
+know it. The context that `StageClock` sets finds the observer, so that no function in between has to pass it
+on. Without a stage, for example if a function is used by itself, the report is ignored.
 
-Memory that has been freed: given back to the system after a stage, kept between the steps of one.
-
-The C library keeps freed memory for the next request of a like size, in each thread by itself: what one has
-freed no other one takes. After photographs have been worked on in several threads that is most of it: 0.7 of
-1.1 GB with 25 photographs of 6 megapixels. Of arrays of some MB it keeps nothing at first, and the system
-clears them anew at every step: a fifth of the time of 60 photographs.
+The C library keeps freed memory for later requests of similar size, separately in each thread, so that no
+other thread can use it. After several threads have processed photographs, this is most of the memory: 0.7 of
+1.1 GB with 25 photographs of 6 megapixels. Therefore freed memory is returned to the system after a stage.
+Between the steps of a stage it is kept. By default the C library does not keep arrays of several MB, and the
+system clears them again at every step, which takes a fifth of the time of 60 photographs.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ class Progress(Protocol):
     """Interface that a run reports its progress to; implementations draw it, count it or ignore it."""
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """A stage of that name begins; `total` steps will be announced, None if unknown."""
+        """Begin a stage with `total` steps, None if unknown."""
 
     def advance(self, step: str = "") -> None:
-        """One step of the stage, such as a photograph of that name, is done."""
+        """Finish one step of the stage, such as a photograph of that name."""
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
-        """Announce what the stage does now, and how many of how many parts of it are done, if known."""
+        """Announce the present work of the stage, with its finished and total parts, if known."""
 
 
 class Silent:
@@ -61,17 +60,23 @@ _watching: ContextVar[Progress] = ContextVar("watching", default=SILENT)
 
 
 def report_step(name: str, done: int | None = None, total: int | None = None) -> None:
-    """Report what the present stage does, and how many of how many parts are done, if that is known."""
+    """Report the present work of the stage.
+
+    Args:
+        name: name of the work.
+        done: number of finished parts, if known.
+        total: number of all parts, if known.
+    """
     _watching.get().step(name, done, total)
 
 
 def reported(name: str, items: Iterator[T] | Collection[T], total: int) -> Iterator[T]:
-    """Yield items and report each as done when the next one is asked for.
+    """Yield items, and report each as done when the next one is requested.
 
     Args:
-        name: what is done with them.
-        items: so many as `total`.
-        total: how many they are.
+        name: name of the work.
+        items: the items.
+        total: number of items.
     """
     if total:
         report_step(name, 0, total)
@@ -81,7 +86,7 @@ def reported(name: str, items: Iterator[T] | Collection[T], total: int) -> Itera
 
 
 class StageClock:
-    """Announces stages and keeps how long each took."""
+    """Clock that announces stages and measures their times."""
 
     def __init__(self, progress: Progress) -> None:
         share_freed_memory()
@@ -90,9 +95,11 @@ class StageClock:
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[None]:
-        """Announce a stage and how many steps it has, if that is known, and time what is done in it.
+        """Announce a stage and measure its time; at its end, freed memory is returned to the system.
 
-        Memory that it has freed is given back to the system at its end.
+        Args:
+            name: name of the stage.
+            total: number of its steps, if known.
         """
         self.progress.stage(name, total)
         begun = time.perf_counter()
@@ -107,7 +114,7 @@ class StageClock:
 
 
 def give_back_memory() -> None:
-    """Give freed memory back where the C library can be asked to (glibc)."""
+    """Return freed memory to the system, if the C library supports it (glibc)."""
     trim = _asked("malloc_trim")
     if trim is not None:
         trim(0)
@@ -115,7 +122,7 @@ def give_back_memory() -> None:
 
 @cache
 def share_freed_memory() -> None:
-    """Have threads that begin from now on share one pool of freed memory, where glibc can be asked to."""
+    """Let threads that start later share one pool of freed memory, if the C library supports it (glibc)."""
     option = _asked("mallopt")
     if option is not None:
         option(ARENA_MAX, 1)
@@ -123,18 +130,18 @@ def share_freed_memory() -> None:
 
 @cache
 def keep_freed_memory() -> None:
-    """Have the C library keep what is freed at the end of its memory, up to twice `LARGEST_KEPT`.
+    """Let the C library keep freed memory at the end of its heap, up to twice `LARGEST_KEPT`.
 
-    glibc decides so by the largest block that has been freed, up to that limit; this one is never written to
-    and takes no memory. The first photograph that is freed has the same effect. Where the environment sets
-    MALLOC_TRIM_THRESHOLD_, as for the workers of a batch, that applies.
+    glibc chooses this limit by the largest block freed so far. The block here is never written to, and takes
+    no memory. The first freed photograph has the same effect. If the environment sets MALLOC_TRIM_THRESHOLD_,
+    as for the workers of a batch, that value applies.
     """
     bytes(LARGEST_KEPT)
 
 
 @cache
 def _asked(function: str) -> Callable[..., int] | None:
-    """Return a function of the C library, None where it has no such function."""
+    """Return a function of the C library, or None if it does not exist."""
     if sys.platform != "linux":
         return None
     found: Callable[..., int] | None = getattr(ctypes.CDLL(None), function, None)

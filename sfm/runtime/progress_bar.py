@@ -13,10 +13,10 @@ from rich.text import Text
 
 @contextmanager
 def drawn_progress(console: Console | None = None) -> Iterator[Drawn]:
-    """Show a progress bar while stderr is a terminal; nothing else ever goes there but an error.
+    """Show a progress bar if stderr is a terminal, to which only errors are written otherwise.
 
     Args:
-        console: in place of stderr.
+        console: console in place of stderr.
     """
     console = console or Console(stderr=True)
     with Progress(
@@ -35,7 +35,7 @@ def drawn_progress(console: Console | None = None) -> Iterator[Drawn]:
 
 
 class Drawn:
-    """Progress as a bar on the terminal: the stage, what it does, and the photographs done."""
+    """Progress as a bar on the terminal: the stage, its present work, and the finished photographs."""
 
     def __init__(self, bar: Progress) -> None:
         self._bar = bar
@@ -58,12 +58,12 @@ class Drawn:
             self._bar.update(self._task, advance=1, step=step)
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
-        """Name what the stage does and count its parts; the count of other work begins anew."""
+        """Show the present work of the stage and count its parts; new work restarts the count."""
         if self._task is None:
             return
         task = self._bar.tasks[-1]
         if name != task.fields["part"] or total != task.total or (done or 0) < task.completed:
-            # what is left is estimated from the parts of this work alone; the time of the stage goes on
+            # only the parts of this work estimate the remaining time; the time of the stage continues
             begun, task.total = task.start_time, total
             fields = task.fields | {"step": name, "part": name}
             self._bar.reset(self._task, total=total, completed=done or 0, **fields)
@@ -73,21 +73,21 @@ class Drawn:
 
 
 class _Counted(ProgressColumn):
-    """Parts done of all; nothing where their number is not known."""
+    """Finished and total parts; empty if the total is unknown."""
 
     def render(self, task: Task) -> Text:
-        """Return what is written."""
+        """Return the text of the column."""
         known = task.total is not None and (task.fields["counted"] or task.stop_time is None)
         return Text(f"{int(task.completed)}/{int(task.total or 0)}" if known else "", "progress.download")
 
 
 class _Times(ProgressColumn):
-    """Time since the stage began, and an estimate of what is left where the number of parts is known."""
+    """Time since the stage began, and the estimated remaining time if the number of parts is known."""
 
     max_refresh = 0.5  # s
 
     def render(self, task: Task) -> Text:
-        """Return what is written."""
+        """Return the text of the column."""
         text = Text(_clock(task.elapsed or 0.0), "progress.elapsed")
         left = task.time_remaining
         if left and not task.finished:
