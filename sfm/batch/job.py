@@ -118,9 +118,7 @@ def lock_of(out: Path, folder: str) -> Path:
     return out / f".{folder}.lock"
 
 
-def measure_one(
-    job: SurveyJob, survey: SurveyFile, image: str, path: Path, *, send: Send
-) -> MeasuredPhotograph:
+def measure_one(survey: SurveyFile, image: str, path: Path, *, send: Send) -> MeasuredPhotograph:
     """Measure one photograph; if it cannot be read, the result states why."""
     begun = time.perf_counter()
     store = MeasuredStore.of_user()

@@ -322,7 +322,7 @@ def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
         found = find_photographs(survey)
         refuse_unknown_photographs(given, found.names)  # before the photographs are measured
         parts = tuple(
-            Call(measure_one, (job, survey, name, path))
+            Call(measure_one, (survey, name, path))
             for name, path in zip(found.names, found.paths, strict=True)
         )
     return Work(job.folder, parts, Call(reconstruct, (job, comparers)))

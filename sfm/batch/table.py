@@ -214,7 +214,7 @@ def refuse_foreign_pages(out: Path) -> None:
         )
     if not read_manifest(out).keys() <= {MANIFEST, *PAGES}:
         raise OutputError(
-            f"{out}: the folder contains '{MANIFEST}' of a result, no batch; needed another --out"
+            f"{out}: the folder contains '{MANIFEST}' of a result, not of a batch; needed another --out"
         )
     refuse_foreign_files(out, PAGES)
 

@@ -38,7 +38,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.similarity import extended_axes, mean_distance, similarity_motions
 
-MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # number of parameters of motions that are no change
+MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # number of parameters of motions that are not a change
 MIN_STABLE = 4  # points of a datum: three define it, and one more checks it
 STABLE_FRACTION = 0.5  # of the points must agree before others are reported as moved
 RANK = 1e-6  # of the largest singular value; below it the reference points are on a line
@@ -55,7 +55,7 @@ class Congruency:
     agreed: bool  # whether the stable points agree; else no majority does
     difference: FloatArray  # d_S, (n, 3)
     covariance: FloatArray  # Q_S of all coordinates, (3 n, 3 n)
-    motions: FloatArray  # G: motions that are no change, (3 n, u)
+    motions: FloatArray  # G: motions that are not a change, (3 n, u)
     statistic: FloatArray  # T of each point: its drop of Omega if stable, else its own test, over 3, (n,)
     level: FloatArray  # alpha of the test of each point, (n,)
     critical: FloatArray  # critical value of T, (n,)
@@ -92,7 +92,7 @@ def congruency(
         difference: second minus first coordinates after any alignment, (n, 3).
         covariance: Q_a + Q_b of all coordinates, (3 n, 3 n).
         xyz: coordinates, (n, 3).
-        motion: motion of the whole that is no change: rigid (translation and rotation), similarity (also
+        motion: motion of the whole that is not a change: rigid (translation and rotation), similarity (also
             scale, unless both have one), or none (both in the datum of control).
         redundancy: redundancy of both adjustments together; None if the variances are known.
         reference: points that may carry the datum, (n,); all if not given.
@@ -115,7 +115,7 @@ def congruency(
     sizes = np.linalg.svd(G[np.repeat(reference, 3)], compute_uv=False)
     if (sizes < RANK * np.linalg.svd(G, compute_uv=False).max(initial=0.0)).any():
         raise GeometryError(
-            "congruency: the points of reference lie on a line, which fixes no rotation about it"
+            "congruency: the points of reference lie on a line, which does not fix the rotation about it"
         )
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * first))
 

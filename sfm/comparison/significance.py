@@ -154,8 +154,8 @@ def compare_results(
     names = tuple(a.network.points[j] for j in pa)
     if not len(pa) and not len(ia):
         raise GeometryError(
-            f"{a.name} and {b.name} have no points and no photographs in common: neither names, nor image "
-            "points, nor places in the object are the same"
+            f"{a.name} and {b.name} have no points and no photographs in common: they share neither names, "
+            "nor image points, nor positions of points"
         )
     chosen = _chosen(names, align, control)
     scale = known_scale(a, b)

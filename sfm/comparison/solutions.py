@@ -1,6 +1,6 @@
 """Comparison of two solutions of one network, and of a survey with another pipeline.
 
-The datum is no part of a solution. Before anything is subtracted, one solution is aligned to the other by a
+The datum is not part of a solution. Before anything is subtracted, one solution is aligned to the other by a
 7-parameter similarity over the object points. Differences are judged in standard deviations.
 
 A baseline has the photographs of a survey oriented by another pipeline, without targets, scale or covariance.
@@ -51,8 +51,7 @@ class Comparison:
     rms_px: tuple[float, float]  # root mean square residual per coordinate of a and b, px
     cost: tuple[float, float]  # half the sum of squared residuals of a and b, px^2
     # (parameter that differs most, difference in its standard deviations in a) for each kind of parameter
-    # with
-    # known standard deviations
+    # with known standard deviations
     sigmas: tuple[tuple[str, float], ...]
 
     @property

@@ -1,8 +1,8 @@
 """Stable points of a network between two epochs: moved points are removed one by one until the rest agrees.
 
 The differences d of m coordinates of n points have the covariance Q. Motions of the whole in the columns of G
-(translations, rotations, the scale) are no change. The point whose removal from the datum lowers Omega = d'
-Q^+ d most is removed first. With W = (Q + c G G')^-1, where c does not affect the test,
+(translations, rotations, the scale) are not a change. The point whose removal from the datum lowers Omega =
+d' Q^+ d most is removed first. With W = (Q + c G G')^-1, where c does not affect the test,
 
     P = W - W G (G' W G)^-1 G' W,  w = P d,  Omega = d' w,  drop of point k: w_k' P_kk^-1 w_k,
 
@@ -75,7 +75,7 @@ def candidates_of(
     Args:
         difference: second minus first coordinates, (n, m).
         covariance: joint covariance of the differences, (n m, n m).
-        G: motions that are no change, as columns, (n m, u).
+        G: motions that are not a change, as columns, (n m, u).
         candidates: points that may be stable, (n,).
 
     Raises:
@@ -172,7 +172,7 @@ def in_datum(
     Args:
         difference: second minus first coordinates, (n, m).
         covariance: joint covariance of the differences, (n m, n m).
-        G: motions that are no change, (n m, u).
+        G: motions that are not a change, (n m, u).
         weight: weight of each point in the datum, (n,); 1 or 0 for a set of points.
 
     Returns:
@@ -198,7 +198,7 @@ def tests_in_datum(
     Args:
         difference: second minus first coordinates, (n, m).
         covariance: joint covariance of the differences, (n m, n m).
-        G: motions that are no change, (n m, u).
+        G: motions that are not a change, (n m, u).
         weight: weight of each point in the datum, (n,).
     """
     n, m = difference.shape
@@ -228,7 +228,7 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
 
     Args:
         difference: second minus first coordinates, (n, m).
-        G: motions that are no change, (n m, u).
+        G: motions that are not a change, (n m, u).
         candidates: points that take part, (n,).
 
     Raises:
@@ -239,7 +239,7 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
     m = difference.shape[1]
     if len(G) != difference.size:
         raise GeometryError(
-            f"robust_weights: G has {len(G)} rows, expected {difference.size}, a row a coordinate"
+            f"robust_weights: G has {len(G)} rows, expected {difference.size}, one for each coordinate"
         )
     if not candidates.any():
         raise GeometryError("robust_weights: no point takes part, expected some candidates")

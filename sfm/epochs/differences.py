@@ -58,7 +58,7 @@ class Differences:
     xyz: FloatArray  # coordinates in the first epoch, object unit, (n, 3)
     difference: FloatArray  # object unit, (n, 3)
     covariance: FloatArray  # of the differences, object unit^2, (3 n, 3 n)
-    motion: str  # motion that is no change: rigid, or similarity unless both have a scale
+    motion: str  # motion that is not a change: rigid, or similarity unless both have a scale
     redundancy: int | None  # of both adjustments together
     only_first: tuple[str, ...]  # points that the second epoch does not have
     only_second: tuple[str, ...]  # points that the first epoch does not have
@@ -70,7 +70,7 @@ class Differences:
 
     @property
     def motions(self) -> FloatArray:
-        """G: motions of the whole that are no change, (3 n, u)."""
+        """G: motions of the whole that are not a change, (3 n, u)."""
         return motions(self.xyz)[:, : MOTIONS[self.motion]]
 
 
@@ -89,7 +89,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     """
     for epoch in (first, second):
         if epoch.result.redundancy == 0:
-            raise GeometryError(f"{epoch.name}: redundancy 0, its standard deviations say nothing")
+            raise GeometryError(f"{epoch.name}: redundancy 0, so its standard deviations mean nothing")
         if epoch.result.covariance is None:
             raise GeometryError(
                 f"{epoch.name}: the covariance of all points together (point_covariance.npy) is missing; run "
@@ -121,7 +121,9 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
         )
     scale = known_scale(a, b)
     if scale is None and a.has_scale and b.has_scale:
-        raise GeometryError(f"{first.name} is in {a.unit} and {second.name} in {b.unit}: give both one unit")
+        raise GeometryError(
+            f"{first.name} is in {a.unit} and {second.name} in {b.unit}: give both the same unit"
+        )
     moved = fit_robustly(b.estimate.points[pb], a.estimate.points[pa], scale=scale)
     C, shared = (_correlated if together else _shared)(first, second, pairs)
     points = replace(pairs_of_results(a, b, pairs, scale)[0], C=C)

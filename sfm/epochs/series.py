@@ -200,7 +200,8 @@ def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch,
             if _matching(found.untested, pattern).any():
                 raise GeometryError(
                     f"epochs: point of reference {pattern} cannot be tested in {epochs[0].name} and "
-                    f"{epochs[1].name}: one has it as known, or did not keep its covariance with the others"
+                    f"{epochs[1].name}: one of them holds it as known, or did not keep its covariance "
+                    "with the others"
                 )
             lacking = [e.name for e in epochs if not _matching(e.result.network.points, pattern).any()]
             raise GeometryError(
@@ -319,9 +320,8 @@ def block_motion(
     outside = found.stable & ~group
     if np.linalg.matrix_rank(G[np.repeat(outside, 3)], tol=RANK * np.linalg.norm(G, 2)) < G.shape[1]:
         raise GeometryError(
-            f"group {name}: {counted(int(outside.sum()), 'stable point')} outside of it, too few or "
-            "on a line: "
-            "nothing is left against which it could move"
+            f"group {name}: {counted(int(outside.sum()), 'stable point')} outside it, too few or "
+            "on a line to show a motion of the group"
         )
     d, Q = in_datum(d, Q, G, outside.astype(float))
     alpha = found.alpha if alpha is None else alpha

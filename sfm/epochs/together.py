@@ -249,9 +249,9 @@ def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray
     if not (a.converged and off < SAME_SIGMA):
         raise GeometryError(
             f"{epoch.name}: adjusting its image points again leads {off:.2g} standard deviations away from "
-            "its result: it was given what its tables do not keep (weights by robust estimation or of single "
-            "photographs, correlated calibrations, exterior orientation, survey observations, mounts), and "
-            "cannot be adjusted together"
+            "its result: it used input that its tables do not keep (weights by robust estimation or of "
+            "single photographs, correlated calibrations, exterior orientation, survey observations, "
+            "mounts), and cannot be adjusted together"
         )
 
 

@@ -120,7 +120,7 @@ def read_covariance(
     try:
         packed = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError, SyntaxError) as error:
-        raise SurveyFileError(f"{path}: is no array of NumPy") from error
+        raise SurveyFileError(f"{path}: not an array of NumPy") from error
     if packed.dtype != np.float64 or packed.shape != (u * (u + 1) // 2,) or not np.isfinite(packed).all():
         raise SurveyFileError(f"{path}: expected {u * (u + 1) // 2} finite numbers of 8 bytes")
     matrix = np.zeros((u, u))
@@ -175,7 +175,7 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
         with np.load(path, allow_pickle=False) as arrays:
             known = {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
     except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
-        raise SurveyFileError(f"{path}: is no array of NumPy") from error
+        raise SurveyFileError(f"{path}: not an array of NumPy") from error
     exterior = known.get("exterior")
     interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
     fits = exterior is None or (
@@ -189,7 +189,5 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
         fits &= tuple(known.get("rig_parameters", ())) == names and rigs.shape == (len(names), len(names))
     matrices = (*interior, *(Q for Q in (exterior, rigs) if Q is not None))
     if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
-        raise SurveyFileError(
-            f"{path}: covariances of other photographs or cameras than the tables beside it"
-        )
+        raise SurveyFileError(f"{path}: its photographs or cameras are not those of the tables beside it")
     return found

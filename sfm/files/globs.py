@@ -18,7 +18,7 @@ BELOW = "**"  # a folder and everything below it
 
 
 def why_no_folder(path: Path) -> str:
-    """Return why a path is no folder: it is a file, or it does not exist, with the most similar name."""
+    """Return why a path is not a folder: it is a file, or it does not exist, with the most similar name."""
     return (
         "is a file, a folder is needed" if path.exists() else f"there is no such folder{nearest_name(path)}"
     )
@@ -61,7 +61,7 @@ def find_files(
         part for k, part in enumerate(given.parts) if given.parts[k - 1 : k] != (BELOW,) or part != BELOW
     ]
     if not parts or given.anchor or any(BELOW in part and part != BELOW for part in parts):
-        raise ValueError("no relative glob")
+        raise ValueError("not a relative glob")
     found: set[Path] = set()
     waiting = [(folder, 0)]
     left = MAX_ENTRIES

@@ -76,7 +76,7 @@ def open_folder(path: Path, *, make: bool = False) -> Iterator[int | None]:
 
     Raises:
         OutputError: the path contains a link.
-        OSError: the path is no folder, or it cannot be opened or made.
+        OSError: the path is not a folder, or it cannot be opened or made.
     """
     refuse_links(path)
     if not HAS_HANDLES:
@@ -115,21 +115,21 @@ def _is_there(name: str, folder: int) -> bool:
     return True
 
 
-def open_new_folder(path: Path, beside: int | None) -> int | None:
+def open_new_folder(path: Path, parent: int | None) -> int | None:
     """Make and open a new folder that only this user can access.
 
     Args:
         path: the folder.
-        beside: handle of the containing folder.
+        parent: handle of the containing folder.
 
     Raises:
         OSError: the folder exists already, or cannot be made.
     """
-    if beside is None:
+    if parent is None:
         path.mkdir(0o700)
         return None
-    os.mkdir(path.name, 0o700, dir_fd=beside)
-    return os.open(path.name, _FOLDER | _NO_LINK, dir_fd=beside)
+    os.mkdir(path.name, 0o700, dir_fd=parent)
+    return os.open(path.name, _FOLDER | _NO_LINK, dir_fd=parent)
 
 
 def move(source: Path, source_folder: int | None, target: Path, target_folder: int | None) -> None:
@@ -252,7 +252,7 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
         with disk_errors(f"{path}: the lock cannot be written"):
             before = _owner(handle)
             if before is None and os.fstat(handle).st_size:
-                raise OutputError(f"{path}: is no lock of Kolinear, and is left alone; remove it")
+                raise OutputError(f"{path}: is not a lock of Kolinear, and is left alone; remove it")
             ours = True
             _write_owner(handle)
         yield before
@@ -403,7 +403,7 @@ def names_below(folder: Path) -> list[str]:
 
 
 def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a regular file; for anything else, a random text that is no hash."""
+    """Return the SHA-256 of a regular file; for anything else, a random text that is not a hash."""
     if not stat.S_ISREG(path.lstat().st_mode):
         return f"no file {os.urandom(16).hex()}"  # no manifest can contain this
     with path.open("rb") as file:

@@ -1,10 +1,10 @@
 """Numbers and names as plain text, and JSON and TOML from untrusted files.
 
-Spreadsheets compute cells that begin with =, +, @ or a - that begins no number, even after spaces. Some also
-begin a new cell after each semicolon. Writing CSV inserts an apostrophe at every such position of a text, and
-reading removes it. Existing apostrophes get one more, so that texts are restored exactly. Control characters
-are not allowed in names, since a tab or carriage return also begins formulas. In other texts they are written
-as escapes.
+Spreadsheets compute cells that begin with =, +, @ or a - that does not begin a number, even after spaces.
+Some also begin a new cell after each semicolon. Writing CSV inserts an apostrophe at every such position of a
+text, and reading removes it. Existing apostrophes get one more, so that texts are restored exactly. Control
+characters are not allowed in names, since a tab or carriage return also begins formulas. In other texts they
+are written as escapes.
 
 Source: OWASP, "CSV Injection"; Unicode Standard 15, property Default_Ignorable_Code_Point, and UAX 9 for
 bidirectional characters.
@@ -62,8 +62,7 @@ MAX_NAME = 500  # characters of a name in a file
 BLOCK = 10_000  # rows that are written at a time
 SHOWN = 40  # characters of a found value that an error message repeats
 # Invisible characters, and characters that change the display of the text around them: categories Cc, Cf, Cs,
-# Zl
-# and Zp, and all others that are ignorable by default.
+# Zl and Zp, and all others that are ignorable by default.
 _HIDDEN = re.compile(
     r"[\x00-\x1f\x7f-\x9f\xad\u034f\u0600-\u0605\u061c\u06dd\u070f\u0890\u0891\u08e2\u115f\u1160\u17b4\u17b5"
     r"\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f\u3164\ud800-\udfff\ufe00-\ufe0f\ufeff\uffa0"
@@ -106,7 +105,7 @@ def csv_blocks(header: Sequence[str], rows: Iterable[Sequence[object]]) -> Itera
     while block := list(islice(rows, BLOCK)):
         columns = [_column(values) for values in zip(*block, strict=True)]
         if len(columns) == 1:
-            columns = [[cell or '""' for cell in columns[0]]]  # an empty line would be no row
+            columns = [[cell or '""' for cell in columns[0]]]  # an empty line would not be a row
         yield "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
 
 
@@ -123,7 +122,7 @@ def from_cell(cell: str) -> str:
 def is_plain(text: str) -> bool:
     """Return whether a name suits tables and terminals: no control, bidirectional or invisible characters.
 
-    On Linux a file name may have any bytes. Bytes that are no UTF-8 appear as lone surrogates (PEP 383),
+    On Linux a file name may have any bytes. Bytes that are not UTF-8 appear as lone surrogates (PEP 383),
     which are not plain either.
     """
     return _HIDDEN.search(text) is None
@@ -202,7 +201,7 @@ def read_json(path: Path, content: type[ContentT], what: str) -> ContentT:
         what: name of such a file with its article, for error messages.
 
     Raises:
-        SurveyFileError: the file is unreadable, too large or no JSON, or a value is not as declared.
+        SurveyFileError: the file is unreadable, too large or not JSON, or a value is not as declared.
     """
     try:
         size = path.stat().st_size
@@ -242,7 +241,7 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
         repeated: sections that may occur several times, each in [[ ]].
 
     Raises:
-        SurveyFileError: the file is unreadable, too large, or no TOML.
+        SurveyFileError: the file is unreadable, too large, or not TOML.
     """
     try:
         if path.exists() and not path.is_file():  # reading a pipe would never end

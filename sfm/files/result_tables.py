@@ -334,7 +334,7 @@ def _read_moments(path: Path, cameras: Sequence[str], network: Network, mounts: 
     for name, a in zip(network.images, network.camera, strict=True):
         if mounts.rig[a] and name not in of:
             raise SurveyFileError(
-                f"{path}: photograph {name} of camera {cameras[a]} is missing, which is on a rig"
+                f"{path}: photograph {name} of camera {cameras[a]}, which is on a rig, is missing"
             )
     order = list(dict.fromkeys((of[name],) if name in of else ("", name) for name in network.images))
     number = {key: t for t, key in enumerate(order)}

@@ -91,7 +91,7 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
         if not replaces:
             refuse_existing(path)  # it may have appeared since the first check
         part.refuse_exchanged()
-        move(part.path / path.name, part.handle, path, part.beside)
+        move(part.path / path.name, part.handle, path, part.parent)
         _sync(path.parent)
 
 
@@ -124,7 +124,7 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
         write_manifest(folder, hashes)
         part.refuse_exchanged()
         for name in names:
-            move(part.path / name, part.handle, folder / name, part.beside)
+            move(part.path / name, part.handle, folder / name, part.parent)
         _sync(folder)
 
 
@@ -132,7 +132,7 @@ def refuse_existing(path: Path) -> None:
     """Raise OutputError if the path of a new file exists already."""
     refuse_links(path)
     if os.path.lexists(path):
-        raise OutputError(f"{path}: is there already and is left alone, a new name is needed")
+        raise OutputError(f"{path}: exists already and is left alone, a new name is needed")
 
 
 def refuse_unwritable(path: Path) -> None:
@@ -190,12 +190,12 @@ class _Part:
 
     path: Path
     handle: int | None  # handle of this folder; None on systems without such handles
-    beside: int | None  # handle of the containing folder
+    parent: int | None  # handle of the containing folder
 
     def refuse_exchanged(self) -> None:
         """Raise OutputError if another folder has taken the path, through which libraries wrote."""
         if self.handle is not None and not os.path.samestat(os.fstat(self.handle), os.stat(self.path)):
-            raise OutputError(f"{self.path}: was exchanged while it was written")
+            raise OutputError(f"{self.path}: was replaced while it was written")
 
 
 @contextmanager
@@ -205,12 +205,12 @@ def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
     path = out.parent / f".{out.name}.{secrets.token_hex(4)}.{ending}"
     with ExitStack() as stack:
         with disk_errors(f"{out}: {_subject(what)}cannot be written here"):
-            beside = stack.enter_context(open_folder(out.parent, make=True))
-            handle = open_new_folder(path, beside)
+            parent = stack.enter_context(open_folder(out.parent, make=True))
+            handle = open_new_folder(path, parent)
         stack.callback(shutil.rmtree, path, ignore_errors=True)
         if handle is not None:
             stack.callback(os.close, handle)
-        yield _Part(path, handle, beside)
+        yield _Part(path, handle, parent)
 
 
 @contextmanager
@@ -252,14 +252,14 @@ def _put_in_place(part: _Part, out: Path) -> None:
     """Rename the finished folder to its final path; an earlier folder is kept until then."""
     part.refuse_exchanged()
     if not out.exists():
-        move(part.path, part.beside, out, part.beside)
+        move(part.path, part.parent, out, part.parent)
         _sync(out.parent)
         return
     with _new_folder(out, "", "old") as old:
-        move(out, part.beside, old.path / "result", old.handle)
+        move(out, part.parent, old.path / "result", old.handle)
         try:
-            move(part.path, part.beside, out, part.beside)
+            move(part.path, part.parent, out, part.parent)
         except OSError:
-            move(old.path / "result", old.handle, out, part.beside)
+            move(old.path / "result", old.handle, out, part.parent)
             raise
         _sync(out.parent)

@@ -2,7 +2,7 @@
 
 The error of a length measurement is the measured minus the calibrated length. The limit of its absolute value
 is A + K L, and at most B. ISO 14253-1 decides whether conformity is proven, given the uncertainty of the
-calibration. Requirements of part 1 that the data do not meet are listed. This is no test by ISO 10360-13,
+calibration. Requirements of part 1 that the data do not meet are listed. This is not a test by ISO 10360-13,
 which applies to area scanners.
 
 Source: VDI/VDE 2634 part 1 (2002), Optical 3D measuring systems: imaging systems with point-by-point probing,
@@ -154,7 +154,7 @@ def accept_result(
     points = measured_points(result)
     if not points.has_scale:
         raise GeometryError(
-            f"{result.name}: its scale is undefined, lengths are tested in a unit that comes from other bars"
+            f"{result.name}: its scale is undefined; a test of lengths needs a scale from other bars"
         )
     for name in (*lengths.start, *lengths.end):
         if name not in points.names:

@@ -186,7 +186,7 @@ def read_features_file(path: Path, *, allow_outside: bool = False) -> tuple[Feat
         Its settings, and the paths of its tables and meshes by name.
 
     Raises:
-        SurveyFileError: the file is unreadable or no TOML, or has an unknown key, a wrong type, or a
+        SurveyFileError: the file is unreadable or not TOML, or has an unknown key, a wrong type, or a
             contradiction. The message states the file, the key, the value found and the value needed.
     """
     path = Path(path)

@@ -243,7 +243,7 @@ class _Work:
         if max(share, 1 - share) < SEEN_FROM:
             found = f"{share:.0%} of the rays come from one side" if len(towards) else "no photographs"
             raise GeometryError(
-                f"shape {one.name}: offset: {found}; needed side with the name of a point on that of the "
+                f"shape {one.name}: offset: {found}; needed side = the name of a point on the side of the "
                 "targets"
             )
         return 1.0 if share > 0.5 else -1.0

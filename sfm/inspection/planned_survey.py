@@ -208,7 +208,7 @@ def read_plan(folder: Path) -> PlannedSurvey:
 
 def _camera(where: Path, c: _Camera) -> Camera:
     if c.model not in MODELS or set(c.parameters) != set(MODELS[c.model].names):
-        raise SurveyFileError(f"{where}: camera {c.name} has not the parameters of a known model")
+        raise SurveyFileError(f"{where}: the parameters of camera {c.name} are not those of a known model")
     names = MODELS[c.model].names
     if not all(side > 0 for side in c.size_px) or c.size_px[0] * c.size_px[1] > MAX_PIXELS:
         raise SurveyFileError(f"{where}: photographs of {c.size_px[0]} x {c.size_px[1]} px")
@@ -227,7 +227,7 @@ def _rig(where: Path, mounts: Sequence[_Mount], cameras: tuple[Camera, ...]) -> 
     if [one.camera for one in mounts] != [camera.name for camera in cameras][: len(mounts)] or (
         len(cameras) > 1 and len(mounts) != len(cameras)
     ):
-        raise SurveyFileError(f"{where}: mounts, needed one of each camera, in their order")
+        raise SurveyFileError(f"{where}: mounts: needed one for each camera, in the order of the cameras")
     if not mounts:
         return None
     value = np.array([one.value for one in mounts])

@@ -31,7 +31,7 @@ FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "PPM", "WEBP")  # Pillow's names; it tr
 # WGS 84: semi-major axis, m, and flattening (NIMA TR8350.2, 2000).
 SEMI_MAJOR_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
 ORIGIN_DECIMALS = 3  # of the degrees of an origin: 0.001 deg are 111 m
-MAX_HEIGHT_M = 100_000.0  # a larger number is no height of a camera
+MAX_HEIGHT_M = 100_000.0  # a larger number is not the height of a camera
 BELOW = (1, 3)  # GPSAltitudeRef: below sea level, below the reference of EXIF 3.0
 MIN_SIGMA_M = 0.001  # no receiver on a camera is better; smaller numbers have another unit or mean unknown
 VOID = "V"  # GPSStatus of a receiver without a fix
@@ -258,7 +258,7 @@ def local_coordinates(positions: Sequence[SatellitePosition]) -> tuple[LocalSyst
 def satellite_position(gps: Mapping[int, Any], xmp: bytes = b"") -> SatellitePosition | None:
     """Return the position in the data of a photograph, or None.
 
-    These are no positions: latitude and longitude 0, which writers use for unknown; numbers out of range;
+    These are not positions: latitude and longitude 0, which writers use for unknown; numbers out of range;
     missing hemispheres; and receivers without a fix.
 
     Args:
@@ -440,7 +440,7 @@ def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
     pixels = size[0] * size[1]
     if pixels > BOMB_PIXELS and pixels > BOMB_PX_PER_BYTE * len(data):
         raise PhotographError(
-            f"{path.name}: {size[0]} x {size[1]} px in {len(data)} bytes is no photograph; "
+            f"{path.name}: {size[0]} x {size[1]} px in {len(data)} bytes is not a photograph; "
             f"a file of that size has at least {pixels // BOMB_PX_PER_BYTE} bytes"
         )
     scans = data.count(b"\xff\xda") if data.startswith(b"\xff\xd8") else 1

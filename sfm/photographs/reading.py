@@ -92,7 +92,7 @@ class PhotographFiles(Sequence[AnyArray]):
         return PhotographFiles(self._paths[k]) if isinstance(k, slice) else read_photograph(self._paths[k])
 
 
-def take_back_srgb(photograph: AnyArray) -> AnyArray:
+def linearise_srgb(photograph: AnyArray) -> AnyArray:
     """Return the linear light of a photograph with the tone curve of sRGB, as uint16.
 
     A tone curve moves the half-bright position of an edge, inwards around dark targets. Centres of circles

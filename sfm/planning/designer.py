@@ -161,11 +161,8 @@ class _Designer:
         )
 
     def _cofactors(self, chosen: Sequence[int]) -> FloatArray:
-        return (
-            np.linalg.inv(self.prior + self.single[list(chosen)].sum(axis=0))
-            if len(chosen)
-            else np.tile(np.linalg.inv(self.prior), (len(self.planned.names), 1, 1))
-        )
+        """Return the covariance of each point with the chosen photographs, (n, 3, 3)."""
+        return np.asarray(np.linalg.inv(self.prior + self.single[list(chosen)].sum(axis=0)))
 
     def _open(self, chosen: Sequence[int]) -> BoolArray:
         """Return the candidates that may be taken: each station once, either upright or rolled."""
@@ -234,8 +231,7 @@ class _Designer:
             chosen, prediction, short = tried, other, other_short
         if prediction is None:
             raise GeometryError(
-                "plan: the stations that are allowed do not make a network: fewer than two of them share "
-                "enough points"
+                "plan: the allowed stations do not make a network: fewer than two of them share enough points"
             )
         return chosen, prediction, short
 
@@ -249,8 +245,7 @@ class _Designer:
                 fewer = chosen[: int(k)] + chosen[int(k) + 1 :]
                 new, new_short = self._full(fewer)
                 if new_short > 1:
-                    fewer, new_, new_short = self._exchanged(fewer)
-                    new = new_
+                    fewer, new, new_short = self._exchanged(fewer)
                 if new is not None and new_short <= 1:
                     chosen, prediction, short = fewer, new, new_short
                     break
@@ -345,7 +340,7 @@ def candidates(
         rotation.append(ways[best])
         counted += 1
     if counted < 2:
-        raise GeometryError(_no_room(planned, least, most, inside))
+        raise GeometryError(_no_room(least, most, inside))
     places, ways = np.array(position), np.array(rotation)
     names = tuple(f"{k + 1}" for k in range(2 * counted))
     stations = Stations(names, np.tile(places, (2, 1)), np.concatenate([ways, rolled(ways)]))
@@ -378,13 +373,13 @@ def _room(planned: PlannedObject, allowed: StationLimits, most: float) -> tuple[
         low[2] = max(low[2], allowed.floor)
     if not (low < high).all():
         raise GeometryError(
-            f"plan: no room within {most:g} of the object in the space and above the floor that are allowed; "
-            "needed a space that reaches to the object"
+            f"plan: no room within {most:g} of the object inside the allowed space and above the floor; "
+            "needed a space that reaches the object"
         )
     return low, high
 
 
-def _no_room(planned: PlannedObject, least: float, most: float, inside: int) -> str:
+def _no_room(least: float, most: float, inside: int) -> str:
     if not inside:
         return (
             f"plan: no station is {least:g} to {most:g} from the object in the space that is allowed; needed "
@@ -417,7 +412,7 @@ def image_rows(planned: PlannedObject, camera: Camera, stations: Stations, sight
         stations: m stations.
         sight: visibility of n points in their photographs.
     """
-    m, n = sight.why.shape
+    m, n = sight.visibility.shape
     rows = np.zeros((m, n, 2, 3))
     for i in range(m):
         used = np.flatnonzero(sight.seen[i])

@@ -131,8 +131,7 @@ def object_of_mesh(
     if reversed_:
         raise GeometryError(
             f"mesh: at {counted(reversed_, 'edge')} neighbouring triangles run in opposite directions, so "
-            "that "
-            "inside and outside are not known; turn its triangles to run alike"
+            "that inside and outside are not known; turn its triangles to run alike"
         )
     corners = mesh.vertices[mesh.triangles]
     if not edges and np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:

@@ -326,7 +326,8 @@ def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBar
         i, j = (index_of(planned.names, name, "point of a scale bar") for name in (bar.start, bar.end))
         if i == j or not (np.isfinite(bar.sigma) and bar.sigma > 0):
             raise GeometryError(
-                f"scale bar {bar.start} - {bar.end}: sigma {bar.sigma:g}, needed two points and one above 0"
+                f"scale bar {bar.start} - {bar.end}: sigma {bar.sigma:g}, needed two points and a "
+                "sigma above 0"
             )
         if place[i] >= 0 and place[j] >= 0:
             length = float(np.linalg.norm(planned.xyz[i] - planned.xyz[j]))

@@ -66,8 +66,8 @@ SAME_RAY = (
 BORDER_PX = 2.0  # between a target and the edge of the photograph
 
 
-class Why(IntEnum):
-    """Why a photograph does not show a point."""
+class Visibility(IntEnum):
+    """Whether a photograph shows a point, or why it does not."""
 
     SEEN = 0
     OUTSIDE = 1  # the photograph or behind the camera
@@ -78,11 +78,11 @@ class Why(IntEnum):
 
 
 WORDS = {
-    Why.OUTSIDE: "outside the photograph",
-    Why.OBLIQUE: "too oblique",
-    Why.HIDDEN: "hidden by the surface",
-    Why.UNSHARP: "not sharp",
-    Why.SMALL: "too few pixels",
+    Visibility.OUTSIDE: "outside the photograph",
+    Visibility.OBLIQUE: "too oblique",
+    Visibility.HIDDEN: "hidden by the surface",
+    Visibility.UNSHARP: "not sharp",
+    Visibility.SMALL: "too few pixels",
 }
 
 
@@ -111,9 +111,9 @@ class Seeing:
 
 @dataclass(frozen=True)
 class Sight:
-    """Visibility of n points in m photographs."""
+    """The n points in m photographs: their visibility, and image points with covariance."""
 
-    why: AnyArray  # values of Why, (m, n)
+    visibility: AnyArray  # values of `Visibility`, (m, n)
     xy: FloatArray  # image points, px; NaN behind the camera, (m, n, 2)
     covariance: FloatArray  # of an image point, px^2; NaN if it is not seen, (m, n, 2, 2)
     diameter_px: (
@@ -123,13 +123,13 @@ class Sight:
     @property
     def seen(self) -> BoolArray:
         """Which photograph shows which point, (m, n)."""
-        return np.asarray(self.why == Why.SEEN)
+        return np.asarray(self.visibility == Visibility.SEEN)
 
     def of(self, photographs: AnyArray) -> Sight:
         """Return the visibility in the selected photographs."""
         return replace(
             self,
-            why=self.why[photographs],
+            visibility=self.visibility[photographs],
             xy=self.xy[photographs],
             covariance=self.covariance[photographs],
             diameter_px=self.diameter_px[photographs],
@@ -154,7 +154,7 @@ def sight_of(
     Source: Mason (1997), Photogramm. Eng. Remote Sens. 63(9).
     """
     m, n = len(position), len(planned.xyz)
-    why = np.empty((m, n), dtype=np.uint8)
+    visibility = np.empty((m, n), dtype=np.uint8)
     xy, covariance = np.empty((m, n, 2)), np.empty((m, n, 2, 2))
     diameter = np.empty((m, n))
     hidden: dict[bytes, BoolArray] = {}
@@ -162,10 +162,10 @@ def sight_of(
         key = position[i].tobytes()  # photographs of one station that differ in their roll
         if key not in hidden:
             hidden[key] = _turned_away_or_hidden(planned, position[i])
-        why[i], xy[i], covariance[i], diameter[i] = _photograph(
+        visibility[i], xy[i], covariance[i], diameter[i] = _photograph(
             planned, camera, position[i], rotation[i], seeing, hidden[key]
         )
-    return Sight(why, xy, covariance, diameter)
+    return Sight(visibility, xy, covariance, diameter)
 
 
 def _turned_away_or_hidden(planned: PlannedObject, position: FloatArray) -> BoolArray:
@@ -195,30 +195,30 @@ def _photograph(
     looked_at = np.flatnonzero(inside)
     back = tangents_from_pixel(camera, xy[looked_at]) - UVW[looked_at, :2] / -UVW[looked_at, 2:]
     inside[looked_at] = np.abs(back).max(axis=1, initial=0.0) < SAME_RAY  # NaN also fails
-    why = np.where(inside, Why.SEEN, Why.OUTSIDE).astype(np.uint8)
+    visibility = np.where(inside, Visibility.SEEN, Visibility.OUTSIDE).astype(np.uint8)
     ray = position - planned.xyz
     ray /= np.maximum(
         np.linalg.norm(ray, axis=1, keepdims=True), 1e-300
     )  # a station at a point does not see it
     cosine = (planned.normals * ray).sum(axis=1)
     oblique = cosine < np.cos(np.radians(seeing.max_incidence_deg))
-    why[inside & oblique] = Why.OBLIQUE
-    why[inside & hidden & ~(oblique & (cosine > 0))] = Why.HIDDEN
-    why[inside & (cosine <= 0)] = Why.OBLIQUE
+    visibility[inside & oblique] = Visibility.OBLIQUE
+    visibility[inside & hidden & ~(oblique & (cosine > 0))] = Visibility.HIDDEN
+    visibility[inside & (cosine <= 0)] = Visibility.OBLIQUE
     if seeing.depth is not None:
         sharp = (depth >= seeing.depth.near) & (depth <= seeing.depth.far)
-        why[(why == Why.SEEN) & ~sharp] = Why.UNSHARP
+        visibility[(visibility == Visibility.SEEN) & ~sharp] = Visibility.UNSHARP
     covariance, shorter = np.full((n, 2, 2), np.nan), np.full(n, np.nan)
-    used = np.flatnonzero(why == Why.SEEN)
+    used = np.flatnonzero(visibility == Visibility.SEEN)
     if seeing.diameter is not None and len(used):
         axes = _outlines(planned, camera, rotation, seeing.diameter, used, UVW[used], xy[used], ray[used])
         shorter[used] = 2 * np.linalg.svd(axes, compute_uv=False)[:, 1]
         covariance[used] = centre_covariance(axes, seeing.target)
-        why[used[shorter[used] < seeing.min_diameter_px]] = Why.SMALL
+        visibility[used[shorter[used] < seeing.min_diameter_px]] = Visibility.SMALL
     if seeing.sigma_px is not None:
         covariance[used] = seeing.sigma_px**2 * np.eye(2)
-    covariance[why != Why.SEEN] = np.nan
-    return why, xy, covariance, shorter
+    covariance[visibility != Visibility.SEEN] = np.nan
+    return visibility, xy, covariance, shorter
 
 
 def _outlines(

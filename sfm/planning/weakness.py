@@ -35,7 +35,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, spread_evenly, usable
-from sfm.planning.visibility import WORDS, Seeing, Why
+from sfm.planning.visibility import WORDS, Seeing, Visibility
 from sfm.reduced_network import reduce_network
 from sfm.similarity import OPEN, motions_along
 
@@ -118,9 +118,9 @@ def reason_of(prediction: Prediction, j: int) -> str:
     if np.isfinite(angle):
         words.append(f"{angle:.0f} degrees")
     if rays < MIN_RAYS:
-        why = prediction.sight.why[:, j]
-        counts = [(int((why == kind).sum()), WORDS[kind]) for kind in Why if kind != Why.SEEN]
-        seen_by_few = int(((why == Why.SEEN) & (prediction.photograph < 0)).sum())
+        why = prediction.sight.visibility[:, j]
+        counts = [(int((why == kind).sum()), WORDS[kind]) for kind in Visibility if kind != Visibility.SEEN]
+        seen_by_few = int(((why == Visibility.SEEN) & (prediction.photograph < 0)).sum())
         counts.append((seen_by_few, f"in photographs that share fewer than {MIN_POINTS} points with others"))
         words += [f"{what} in {count}" for count, what in sorted(counts, reverse=True) if count]
     elif (by := prediction.motion_variance[j]).sum() > prediction.sigma[j] ** 2 / 2:

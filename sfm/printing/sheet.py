@@ -46,8 +46,7 @@ LABEL_MM = 4.0  # room for the id below a target
 # Clear radius around a target, in radii of its ring, so that neighbours are not read as code.
 CLEAR = 1.35
 # Printers of 600 dots per inch print 24 dots across the smallest target, and 6 across a module of the
-# smallest tag
-# or the narrowest ring of the smallest concentric tag.
+# smallest tag or the narrowest ring of the smallest concentric tag.
 MIN_DOT_MM, MIN_MODULE_MM = 1.0, 0.25
 DEFAULT_TARGETS = 100
 MAX_LETTERS = 40  # of the name of a code table, so that its line fits on the page
@@ -136,7 +135,7 @@ def lay_out_sheet(
         )
     if ring_radii is not None:
         if not isinstance(codes, CodeFamily):
-            raise SurveyFileError(f"targets: radii of the ring are of rings, {codes.name} has none")
+            raise SurveyFileError(f"targets: radii of the ring belong to rings, {codes.name} has none")
         if not 1 < ring_radii[0] < ring_radii[1]:
             raise SurveyFileError(
                 f"targets: radii of the ring are {ring_radii[0]:g} and {ring_radii[1]:g} radii of the dot, "
@@ -185,7 +184,7 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
         The written files; either all of them appear, or none.
 
     Raises:
-        OutputError: another ending, a file at this path that is no sheet, or the file cannot be written.
+        OutputError: another ending, a file at this path that is not a sheet, or the file cannot be written.
     """
     if path.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{path}: a sheet is written as .pdf or .svg")
@@ -204,12 +203,12 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
 
 
 def _refuse_other_files(path: Path) -> None:
-    """Raise OutputError if the path exists and is no earlier sheet, which would be lost."""
+    """Raise OutputError if the path exists and is not an earlier sheet, which would be lost."""
     with disk_errors(f"{path}: the sheet cannot be written"):
         if path.is_dir():
             raise OutputError(f"{path}: is a folder, needed the name of a file")
         if path.exists() and not (path.is_file() and CHECK.encode() in _head(path)):
-            raise OutputError(f"{path}: exists and is no earlier sheet, needed another name")
+            raise OutputError(f"{path}: exists and is not an earlier sheet, needed another name")
 
 
 def _head(path: Path) -> bytes:

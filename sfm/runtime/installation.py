@@ -124,7 +124,7 @@ def refuse_folder_settings() -> None:
     for name in SETTINGS:
         if os.path.lexists(name):
             raise KolinearError(
-                f"the current folder, {os.getcwd()}, contains '{name}', by which it would decide what is "
+                f"the current folder, {os.getcwd()}, contains '{name}', which would decide what is "
                 "computed or run; start Kolinear from another folder, or remove the file"
             )
 

@@ -46,13 +46,13 @@ class Silent:
     """Progress that is not shown."""
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Take note of nothing."""
+        """Ignore the stage."""
 
     def advance(self, step: str = "") -> None:
-        """Take note of nothing."""
+        """Ignore the step."""
 
     def step(self, name: str, done: int | None = None, total: int | None = None) -> None:
-        """Take note of nothing."""
+        """Ignore the work."""
 
 
 SILENT: Progress = Silent()

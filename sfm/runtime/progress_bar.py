@@ -12,7 +12,7 @@ from rich.text import Text
 
 
 @contextmanager
-def drawn_progress(console: Console | None = None) -> Iterator[Drawn]:
+def drawn_progress(console: Console | None = None) -> Iterator[DrawnProgress]:
     """Show a progress bar if stderr is a terminal, to which only errors are written otherwise.
 
     Args:
@@ -28,13 +28,13 @@ def drawn_progress(console: Console | None = None) -> Iterator[Drawn]:
         console=console,
         disable=not console.is_terminal,
     ) as bar:
-        drawn = Drawn(bar)
+        drawn = DrawnProgress(bar)
         yield drawn
         drawn.stage("done", 1)
         bar.remove_task(bar.task_ids[-1])
 
 
-class Drawn:
+class DrawnProgress:
     """Progress as a bar on the terminal: the stage, its present work, and the finished photographs."""
 
     def __init__(self, bar: Progress) -> None:

@@ -127,7 +127,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
     if survey.tie_points is not None:
         sections.append(("tie_points", survey.tie_points))
     sections += [("datum", survey.datum), ("adjust", survey.adjust), ("compare", survey.compare)]
-    rows = [(name, _words(section.model_dump())) for name, section in sections]
+    rows = [(name, _format_values(section.model_dump())) for name, section in sections]
     given = [
         (one, len(values.names))
         for one, values in (
@@ -145,18 +145,18 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
     return tuple(rows)
 
 
-def _words(values: dict[str, Any]) -> str:
+def _format_values(values: dict[str, Any]) -> str:
     """Format the keys whose values are not empty."""
     return "; ".join(
-        f"{key} = {_word(value)}"
+        f"{key} = {_format_value(value)}"
         for key, value in values.items()
         if key != "name" and value is not None and value != ()
     )
 
 
-def _word(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"[{', '.join(_word(one) for one in value)}]"
+        return f"[{', '.join(_format_value(one) for one in value)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -178,7 +178,7 @@ ALONE = OtherPrograms()
 
 @dataclass(frozen=True)
 class SurveyComparison:
-    """Comparisons of a survey with other programs; None where there is none."""
+    """Comparisons of a survey with other programs; None for a comparison that was not made."""
 
     adjusters: AdjusterComparison | None = None
     baseline: BaselineComparison | None = None
@@ -191,7 +191,7 @@ def compare_solution(
     """Compare a solution with those of other programs.
 
     The survey is valid without them: if one of them fails, the result has a warning. A library that is not
-    installed gives a remark but no warning, since that is no defect of the survey.
+    installed gives a remark but no warning, since that is not a defect of the survey.
 
     Args:
         solution: solution of the survey.

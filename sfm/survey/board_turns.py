@@ -47,7 +47,7 @@ class _Rig:
     """A relative orientation of two cameras, and how pairs of photographs agree with it."""
 
     turn: IntArray  # turn of the plate in the right photograph, 0 if both have the same names, (p,)
-    misfit: FloatArray  # RMS distance of its points from their positions by the left photograph, px, (p,)
+    misfit: FloatArray  # RMS distance of its points from their predicted positions, px, (p,)
     agrees: BoolArray  # whether each point is nearest to the predicted position of its number, (p,)
 
     @classmethod

@@ -123,10 +123,10 @@ def circle_misfit(
 def _seen_twice(
     photographs: MeasuredPhotographs, naming: Naming, network: Network, estimate: Estimate
 ) -> BoolArray:
-    """Return which image points are of targets with outlines in two or more oriented photographs, (k,)."""
+    """Return which image points belong to targets with outlines in two or more oriented photographs, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _named(photographs, naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
+    rows &= _named(naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
 
@@ -197,7 +197,7 @@ def _other_sizes(
     return tuple(remarks)
 
 
-def _named(photographs: MeasuredPhotographs, naming: Naming, values: list[AnyArray]) -> AnyArray:
+def _named(naming: Naming, values: list[AnyArray]) -> AnyArray:
     """Return the values of the named targets in the order of the image points, (k, ...).
 
     values: one array for each photograph, with a row for each of its targets.
@@ -216,7 +216,7 @@ def _views(
 ) -> CircleViews:
     """Return the ellipses of the selected image points, with their rays."""
     shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
-    shape = _named(photographs, naming, shapes)[rows]
+    shape = _named(naming, shapes)[rows]
     seen = network.image_points.select(rows)
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]

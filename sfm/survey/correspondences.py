@@ -151,7 +151,7 @@ def _without_other_objects(
 def _without_contested(
     photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, found: ContestedCodes
 ) -> Estimate:
-    """Return the estimate without left-out photographs, and with contested codes intersected anew."""
+    """Return the estimate without left-out photographs, and with contested codes intersected again."""
     position, rotation, points = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
     out = list(found.left_out)
     position[out], rotation[out] = np.nan, np.nan

@@ -193,7 +193,7 @@ def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
 
 
 def _defect_of_points(part: Network, found: Adjustment) -> int:
-    """Return the rank defect that points with rejected rays add; it is no defect of the cameras."""
+    """Return the rank defect that points with rejected rays add; it is not a defect of the cameras."""
     rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
     known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
     if found.datum == "control":

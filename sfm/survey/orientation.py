@@ -48,14 +48,12 @@ from sfm.survey.rigs import mount_cameras
 
 FISHEYE = "opencv_fisheye"
 # c of a central perspective over half the diagonal. Below it the corner is more than 45 degrees off the axis,
-# where
-# equal angles and equal tangents differ by more than a tenth of the half diagonal.
+# where equal angles and equal tangents differ by more than a tenth of the half diagonal.
 WIDE_C = 1.0
 # If at least this share of the image points fits a central perspective, no other model is tried.
 MIN_FITTING_FRACTION = 0.9
 # Points of natural texture that take part in the orientation: those with the most rays, and at least so many
-# of
-# every photograph.
+# of every photograph.
 ORIENTATION_POINTS, POINTS_PER_PHOTOGRAPH = 400, 100
 CONTROL_OF_CAMERA = 6  # control points in the datum with which two photographs determine their camera
 

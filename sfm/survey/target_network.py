@@ -29,8 +29,7 @@ from sfm.targets.outlines import Flag
 
 UNNAMED = -1
 # Relative standard deviation of the size of tags where the survey states none. Prints of desktop printers,
-# and
-# those made by mistake with the setting "fit to page", differ by this much once checked with a ruler.
+# and those made by mistake with the setting "fit to page", differ by this much once checked with a ruler.
 TAG_SIGMA = 0.002
 MAX_SEMI_AXES = 4.0  # a target nearer to its point than this many of its semi-axes is not another target
 MIN_RAYS = 3  # photographs that must agree on an uncoded point; two rays cannot contradict each other

@@ -77,7 +77,7 @@ def test_the_page_lies_beside_the_folder_and_is_replaced_only_if_it_is_ours(
     assert f"Page: {page}" in capsys.readouterr().out
     assert len(data_of(page)[1]["thumbnail.length"]) == 6  # of the folder pictures of the result
     page.write_text("<p>mine", encoding="utf-8")
-    with pytest.raises(OutputError, match=r"out\.html: is there already and is left alone"):
+    with pytest.raises(OutputError, match=r"out\.html: exists already and is left alone"):
         view(result_folder, browser=False, budget=1.0)
     assert page.read_text(encoding="utf-8") == "<p>mine"
     page.unlink()

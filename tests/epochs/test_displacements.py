@@ -240,7 +240,7 @@ def test_bad_input_is_one_line() -> None:
     moved = find_displacements(found)
     with pytest.raises(GeometryError, match=r"group pier: 2 points, a rigid motion needs 3 or more"):
         block_motion(moved, np.arange(POINTS) < 2, name="pier")
-    with pytest.raises(GeometryError, match="0 stable points outside of it"):
+    with pytest.raises(GeometryError, match="0 stable points outside it"):
         block_motion(moved, np.ones(POINTS, dtype=bool), name="all")
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
         block_motion(moved, np.arange(POINTS) < 9, name="pier", model="bent")

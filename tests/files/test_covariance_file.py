@@ -77,7 +77,7 @@ def test_of_another_table_or_damaged_is_refused(tmp_path: Path) -> None:
         read_covariance(tmp_path, NAMES, 1.01 * sigma)
     data = (tmp_path / NAME).read_bytes()
     (tmp_path / NAME).write_bytes(b"\x00" * 128 + data[128:])
-    with pytest.raises(SurveyFileError, match="is no array"):
+    with pytest.raises(SurveyFileError, match="not an array"):
         read_covariance(tmp_path, NAMES, sigma)
     (tmp_path / NAME).write_bytes(data.replace(b"<f8", b"<i8"))
     with pytest.raises(SurveyFileError, match="finite numbers of 8 bytes"):
@@ -234,7 +234,7 @@ def test_single_photographs_have_no_rig_tables(tmp_path: Path) -> None:
             "moments.csv",
             "moment 2 camera 1,2\n",
             "",
-            "photograph moment 2 camera 1 of camera camera 1 is missing",
+            "photograph moment 2 camera 1 of camera camera 1, which is on a rig, is missing",
         ),
         ("moments.csv", "moment 2 camera 1", "x", "moments.csv: image 'x' is not in images.csv"),
     ],
@@ -257,7 +257,7 @@ def test_covariance_of_other_rigs_is_refused(solved: Solution, tmp_path: Path) -
     with np.load(path) as arrays:
         found = dict(arrays)
     np.savez(path, **(found | {"rigs": found["rigs"][1:, 1:]}))
-    with pytest.raises(SurveyFileError, match="covariances of other photographs or cameras"):
+    with pytest.raises(SurveyFileError, match="its photographs or cameras are not those"):
         read_result(tmp_path / "t")
 
 

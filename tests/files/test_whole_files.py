@@ -47,7 +47,7 @@ def test_files_and_folders_are_written_with_and_without_handles(handles: bool, t
         for path in ("a/out/file", "b/out/file", "c/file"):
             assert (tmp_path / path).read_text() == text
     assert sorted(path.name for path in tmp_path.glob("*/*")) == ["file", "out", "out"]
-    with pytest.raises(OutputError, match="file: is there already"), whole_file(tmp_path / "c" / "file"):
+    with pytest.raises(OutputError, match="file: exists already"), whole_file(tmp_path / "c" / "file"):
         raise AssertionError
     (tmp_path / "link").symlink_to(tmp_path / "a")
     for whole in (whole_folder, whole_files, whole_file):
@@ -61,7 +61,7 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
     (tmp_path / "file").write_text("text")
     with pytest.raises(OutputError, match="file/out: cannot be written here: Not a directory"):
         refuse_unwritable(tmp_path / "file" / "out")
-    with pytest.raises(OutputError, match="file: is there already"):
+    with pytest.raises(OutputError, match="file: exists already"):
         refuse_unwritable(tmp_path / "file")
 
 
@@ -99,7 +99,7 @@ def test_a_part_that_is_exchanged_meanwhile_is_not_moved(tmp_path: Path) -> None
     out = tmp_path / "given" / "file"
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "file").write_text("of the user")
-    with pytest.raises(OutputError, match="was exchanged while it was written"), whole_file(out) as part:
+    with pytest.raises(OutputError, match="was replaced while it was written"), whole_file(out) as part:
         part.parent.rename(tmp_path / "given" / "other")
         part.parent.symlink_to(tmp_path / "home")
     assert (tmp_path / "home" / "file").read_text() == "of the user"

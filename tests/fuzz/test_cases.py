@@ -97,7 +97,7 @@ def png(width: int, height: int, rows: bytes) -> bytes:
     ("width", "height", "match"),
     [
         (100_000, 100_000, r"photographs of at most 250 million pixels are read"),
-        (15_000, 16_000, r"15000 x 16000 px in \d+ bytes is no photograph"),
+        (15_000, 16_000, r"15000 x 16000 px in \d+ bytes is not a photograph"),
         (2**31 - 1, 2**31 - 1, r"."),
     ],
 )

@@ -487,7 +487,7 @@ def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
     text = (Path(render.__file__).parent / "survey.toml").read_text(encoding="utf-8")
     survey = tmp_path / "survey.toml"
     survey.write_text(text.replace('codes = "none"', 'codes = "arcs"'), encoding="utf-8")
-    with pytest.raises(SurveyFileError, match=r"tie_points.*take the place of targets"):
+    with pytest.raises(SurveyFileError, match=r"tie_points.*replace targets"):
         read_survey(survey)
     survey.write_text(text.replace('detector = "foerstner"', "window_px = 14"), encoding="utf-8")
     with pytest.raises(SurveyFileError, match="window_px = 14, needed an odd number"):

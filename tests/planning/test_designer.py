@@ -226,7 +226,7 @@ def test_displacements_and_lengths_that_are_wanted() -> None:
         unseen, WantedPrecision(length_sigma=p.length_sigma), np.arange(20) != 4
     ) == pytest.approx(1, abs=0.2)
     lonely = replace(p, sight=p.sight.of(np.arange(6)))
-    lonely.sight.why[MIN_RAYS - 1 :, 0] = 1
+    lonely.sight.visibility[MIN_RAYS - 1 :, 0] = 1
     assert short_of(lonely, WantedPrecision(sigma=1.0), every) == np.inf
     with pytest.raises(GeometryError, match="wanted sigma is -1"):
         WantedPrecision(sigma=-1.0)

@@ -25,7 +25,7 @@ from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import ScaleBarPlan, WantedPrecision, predict_network
 from sfm.planning.stations import arrangement
-from sfm.planning.visibility import Seeing, TargetImage, Why
+from sfm.planning.visibility import Seeing, TargetImage, Visibility
 from sfm.planning.weakness import contributions, open_counts, reason_of
 from sfm.report.pages import write_page
 from tests.cli.test_planning_commands import plan
@@ -197,12 +197,12 @@ def test_a_rig_without_which_nothing_is_determined_gives_all_points() -> None:
     stations = arrangement("ring:6", plate, cameras[0]).with_rig(truth.mounts, cameras)
     seeing = Seeing(sigma_px=0.1)
     whole = predict_network(plate, cameras, stations, seeing)
-    why = whole.sight.why.copy()
+    why = whole.sight.visibility.copy()
     for k in range(6):
         for camera in (0, 1):
             shown = (np.arange(3) + 3 * camera + k) % 8
-            why[2 * k + camera, ~np.isin(np.arange(8), shown)] = Why.OUTSIDE
-    narrow = predict_network(plate, cameras, stations, seeing, sight=replace(whole.sight, why=why))
+            why[2 * k + camera, ~np.isin(np.arange(8), shown)] = Visibility.OUTSIDE
+    narrow = predict_network(plate, cameras, stations, seeing, sight=replace(whole.sight, visibility=why))
     (rig,) = contributions(narrow)
     assert rig.points == narrow.determined.sum() > 0 and rig.sigma_without == np.inf
 

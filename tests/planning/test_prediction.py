@@ -161,7 +161,7 @@ def test_a_weak_point_is_named_with_its_reason() -> None:
         np.concatenate([stations.rotation, [two, two]]),
     )
     seen = sight_of(planned, CAMERA, every.position, every.rotation, SEEING)
-    seen.why[:4, -1] = 1
+    seen.visibility[:4, -1] = 1
     p = predict_network(planned, CAMERA, every, SEEING, sight=seen)
     first = weak_points(p)[0]
     assert first.name == "far" and first.reason.startswith("2 rays, 9 degrees, outside the photograph in 4")

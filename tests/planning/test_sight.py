@@ -25,7 +25,7 @@ from sfm.planning.visibility import (
     Lens,
     Seeing,
     TargetImage,
-    Why,
+    Visibility,
     best_focus,
     centre_covariance,
     depth_of_field,
@@ -78,7 +78,7 @@ def test_a_box_shows_three_sides_and_its_bottom_never() -> None:
     box = shape_object("box", (1.0, 1.0, 1.0), 300)
     seen = sight_of(box, CAMERA, np.array([[3.0, 3.0, 3.5]]), looking(np.array([-3.0, -3, -3]))[None], WIDE)
     faces = box.normals @ np.array([1.0, 1.0, 1.0]) > 0.5
-    assert (seen.why[0] == Why.SEEN).tolist() == faces.tolist()
+    assert (seen.visibility[0] == Visibility.SEEN).tolist() == faces.tolist()
     assert box.normals[:, 2].min() > -0.5
 
 
@@ -91,14 +91,22 @@ def test_incidence_format_and_unknown_normals() -> None:
     xyz = np.array([[0.0, 0, 0], [0, 0.1, 0], [0.1, 0, 0], [0.1, 0.1, 0], [-0.1, 0, 0]])
     planned = object_of_points(tuple("abcde"), xyz, normals)
     above, down = np.array([[0.0, 0.0, 10.0]]), looking(np.array([0.0, 0, -1]))[None]
-    why = sight_of(planned, CAMERA, above, down, Seeing(sigma_px=0.1)).why[0]
-    assert [Why(w) for w in why] == [Why.SEEN, Why.SEEN, Why.OBLIQUE, Why.OBLIQUE, Why.OBLIQUE]
+    why = sight_of(planned, CAMERA, above, down, Seeing(sigma_px=0.1)).visibility[0]
+    assert [Visibility(w) for w in why] == [
+        Visibility.SEEN,
+        Visibility.SEEN,
+        Visibility.OBLIQUE,
+        Visibility.OBLIQUE,
+        Visibility.OBLIQUE,
+    ]
     unknown = replace(planned, normals=np.full((5, 3), np.nan))
-    assert (sight_of(unknown, CAMERA, above, down, Seeing(sigma_px=0.1)).why[0] == Why.SEEN).all()
+    assert (
+        sight_of(unknown, CAMERA, above, down, Seeing(sigma_px=0.1)).visibility[0] == Visibility.SEEN
+    ).all()
     # the photograph is 10 mm wide at c = 10 mm: at a distance of 10 it ends 5 from the axis
     wide = object_of_points(("in", "out", "behind"), np.array([[4.9, 0, 0], [5.1, 0, 0], [0, 0, 20.0]]), None)
-    why = sight_of(wide, CAMERA, above, down, Seeing(sigma_px=0.1)).why[0]
-    assert [Why(w) for w in why] == [Why.SEEN, Why.OUTSIDE, Why.OUTSIDE]
+    why = sight_of(wide, CAMERA, above, down, Seeing(sigma_px=0.1)).visibility[0]
+    assert [Visibility(w) for w in why] == [Visibility.SEEN, Visibility.OUTSIDE, Visibility.OUTSIDE]
 
 
 def test_depth_of_field_by_the_rays_of_the_lens() -> None:
@@ -115,8 +123,8 @@ def test_depth_of_field_by_the_rays_of_the_lens() -> None:
     seeing = Seeing(sigma_px=0.1, depth=DepthOfField(0.9, 1.1, 1.0))
     why = sight_of(
         planned, CAMERA, np.array([[0.0, 0, 1]]), looking(np.array([0.0, 0, -1]))[None], seeing
-    ).why[0]
-    assert [Why(w) for w in why] == [Why.SEEN, Why.UNSHARP, Why.UNSHARP]
+    ).visibility[0]
+    assert [Visibility(w) for w in why] == [Visibility.SEEN, Visibility.UNSHARP, Visibility.UNSHARP]
 
 
 @pytest.mark.parametrize(
@@ -161,7 +169,7 @@ def test_the_outline_of_a_target_is_that_of_its_projection() -> None:
         found.diameter_px[0, 0], rel=0.01
     )
     small = sight_of(planned, CAMERA, position[None], rotation[None], Seeing(diameter=0.002))
-    assert (small.why[0] == Why.SMALL).all() and np.isnan(small.covariance).all()
+    assert (small.visibility[0] == Visibility.SMALL).all() and np.isnan(small.covariance).all()
 
 
 def test_meshes_with_holes_are_refused_unless_open() -> None:

@@ -104,7 +104,7 @@ def test_rings_of_other_radii_are_printed_and_read(tmp_path):
     usual = find_targets(picture, polarity="dark", codes="ring12", min_diameter_px=40)
     assert (usual.code < 0).all()
     for radii in ((0.9, 2.0), (2.0, 2.0)):
-        with pytest.raises(SurveyFileError, match="radii of the ring are"):
+        with pytest.raises(SurveyFileError, match="radii of the ring"):
             lay_out_sheet("ring12", np.arange(1, 9), diameter_mm=8.0, ring_radii=radii)
 
 
@@ -214,7 +214,7 @@ def test_any_name_of_a_code_table_is_written_as_text(tmp_path, name):
 
 
 def test_what_is_ignored_or_unprintable_is_refused():
-    with pytest.raises(SurveyFileError, match="radii of the ring are of rings, apriltag36h11 has none"):
+    with pytest.raises(SurveyFileError, match="radii of the ring belong to rings, apriltag36h11 has none"):
         lay_out_sheet("apriltag36h11", np.arange(4), diameter_mm=40.0, ring_radii=(2.0, 3.0))
     with pytest.raises(SurveyFileError, match="number 1 is named 3 times"):
         lay_out_sheet("ring14", np.array([1, 2, 1, 1]), diameter_mm=10.0)
@@ -234,7 +234,7 @@ def test_only_earlier_sheets_are_replaced(tmp_path):
         write_sheet(sheet, tmp_path / "d.pdf")
     for name, other in (("o.pdf", b"%PDF-1.4 a letter"), ("o-2.svg", b"<svg/>")):
         (tmp_path / name).write_bytes(other)
-        with pytest.raises(OutputError, match="exists and is no earlier sheet"):
+        with pytest.raises(OutputError, match="exists and is not an earlier sheet"):
             write_sheet(sheet, tmp_path / name.replace("-2", ""))
         assert (tmp_path / name).read_bytes() == other
     assert not (tmp_path / "o-1.svg").exists()

@@ -21,7 +21,7 @@ from sfm.remarks.remark import of_kind
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import reverse_depth
 from sfm.survey.adjusting.settling import held_to_converge, nearer_start
-from sfm.survey.adjusting.solution_remarks import far_principal_distances, unlike_squares
+from sfm.survey.adjusting.solution_remarks import remarks_on_pixel_sides, remarks_on_principal_distances
 from sfm.survey.inputs.survey import CameraSetup
 from tests.survey.weak_networks import _measured, _stations
 from tests.surveys import survey_of
@@ -60,7 +60,7 @@ def test_nominal_sensor_sizes_that_make_odd_pixels_are_reported(
     settings: dict[str, tuple[float, float]], pixel: tuple[float, float], free: tuple[str, ...], told: bool
 ) -> None:
     camera = CameraSetup(name="a", images="*.png", free=free, **settings)
-    remarks = unlike_squares([camera], [camera_from_values("a", "brown", (60, 40), pixel, c_mm=50.0)])
+    remarks = remarks_on_pixel_sides([camera], [camera_from_values("a", "brown", (60, 40), pixel, c_mm=50.0)])
     assert [one.kind for one in remarks] == (["pixels_not_square"] if told else [])
 
 
@@ -71,22 +71,22 @@ def test_c_far_from_its_start_value_is_reported(model: str) -> None:
     estimate = replace(truth, cameras=(name,))
     network, brown = make_network(seed_of("far c"), images=3, points=12)
     survey = survey_of(network, brown)  # says c_mm = 10
-    assert far_principal_distances(survey, estimate, [0.01]) == ()
+    assert remarks_on_principal_distances(survey, estimate, [0.01]) == ()
     p = name.parameters.copy()
     p[: 1 if name.in_mm else 2] *= 0.22
     for factor, told in ((0.85, False), (1.15, False), (0.75, True), (1.35, True)):
         near = name.with_parameters(np.where(name.parts[0], factor * name.parameters, name.parameters))
-        remarks = far_principal_distances(survey, replace(estimate, cameras=(near,)), [0.01])
+        remarks = remarks_on_principal_distances(survey, replace(estimate, cameras=(near,)), [0.01])
         assert len(remarks) == told
     far = replace(estimate, cameras=(name.with_parameters(p),))
     c = abs(far.cameras[0].parameters[0])
     for share, severity in ((4.9e-4, "note"), (5.1e-4, "warning"), (np.nan, "warning")):
-        (one,) = far_principal_distances(survey, far, [share * c])
+        (one,) = remarks_on_principal_distances(survey, far, [share * c])
         assert one.severity == severity
     assert one.kind == "c_far_from_given" and one.names("camera") == ("synthetic",)
     assert [one.number(name) for name in ("given", "found", "change")] == pytest.approx([10, 2.2, -78])
     held = replace(estimate, cameras=(replace(far.cameras[0], free=name.free & False),))
-    (one,) = far_principal_distances(survey, held, [0.01])
+    (one,) = remarks_on_principal_distances(survey, held, [0.01])
     assert one.kind == "c_held_elsewhere" and one.severity == "error"
     assert [one.number(name) for name in ("given", "found")] == pytest.approx([10, 2.2])
 

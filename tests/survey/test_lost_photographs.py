@@ -289,7 +289,7 @@ def _about_y(angle: float) -> FloatArray:
 @pytest.mark.parametrize("parallax", [0.0, 0.5])
 def test_photographs_from_one_place_are_refused_with_their_parallax(parallax: float) -> None:
     network, start = turned(parallax * MIN_PARALLAX * SIGMA_PX)
-    with pytest.raises(GeometryError, match="no base: the 6 photographs were taken from one place"):
+    with pytest.raises(GeometryError, match="no base: the 6 photographs were taken from one position"):
         refuse_no_base(network, start.cameras)
 
 

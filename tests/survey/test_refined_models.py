@@ -289,7 +289,7 @@ def test_a_model_of_too_few_points_is_refused_and_nothing_is_written(tmp_path: P
     for j in {*number} - {number[k] for k in (10, 16, 46, 52)}:
         scene.delete_point3D(j)
     scene.write_binary(str(tmp_path / "model"))
-    with pytest.raises(GeometryError, match="are not more than is to be estimated from them; hold param"):
+    with pytest.raises(GeometryError, match="leave no redundancy; hold param"):
         refine(tmp_path / "model", tmp_path)
     for j in scene.point3D_ids():
         scene.delete_point3D(j)

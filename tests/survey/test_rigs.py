@@ -111,12 +111,12 @@ def turned(mounts: Mounts | None) -> Mounts:
         (RIG.replace(', "camera 2"', ""), "rig stereo: 1 camera, at least 2 are needed"),
         (RIG.replace("moment (", "time ("), "does not match photograph 'moment 1 camera 1'"),
         (RIG.replace("([0-9]+)", "[0-9]+"), "has 0 groups, needed 1"),
-        (RIG.replace("([0-9]+)", "([0-9+"), "is no regular expression"),
+        (RIG.replace("([0-9]+)", "([0-9+"), "is not a regular expression"),
         (RIG.replace("([0-9]+)", "(.*.*.*.*)x"), "repeats more than 3 parts"),
         (RIG.replace("([0-9]+)", "([0-9]+)*"), "repeats more than 3 parts, or a group"),
         (RIG.replace("moment ([0-9]+)", "(camera)"), "of camera camera 1 are of one moment, 'camera'"),
         (RIG.replace("moment ([0-9]+)", "(.+)"), "no moment has photographs of two cameras"),
-        (RIG + RIG.replace("stereo", "other"), "camera camera 1 is on rig stereo already"),
+        (RIG + RIG.replace("stereo", "other"), "camera camera 1 is already on rig stereo"),
         (RIG + "tolerance_s = 2.0\n", 'tolerance_s is given, moment = "exif" is needed with it'),
     ],
 )
@@ -187,7 +187,7 @@ def test_given_mounts_give_the_scale(sigma: float, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "said"),
     [
-        ("camera 1,1,0,0,0,0,0,0,0,0,0,0,0", "camera 'camera 1' is on no rig, or its reference"),
+        ("camera 1,1,0,0,0,0,0,0,0,0,0,0,0", "camera 'camera 1' is on no rig, or is the reference"),
         ("camera 2,1,0,0,0,0,0,0,0,0,1,1,1", "needed all six values, held fixed .sigma 0. together"),
         ("camera 2,1,0,0,1,1,1,,,,,,", "needed all six values"),
         ("\n".join(["camera 2,1,0,0,1,1,1,0,0,0,1,1,1"] * 2), "camera 'camera 2' is on line 2 already"),

@@ -217,7 +217,7 @@ def test_plates_of_a_survey_must_be_complete(tmp_path: Path) -> None:
         codes="checkerboard", rows=7, columns=10, marks=[],
     ).replace("marks = []\n", "")  # fmt: skip
     for plate, message in (
-        ('codes = "ring14"', "plate 2: codes = 'ring14' is no plate"),
+        ('codes = "ring14"', "plate 2: codes = 'ring14' is not a plate"),
         ('codes = "grid"\nrows = 5', "plate 2: targets.columns is missing"),
         ('codes = "checkerboard"\nrows = 5\ncolumns = 6\npitch = 3.0', "are not distinguished"),
     ):
@@ -227,7 +227,7 @@ def test_plates_of_a_survey_must_be_complete(tmp_path: Path) -> None:
     text = text.replace('kind = "control"', 'kind = "free"')
     rings = text.replace('codes = "checkerboard"\nrows = 7\ncolumns = 10\npitch = 12.0', 'codes = "ring14"')
     (tmp_path / "survey.toml").write_text(f'{rings}[[plate]]\ncodes = "grid"\n', encoding="utf-8")
-    with pytest.raises(SurveyFileError, match="needed a first plate"):
+    with pytest.raises(SurveyFileError, match="needed the first plate"):
         read_survey(tmp_path / "survey.toml")
 
 

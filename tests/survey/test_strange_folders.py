@@ -221,7 +221,7 @@ def test_settings_of_libraries_in_the_current_folder_are_refused(
     before = sorted(tmp_path.rglob("*"))
     assert kolinear(*arguments) == 2
     told = capsys.readouterr().err
-    assert told.count("\n") == 1 and f"contains '{name}', by which it would decide" in told
+    assert told.count("\n") == 1 and f"contains '{name}', which would decide" in told
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -368,7 +368,7 @@ def test_no_command_writes_through_a_link(
     assert kolinear(*arguments) == (1 if of_one_survey else 2)
     told = capsys.readouterr()
     said = told.out if of_one_survey else told.err
-    refused = ("is a link to", "is there already", "of this name already", "exists a")
+    refused = ("is a link to", "exists already", "already is a file", "of this name already", "exists a")
     assert link.name in said and any(words in said for words in refused), told
     lines = [line for line in told.err.splitlines() if COMPILING not in line]
     assert of_one_survey or (len(lines) == 1 and told.out == "")
@@ -379,7 +379,7 @@ def test_no_command_writes_through_a_link(
 SHARED = ("out", "new", "out/batch", "out/batch/logs")  # folders that may hold other files, too
 LATER = (("render", "new/a", "folder"), ("refine", "new", "file"))  # beside it; photographs come before it
 NAMED = (
-    "is there already",
+    "exists already",
     "cannot be",
     "contains '",
     "left alone",
@@ -485,7 +485,7 @@ def test_a_lock_that_came_with_the_folder_is_not_written(kind: str, home: Path, 
         lock.write_text(OWN)
     else:
         os.mkfifo(lock)
-    with pytest.raises(OutputError, match=r"\.s\.lock: is (not a regular|no lock of)"), locked(lock):
+    with pytest.raises(OutputError, match=r"\.s\.lock: is (not a regular|not a lock of)"), locked(lock):
         pass
     assert (home / ".profile").read_text() == OWN
     assert kind != "text" or lock.read_text() == OWN

@@ -14,7 +14,7 @@ from sfm.camera import camera_from_values, project
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
 from sfm.report.findings.survey_remarks import findings_of
-from sfm.survey.adjusting.solution_remarks import contradicted
+from sfm.survey.adjusting.solution_remarks import remarks_on_held_c
 from sfm.survey.inputs.survey import CameraSetup
 from tests.survey.weak_networks import outcome_of, study, weak_network
 from tests.synthetic import make_network, seed_of
@@ -118,9 +118,9 @@ def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:
 
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
     cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0, rms=2.0)
-    (found,) = contradicted(("A",), (cause,))
+    (found,) = remarks_on_held_c(("A",), (cause,))
     assert found.kind == "c_held_contradicted" and found.names("cameras") == ("A",)
-    assert contradicted((), (cause,)) == contradicted(("A",), ()) == ()
+    assert remarks_on_held_c((), (cause,)) == remarks_on_held_c(("A",), ()) == ()
 
 
 def test_a_pair_does_not_determine_the_c_that_was_found_for_it() -> None:

@@ -273,7 +273,7 @@ def survey_text(**changes: str) -> str:
     ("changes", "message"),
     [
         ({"pitch": ""}, "targets.pitch is missing, codes = 'grid' needs it"),
-        ({"codes": 'codes = "ring14"'}, "targets.rows is of a calibration plate, codes = 'ring14' is none"),
+        ({"codes": 'codes = "ring14"'}, "targets.rows belongs to a calibration plate, codes = 'ring14'"),
         ({"marks": "marks = [[3, 3], [12, 4]]"}, r"mark \[12, 4\] is not on a plate of 9 rows"),
         ({"marks": "marks = [[3, 3], [5, 3]]"}, "the marks look alike turned by 180 degrees"),
         ({"marks": "", "kind": 'kind = "free"'}, "looks alike turned by 180 degrees has no"),
@@ -295,10 +295,10 @@ def survey_text(**changes: str) -> str:
             },
             "the board has tags 8 to 37, dictionary 'apriltag16h5' has 0 to 29",
         ),
-        ({"marks": "first_tag = 3"}, "targets.first_tag is of codes = 'charuco' and 'aprilgrid'"),
-        ({"codes": 'codes = "checkerboard"'}, "targets.marks are of grid, asymmetric-grid"),
+        ({"marks": "first_tag = 3"}, "targets.first_tag belongs to codes = 'charuco' or 'aprilgrid'"),
+        ({"codes": 'codes = "checkerboard"'}, "targets.marks belong to grid, asymmetric-grid"),
         ({"codes": 'codes = "checkerboard"', "rows": "rows = 2", "marks": ""}, "board of 2 x 11 cross"),
-        ({"unit": 'unit = "mm"\n[control]\nfile = "c.csv"'}, r"\[control\] beside a calibration plate"),
+        ({"unit": 'unit = "mm"\n[control]\nfile = "c.csv"'}, r"\[control\] is given, but the calib"),
     ],
 )  # fmt: skip
 def test_plates_that_cannot_be_are_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:

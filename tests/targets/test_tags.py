@@ -11,7 +11,7 @@ import pytest
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.photographs.reading import take_back_srgb
+from sfm.photographs.reading import linearise_srgb
 from sfm.pipeline import run_survey
 from sfm.printing.sheet import lay_out_sheet
 from sfm.rendering.render import render_photograph, render_photographs
@@ -201,7 +201,7 @@ def test_a_tone_curve_that_is_taken_back_leaves_the_corners(curve: str) -> None:
         srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
         signal = srgb if curve == "srgb" else light ** (1 / 2.2)
         coded = np.rint(255 * signal).astype(np.uint8)
-        for one, into in ((coded, stored), (take_back_srgb(coded), linear)):
+        for one, into in ((coded, stored), (linearise_srgb(coded), linear)):
             found = find_targets(one, polarity="dark", codes="apriltag36h11")
             corner = (found.flag & Flag.CORNER) != 0
             at = truth[found.code[corner] % 4]
@@ -334,7 +334,7 @@ def test_sizes_that_do_not_go_with_the_codes_are_refused(tmp_path: Path) -> None
         ('codes = "apriltag36h11"', 'codes = "ring14"', "codes = 'ring14' has none"),
         ("tag_size = 30.0\n", "", "tag_sigma needs targets.tag_size"),
         ("tag_sigma = 0.01", "tag_sigma = 1e-7", "more than a million times its sigma"),
-        ("tag_sigma = 0.01", "ring_radii = [2, 3]", "are of rings"),
+        ("tag_sigma = 0.01", "ring_radii = [2, 3]", "belong to rings"),
         (
             'codes = "apriltag36h11"\ntag_size = 30.0\ntag_sigma = 0.01',
             'codes = "ring14"\nring_radii = [3, 2]',

@@ -184,7 +184,7 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
             _ended(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
             network=number,
             program=program_name(backend.name),
-            apart=apart(cost_a, cost_b, plan.noise_px),
+            apart=sigmas_apart(cost_a, cost_b, plan.noise_px),
             message=our_failure or None,
             their_message=their_failure or None,
         ),
@@ -264,7 +264,7 @@ def _fit(network: Network, estimate: Estimate | None) -> tuple[float, float]:
     return float((v**2).sum() / 2), float(np.sqrt((v**2).mean()))
 
 
-def apart(a: float, b: float, sigma_px: float) -> float:
+def sigmas_apart(a: float, b: float, sigma_px: float) -> float:
     """Return the shift in one direction, in standard deviations, that explains the difference of two costs.
 
     A shift of s standard deviations increases the cost by s^2 sigma_px^2 / 2.
@@ -280,7 +280,7 @@ def apart(a: float, b: float, sigma_px: float) -> float:
 def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> str:
     """Return the kind of remark on how two adjusters ended, from their costs (px^2) and failures."""
     # An adjuster that ends at the other's optimum has solved the network, whatever it reports.
-    if apart(a, b, sigma_px) <= SAME_SIGMAS:
+    if sigmas_apart(a, b, sigma_px) <= SAME_SIGMAS:
         return "same_optimum"
     if ours and theirs:
         return "both_adjusters_failed"

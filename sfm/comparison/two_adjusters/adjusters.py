@@ -43,8 +43,8 @@ from sfm.runtime.progress import report_step
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
 # The weak directions of full_opencv need more steps than a survey. Even if k1 to k6 have grown a
-# thousandfold, they
-# may still converge: of 32 random networks that had not converged after 40 steps, 25 did so by step 200.
+# thousandfold, they may still converge: of 32 random networks that had not converged after 40 steps, 25 did
+# so by step 200.
 MAX_ITERATIONS = 200
 ALPHA = (
     0.05  # of the chi-square test, with 1 degree of freedom, whether image points distinguish two solutions
@@ -83,8 +83,7 @@ class AdjusterComparison:
     backend_converged: bool
     comparison: Comparison
     # the other adjuster's covariances of the points with photographs and cameras held (conditional), scaled
-    # by our
-    # sigma0, object unit^2, (n, 3, 3); None if it has none
+    # by our sigma0, object unit^2, (n, 3, 3); None if it has none
     backend_points: FloatArray | None
     unshared: tuple[str, ...] = ()  # text on parameters that cameras share in the survey, held at its result
     better: BetterFit | None = None  # if the compared camera has more free parameters and fits better
@@ -168,8 +167,7 @@ def compare_adjusters(
     if rational and (ours.undetermined or not ours.converged):
         held = ours.undetermined or (
             f"k1 to k6 still grow together after {counted(ours.iterations, 'iteration')}, numerator and "
-            "denominator of "
-            "the rational distortion cancelling",
+            "denominator of the rational distortion cancelling",
         )
     while True:
         if held:

@@ -33,8 +33,7 @@ SELF_CALIBRATION_IMAGES = 8  # photographs of each camera that are needed to fre
 START_POSITION = 0.01  # error of start values of projection centres and points, over the distance
 START_ANGLE_DEG = 1.0
 # Few rays connect a strip: inconsistent errors of neighbours bend it as a whole, and from distant start
-# values every
-# adjuster ends beside the optimum. In practice its start values come from relative orientation.
+# values every adjuster ends beside the optimum. In practice its start values come from relative orientation.
 STRIP_START = 0.2
 START_FOCAL = 0.02  # relative error of free focal lengths at the start
 

@@ -65,8 +65,7 @@ class Task:
     least: IntArray  # image points that each photograph needs to stay, (m,)
     suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
     # Factor of the stated standard deviations of the image points. If these are far too large, control and
-    # bars
-    # bend the network by more than its noise, and their points look like gross errors.
+    # bars bend the network by more than its noise, and their points look like gross errors.
     factor: float = 1.0
 
     @property
@@ -452,8 +451,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
     )
     raise GeometryError(
         f"{counted(n, 'common point')} in {counted(m, 'photograph')}: {counted(observations, 'observation')} "
-        "and datum conditions for "
-        f"{counted(unknowns, 'unknown')}{free}, more are needed{advice}"
+        f"and datum conditions for {counted(unknowns, 'unknown')}{free}, more are needed{advice}"
     )
 
 

@@ -42,10 +42,10 @@ from sfm.survey.adjusting.settling import (
     settle_by_photograph,
 )
 from sfm.survey.adjusting.solution_remarks import (
-    contradicted,
     handedness_unchecked,
     left_out_points,
     not_calibrated,
+    remarks_on_held_c,
     remarks_on_solution,
     unused_image_points,
     windows_elsewhere,
@@ -77,10 +77,8 @@ from sfm.targets.codes.plates import points_of_plates
 
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
-# reported.
-# With c free in each photograph, photographs that determine it badly do more harm than good: two halves of a
-# video
-# whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
+# reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
+# halves of a video whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
 MAX_FOCUS_CHANGE = 1.03
 PAIR_TOLERANCE = 10.0  # standard deviations within which image points fit another orientation of a pair
 GIVEN_IMAGE_POINTS = 3  # of a photograph with given orientation, which selects one of the four solutions
@@ -192,7 +190,7 @@ def _solution(
             *judged.unchecked,
             *bump_remarks(final, unit),
             *windows_elsewhere(survey, explain_rejections(final, unit=unit, bodies=plates)),
-            *contradicted(found.c_held, judged.causes),
+            *remarks_on_held_c(found.c_held, judged.causes),
         ),
         left_out,
         unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
@@ -383,7 +381,7 @@ def _settled(
             factor = float(np.clip(alone.sigma0, least_factor(alone.stated_px), 1.0))
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
-        # the free network is no start either, nor are its per-photograph cameras
+        # neither the free network is a start, nor are its per-photograph cameras
         free = None
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate = start.estimate
@@ -413,7 +411,7 @@ def _with_mounts(
 ) -> tuple[Task, Estimate, tuple[Remark, ...]]:
     """Return the task and start values with the given mounts, if their scale agrees with all other scales."""
     kinds = (("bars", task.network.scale_bars), ("control", task.network.control))
-    others = [name for name, some in kinds if len(some) and (name == "bars" or task.datum.kind == name)]
+    others = [name for name, some in kinds if len(some) and name in ("bars", task.datum.kind)]
     others += [one.name for one in task.network.observations]
     said: tuple[Remark, ...] = ()
     if free is not None and not free.held:

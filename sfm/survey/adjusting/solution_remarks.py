@@ -49,8 +49,8 @@ def remarks_on_solution(
         *adjustment.remarks,
         *remarks_on_left_out(left_out, measured),
         *([remark("datum_points_missing", points=absent)] if absent else []),
-        *far_principal_distances(survey, adjustment.estimate, sigma_of_c),
-        *unlike_squares(survey.cameras, adjustment.estimate.cameras),
+        *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
+        *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
         *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
         *weak_scale(adjustment),
@@ -176,7 +176,9 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tu
     return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)
 
 
-def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[float]) -> tuple[Remark, ...]:
+def remarks_on_principal_distances(
+    survey: Survey, estimate: Estimate, sigma: Sequence[float]
+) -> tuple[Remark, ...]:
     """Return a remark for each principal distance that is far from the one that the survey states.
 
     A principal distance held at such a value was found by trial, and nothing has tested it.
@@ -215,7 +217,7 @@ def far_principal_distances(survey: Survey, estimate: Estimate, sigma: Sequence[
     return tuple(remarks)
 
 
-def contradicted(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
+def remarks_on_held_c(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tuple[Remark, ...]:
     """Return a remark if the residuals have a cause and c was held at a value that was not measured.
 
     Args:
@@ -253,7 +255,9 @@ def _calibrates(survey: Survey) -> bool:
     return plate_family(survey.targets) is not None and survey.datum.kind == "control"
 
 
-def unlike_squares(settings: Sequence[CameraSettings], cameras: Sequence[Camera]) -> tuple[Remark, ...]:
+def remarks_on_pixel_sides(
+    settings: Sequence[CameraSettings], cameras: Sequence[Camera]
+) -> tuple[Remark, ...]:
     """Return a remark on each camera whose nominal sensor size implies pixels that are not square.
 
     Args:

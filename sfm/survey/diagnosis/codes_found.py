@@ -39,8 +39,7 @@ MIN_TAGS = (
     2  # of a family in a photograph that are not read by chance; a dictionary may be part of a larger one
 )
 # Smallest readable diameter of the dot of a ring, in px and in standard deviations of its edges. Of rendered
-# rings
-# with 12 to 20 cells, all 49 are read from 6 px on at 0.75 px, and from 8 or 9 px on at 1.25 px.
+# rings with 12 to 20 cells, all 49 are read from 6 px on at 0.75 px, and from 8 or 9 px on at 1.25 px.
 MIN_DOT_PX, MIN_DOT_SIGMAS = 6.0, 7.0
 POLARITIES = ("dark", "bright")
 
@@ -114,7 +113,7 @@ class _Line(NamedTuple):
     """A row or column of a plate that is not seen, and its neighbour that is seen."""
 
     outer: IntArray  # points of the missing line
-    beside: IntArray  # points of its neighbour
+    neighbour: IntArray  # points of its neighbour
 
 
 def _missing_sides(plate: PlateFamily, seen: BoolArray) -> dict[str, _Line]:
@@ -141,9 +140,9 @@ def _in_view(
     H, _ = cv2.findHomography(plane[code], xy, 0)
     if H is None:
         return
-    for side, (outer, beside) in sides.items():
-        found = np.isin(beside, code)
-        beyond = 2 * plane[outer] - plane[beside]  # the margin of the plate
+    for side, (outer, neighbour) in sides.items():
+        found = np.isin(neighbour, code)
+        beyond = 2 * plane[outer] - plane[neighbour]  # the margin of the plate
         at = cv2.perspectiveTransform(np.concatenate([plane[outer], beyond])[None], H)[0]
         inside = ((at >= 0) & (at < size_px)).all(axis=1).reshape(2, -1).all(axis=0)
         if 2 * (found & inside).sum() >= len(outer):

@@ -55,8 +55,8 @@ MIN_RAYS = 2
 MOTION_RAYS = 3  # of a point that shows a motion; two rays can intersect by chance
 MOTION_POINTS = 20  # in three photographs or more; with fewer an orientation may fit random motion
 MIN_PARALLAX = 10.0  # standard deviations of image points; below it a depth is known to a tenth at best
-# Fraction of the points of a pair that may have no depth, such as distant hills behind a near object;
-# the remaining fraction may be wrong matches.
+# Fraction of the points of a pair that may have no depth, such as distant hills behind a near object; the
+# remaining fraction may be wrong matches.
 MAX_DISTANT_FRACTION = 0.9
 MIN_COMMON = 20  # points of a pair of photographs; rotation and camera use up five of their coordinates
 SCALES = np.geomspace(0.5, 2.0, 15)  # factors of c that are tried, 10 % apart; the best is refined
@@ -71,7 +71,7 @@ MISFIT = 3.0  # RMS residual, in standard deviations of image points, that sugge
 
 
 @dataclass(frozen=True)
-class Lost:
+class LostGroup:
     """Photographs without orientation that belong together."""
 
     images: IntArray  # indices of the photographs
@@ -108,7 +108,7 @@ def explain_lost_photographs(network: Network, found: Orientation, *, named: boo
     return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
 
 
-def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
+def lost_groups(network: Network, estimate: Estimate) -> list[LostGroup]:
     """Return the photographs without orientation in groups that could be oriented among themselves."""
     oriented, seen = estimate.oriented, network.image_points
     lost = np.flatnonzero(~oriented)
@@ -126,7 +126,7 @@ def lost_groups(network: Network, estimate: Estimate) -> list[Lost]:
         images = lost[label[lost] == number]
         points = _points_of(network, images)
         most = max(int(in_network[_points_of(network, [i])].sum()) for i in images)
-        groups.append(Lost(images, points[in_network[points]], most >= MIN_POINTS))
+        groups.append(LostGroup(images, points[in_network[points]], most >= MIN_POINTS))
     return groups
 
 
@@ -155,17 +155,17 @@ def try_other_principal_distances(
         principal distance orients more photographs.
     """
     m = len(network.images)
-    lost = m if found is None else _unexplained(network, found)
+    lost = m if found is None else _count_unexplained(network, found)
     if not len(network.image_points):
         return found, ()
     free = all(camera.free[0] for camera in estimate.cameras)
     if lost < 2:  # a single lost photograph has another cause
         misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
         held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
-        best = _likeliest(network, estimate, found, held, orient, least=_oriented(found))
+        best = _likeliest(network, estimate, found, held, orient, least=_count_oriented(found))
         return (found if best is None else _restored(best, estimate)), ()
     others = [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
-    least = _oriented(found) + int(MAJORITY_FRACTION * lost) + 1
+    least = _count_oriented(found) + int(MAJORITY_FRACTION * lost) + 1
     best = _likeliest(network, estimate, found, others, orient, least=least)
     if best is None:
         return found, ()
@@ -175,9 +175,9 @@ def try_other_principal_distances(
             camera=given.name,
             given=(given.c_px * float(np.mean(given.pixel_mm)), "mm"),
             better=(better.c_px * float(np.mean(given.pixel_mm)), "mm"),
-            oriented=_oriented(best),
+            oriented=_count_oriented(best),
             total=m,
-            before=_oriented(found),
+            before=_count_oriented(found),
         )
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
@@ -206,17 +206,17 @@ def _likeliest(
         except GeometryError:
             continue
         likelihood = _log_likelihood(network, estimate, other)
-        if _oriented(other) >= least and likelihood > likeliest:
+        if _count_oriented(other) >= least and likelihood > likeliest:
             best, likeliest = other, likelihood
             if (
-                _oriented(best) == len(network.images)
+                _count_oriented(best) == len(network.images)
                 and best.rms_px <= MISFIT * network.image_points.median_sigma_px
             ):
                 break
     return best
 
 
-def _oriented(found: Orientation | None) -> int:
+def _count_oriented(found: Orientation | None) -> int:
     """Return the number of oriented photographs."""
     return 0 if found is None else int(found.estimate.oriented.sum())
 
@@ -229,7 +229,7 @@ def _restored(found: Orientation, estimate: Estimate) -> Orientation:
     return replace(found, estimate=replace(found.estimate, cameras=cameras))
 
 
-def _unexplained(network: Network, found: Orientation) -> int:
+def _count_unexplained(network: Network, found: Orientation) -> int:
     """Return how many photographs are lost although they show enough points and are not mirrored."""
     mirrored = [image for image, reason in found.failures if reason.kind == "photograph_mirrored"]
     lost = [i for one in lost_groups(network, found.estimate) if one.connected for i in one.images.tolist()]
@@ -258,7 +258,7 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
     return replace(estimate, cameras=tuple(cameras))
 
 
-def _not_connected(network: Network, oriented: BoolArray, group: Lost, *, named: bool) -> Remark:
+def _not_connected(network: Network, oriented: BoolArray, group: LostGroup, *, named: bool) -> Remark:
     """Return the remark on a group of photographs that is not connected, with points to connect it."""
     theirs = _often_seen(network, group.images) if named else []
     return remark(
@@ -305,9 +305,9 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     if parallax is None or not parallax.max() < needed:
         return
     raise GeometryError(
-        f"orientation: no base: the {len(network.images)} photographs were taken from one place; rotations "
-        f"alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, and depths "
-        f"need {needed:.2g} px; photograph from several places"
+        f"orientation: no base: the {len(network.images)} photographs were taken from one position; "
+        f"rotations alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, "
+        f"and depths need {needed:.2g} px; photograph from several places"
     )
 
 
@@ -448,7 +448,7 @@ def find_second_motion(
     on = images[network.image_points.image]
     tolerance_px = TOLERANCE_FACTOR * found.rms_px
     fits = residual_lengths(network, found.estimate) <= tolerance_px
-    rays, fitting = _rays(network, on), _rays(network, on & fits)
+    rays, fitting = _count_rays(network, on), _count_rays(network, on & fits)
     left = (rays >= MOTION_RAYS) & (fitting < MIN_SHARE * rays)
     if left.sum() < MOTION_POINTS:
         return ()
@@ -458,7 +458,7 @@ def find_second_motion(
         other = orient(part, start)
     except GeometryError:
         return ()
-    moved = _rays(part, residual_lengths(part, other.estimate) <= tolerance_px) >= MOTION_RAYS
+    moved = _count_rays(part, residual_lengths(part, other.estimate) <= tolerance_px) >= MOTION_RAYS
     if moved.sum() < MOTION_POINTS:
         return ()
     seen = part.image_points
@@ -474,6 +474,6 @@ def find_second_motion(
     )
 
 
-def _rays(network: Network, rows: BoolArray) -> IntArray:
+def _count_rays(network: Network, rows: BoolArray) -> IntArray:
     """Return the number of rays of each object point among the selected image points, (n,)."""
     return np.bincount(network.image_points.point[rows], minlength=len(network.points))

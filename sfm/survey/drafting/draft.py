@@ -160,11 +160,8 @@ def _text(
     else:
         lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
         for plate in trial.plates[1:]:
-            lines += [
-                "",
-                "# fixed to the first plate; its points are measured",
-                *_other_plate_lines(plate, pitch),
-            ]
+            lines += ["", "# fixed to the first plate; its points are measured", "[[plate]]"]
+            lines += _plate_keys(plate, pitch)
         lines += [f"# Left out: {_described(plate)} ({why})" for plate, why in trial.left_out]
     sigma = CORNER_SIGMA_PX if trial.codes in ("none", *BOARDS) else SIGMA_PX
     lines += [
@@ -237,17 +234,13 @@ def _kinds_of_codes() -> str:
 
 
 def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
-    lines = ["[targets]", *_lines_of_any_plate(plate, pitch)]
+    lines = ["[targets]", *_plate_keys(plate, pitch)]
     if not pitch:
         lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
     return lines
 
 
-def _other_plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
-    return ["[[plate]]", *_lines_of_any_plate(plate, pitch)]
-
-
-def _lines_of_any_plate(plate: PlateFamily, pitch: float | None) -> list[str]:
+def _plate_keys(plate: PlateFamily, pitch: float | None) -> list[str]:
     lines = [
         f"codes = {_quoted(plate.name)}",
         f"rows = {plate.rows}  # of dots, of crossings inside the board, or of corners of tags",

@@ -43,9 +43,7 @@ from sfm.targets.codes.plates import (
 )
 from sfm.targets.codes.tags import DICTIONARIES, tag_family
 
-OF_PLATES = (
-    *("rows", "columns", "pitch", "pitch_assumed", "marks", "plate_sigma", "dictionary", "first_tag"),
-)
+PLATE_KEYS = ("rows", "columns", "pitch", "pitch_assumed", "marks", "plate_sigma", "dictionary", "first_tag")
 MIN_SIDE = 3  # rows or columns of a checkerboard that OpenCV finds
 TABLES = ("summary.json", "cameras.csv", "interior_correlations.csv")
 
@@ -171,7 +169,7 @@ def calibrated(
         )
     if weighted and not found.sigma:
         raise SurveyFileError(
-            f"{where}: {source} has no standard deviations of camera {found.name}, so that it can be "
+            f"{where}: {source} has no standard deviations of camera {found.name}, so it can be "
             "held but not weighted"
         )
     observed = found.sigma if weighted else {}
@@ -235,12 +233,12 @@ def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateS
         return
     if targets.codes not in PLATES:
         raise SurveyFileError(
-            f"{where}: plate beside targets of codes = '{targets.codes}', needed a first plate in [targets]"
+            f"{where}: plate is given, targets.codes = '{targets.codes}'; needed the first plate in [targets]"
         )
     for k, one in enumerate(others, 2):
         if one.codes not in PLATES:
             raise SurveyFileError(
-                f"{where}: plate {k}: codes = '{one.codes}' is no plate; plates are {', '.join(PLATES)}"
+                f"{where}: plate {k}: codes = '{one.codes}' is not a plate; plates are {', '.join(PLATES)}"
             )
         refuse_contradicting_plates(one, f"{where}: plate {k}")
     try:
@@ -258,12 +256,12 @@ def is_plate_control(control: KnownPoints | None, plate: KnownPoints | None) -> 
 
 def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
     """Raise SurveyFileError if the settings of a plate are incomplete, or are given without a plate."""
-    given = [name for name in OF_PLATES if name in targets.model_fields_set]
+    given = [name for name in PLATE_KEYS if name in targets.model_fields_set]
     if targets.codes not in PLATES:
         if given:
             raise SurveyFileError(
-                f"{where}: targets.{given[0]} is of a calibration plate, codes = '{targets.codes}' is none; "
-                f"plates are {', '.join(PLATES)}"
+                f"{where}: targets.{given[0]} belongs to a calibration plate, codes = '{targets.codes}' "
+                f"is not one; plates are {', '.join(PLATES)}"
             )
         return
     for name in ("rows", "columns", "pitch"):
@@ -295,10 +293,11 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
     for name in ("dictionary", "first_tag"):
         if not board and name in targets.model_fields_set:
             raise SurveyFileError(
-                f"{where}: targets.{name} is of codes = 'charuco' and 'aprilgrid', found '{targets.codes}'"
+                f"{where}: targets.{name} belongs to codes = 'charuco' or 'aprilgrid', found "
+                f"'{targets.codes}'"
             )
     if targets.codes not in GRIDS and targets.marks:
-        raise SurveyFileError(f"{where}: targets.marks are of {', '.join(GRIDS)}, found '{targets.codes}'")
+        raise SurveyFileError(f"{where}: targets.marks belong to {', '.join(GRIDS)}, found '{targets.codes}'")
     if targets.codes == "checkerboard" and min(plate.rows, plate.columns) < MIN_SIDE:
         raise SurveyFileError(
             f"{where}: a checkerboard of {plate.rows} x {plate.columns} crossings, at least {MIN_SIDE} x "

@@ -28,7 +28,7 @@ from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
-MIN_EIGENVALUE = 1e-12  # a matrix with a smaller eigenvalue is no correlation matrix
+MIN_EIGENVALUE = 1e-12  # a matrix with a smaller eigenvalue is not a correlation matrix
 MAX_PIXEL_MM = 1000.0  # side of a pixel; it is 1 mm in models without a pixel size
 MIN_VIEW_DEG, MAX_VIEW_DEG = (
     0.5,

@@ -140,7 +140,7 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
     names = [one.name for one in (*content.bars, *content.frames)]
     for name in names:
         if names.count(name) > 1:
-            raise SurveyFileError(f"{path}: '{name}' comes twice, needed different names of bars and frames")
+            raise SurveyFileError(f"{path}: '{name}' occurs twice; bars and frames need different names")
     tables = {}
     for frame in content.frames:
         file = inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
@@ -175,7 +175,7 @@ def given_by(
     used = tuple(used)
     if used and temperature is None:
         raise SurveyFileError(
-            f"{where}: [[equipment]] without survey.temperature; needed that of {used[0].name}, deg C"
+            f"{where}: [[equipment]] needs survey.temperature, the temperature of {used[0].name} in deg C"
         )
     known = {one.name: one for one in (*equipment.content.bars, *equipment.content.frames)}
     scale = METRES[equipment.content.unit] / METRES[unit]
@@ -195,8 +195,8 @@ def given_by(
         places = places_of.setdefault(one.name, [])
         if frozenset(points) in places:
             raise SurveyFileError(
-                f"{where}: equipment '{one.name}' comes twice on the points {listed(sorted(points))}, needed "
-                "once for each place, with other points"
+                f"{where}: equipment '{one.name}' is given twice on the points {listed(sorted(points))}, "
+                "needed other points for each position"
             )
         places.append(frozenset(points))
         factor, calibration = scale * item.factor(temperature), scale * of_item[one.name] ** 0.5

@@ -159,7 +159,8 @@ def mount_observations(
             if name not in mounted:
                 some = listed(sorted(mounted))
                 raise SurveyFileError(
-                    f"{table.table.place(k)}: camera '{name}' is on no rig, or its reference; needed {some}"
+                    f"{table.table.place(k)}: camera '{name}' is on no rig, or is the reference camera of "
+                    f"one; needed {some}"
                 )
             sigma = table.sigma[k]
             if not np.isfinite(sigma).all() or ((sigma == 0).any() and (sigma > 0).any()):

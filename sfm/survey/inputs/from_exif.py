@@ -33,7 +33,7 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
         files: photographs of the survey; unreadable ones and those without a position are not observed.
 
     Raises:
-        SurveyFileError: no photograph states a position, or no place has most of the positions.
+        SurveyFileError: no photograph states a position, or no place contains most of the positions.
     """
     if survey.exif_sigma_m is None:
         return survey, ()

@@ -140,7 +140,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
     folder = Path(images_dir) if images_dir is not None else survey.folder
     if not folder.is_dir():
         raise SurveyFileError(
-            f"{folder}: {why_no_folder(folder)}; photographs of survey {survey.name} were needed"
+            f"{folder}: {why_no_folder(folder)}; needed the folder of the photographs of survey {survey.name}"
         )
 
     def refuse_outside(path: Path) -> None:
@@ -154,7 +154,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
             found = find_files(folder, glob, enter=refuse_outside)
         except ValueError as error:
             raise SurveyFileError(
-                f"{survey.source}: camera {camera}: images = '{glob}' is no glob relative to {folder}"
+                f"{survey.source}: camera {camera}: images = '{glob}' is not a glob relative to {folder}"
             ) from error
         if not found:
             raise SurveyFileError(
@@ -232,7 +232,7 @@ def refuse_incomplete_cameras(
             lines.append(f"camera {one.name}: {' and '.join(missing)}")
     if lines:
         raise SurveyFileError(
-            f"{source}: EXIF data of the photographs do not state what is needed of {'; '.join(lines)}"
+            f"{source}: EXIF data of the photographs lack values that are needed: {'; '.join(lines)}"
         )
 
 

@@ -228,10 +228,8 @@ class RigSettings(Section):
     name: Name  # name of the rig; unique in the survey
     cameras: Names  # names of its cameras; the first is the reference
     # "order": photographs of each camera in the order of their names; "exif": by the times in their EXIF
-    # data; a
-    # table image,moment (.csv); else a regular expression with one group, which finds the moment in the names
-    # of
-    # photographs
+    # data; a table image,moment (.csv); else a regular expression with one group, which finds the moment in
+    # the names of photographs
     moment: Annotated[Name, Field(max_length=MAX_PATTERN)]
     # globs of the photographs of blocks of time, between which the mounts changed but not the cameras
     blocks: Annotated[Names, Field(max_length=MAX_GROUPS)] = ()

@@ -104,7 +104,7 @@ def measurements_from_observations(survey: Survey) -> Measurements:
 
 
 def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
-    """Raise SurveyFileError if given orientations or start values are of unknown photographs or cameras.
+    """Raise SurveyFileError if given orientations or start values refer to unknown photographs or cameras.
 
     Args:
         survey: may give observed and approximate exterior orientations, and start values of cameras.

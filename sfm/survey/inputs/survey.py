@@ -174,7 +174,7 @@ class Survey:
         if plate is None:
             return
         if self.control is not None and not is_plate_control(self.control, plate):
-            raise SurveyFileError(f"{where}: control beside a calibration plate, which is the control itself")
+            raise SurveyFileError(f"{where}: control is given, but the calibration plate is the control")
         object.__setattr__(self, "control", plate)
         if self.start_points is None:
             object.__setattr__(self, "start_points", plate)
@@ -316,7 +316,7 @@ def _given_by_equipment(file: SurveyFile) -> GivenEquipment:
     if file.head.equipment is None:
         if file.equipment:
             raise SurveyFileError(
-                f"{file.source}: [[equipment]] without survey.equipment; needed the file that describes it"
+                f"{file.source}: [[equipment]] needs survey.equipment, the file that describes it"
             )
         return GivenEquipment()
     path = file.beside(file.head.equipment)

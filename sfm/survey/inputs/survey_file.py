@@ -162,14 +162,14 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
         allow_outside: whether the path may leave the folder.
 
     Raises:
-        SurveyFileError: the path leaves the folder, or is no valid path.
+        SurveyFileError: the path leaves the folder, or is not a valid path.
     """
     try:
         path = folder / name
         path.is_file()  # raises if a name is too long for the disk
         left = not path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError) as error:  # circular links, a null byte
-        raise SurveyFileError(f"{where}: {name!r:.100} is no path of a file") from error
+        raise SurveyFileError(f"{where}: {name!r:.100} is not the path of a file") from error
     if left and not allow_outside:
         raise SurveyFileError(
             f"{where}: {name!r:.100} leaves the survey's folder; --allow-outside allows that, "
@@ -181,7 +181,7 @@ def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) 
 def is_home_file(path: Path) -> bool:
     """Return whether a link leads to a file in the user's home folder outside hidden folders.
 
-    People use links to collect photographs in a folder, so these links are no attack.
+    People use links to collect photographs in a folder, so these links are not an attack.
 
     Args:
         path: path of the link.
@@ -203,7 +203,7 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
         allow_outside: whether these paths may lead out of its folder; do not allow it for files of strangers.
 
     Raises:
-        SurveyFileError: the file is unreadable or no TOML, or has an unknown key, a wrong type, or settings
+        SurveyFileError: the file is unreadable or not TOML, or has an unknown key, a wrong type, or settings
             that contradict one another. The message states the file, the key, the value found and the value
             needed.
     """

@@ -36,14 +36,11 @@ from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_p
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 
 # Windows that are tried; the first of those with about the best precision is taken. Noise that is correlated
-# over
-# several pixels hides the texture of small windows. Where texture is weak, the four parameters of an affine
-# warp
-# weaken the shift, although the plane through the tie points gives them better: without them varnished wood
-# has
-# three times as many matches with half the errors. Affine windows of 31 px measure the mean depth of a curved
-# surface, with the same error in all photographs; their standard deviation is 0.93 to 1.8 times that of
-# smaller ones.
+# over several pixels hides the texture of small windows. Where texture is weak, the four parameters of an
+# affine warp weaken the shift, although the plane through the tie points gives them better: without them
+# varnished wood has three times as many matches with half the errors. Affine windows of 31 px measure the
+# mean depth of a curved surface, with the same error in all photographs; their standard deviation is 0.93 to
+# 1.8 times that of smaller ones.
 TRIED_WINDOWS = (
     Windows(15),
     Windows(11),

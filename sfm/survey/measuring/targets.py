@@ -22,7 +22,7 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.photographs.reading import read_photograph, take_back_srgb
+from sfm.photographs.reading import linearise_srgb, read_photograph
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage
 from sfm.runtime.faults import working_on
@@ -155,7 +155,7 @@ def target_settings(settings: TargetSettings, family: TargetFamily | None) -> st
 def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFamily | None) -> Targets:
     """Return the targets of a photograph, (H, W), that was read in the channel of the settings."""
     return find_targets(
-        take_back_srgb(photograph) if settings.tone == "srgb" else photograph,
+        linearise_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,
@@ -247,9 +247,9 @@ def each_photograph(
 
 
 def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
-    """Return for every photograph the first one whose file has the same bytes; itself if it is no copy.
+    """Return for every photograph the first one whose file has the same bytes; itself if it is not a copy.
 
-    A copy is no second observation: it would only make the result look more precise than it is.
+    A copy is not a second observation: it would only make the result look more precise than it is.
     """
     first = list(range(len(photographs)))
     seen: dict[tuple[int, str], int] = {}

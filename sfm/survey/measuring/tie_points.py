@@ -42,12 +42,10 @@ MIN_SPREAD_SIGMAS = 2.0
 # Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
 # A photograph with fewer image points is searched for more features. Three photographs of a portal, taken
-# while
-# walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
+# while walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
 # Photographs that must agree on a point: two rays do not reveal an error along the epipolar line. Points of
-# two
-# rays are used if a photograph, or a part of it, has no others.
+# two rays are used if a photograph, or a part of it, has no others.
 MIN_RAYS = 3
 
 

@@ -126,10 +126,8 @@ def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[st
         why = describe_reasons(by_count(lost))
         raise GeometryError(
             f"refine: {counted(2 * len(part.image_points), 'coordinate')} of {len(part.points)} points "
-            "measured anew in "
-            f"{counted(len(part.images), 'photograph')} are not more than is to be estimated from them; "
-            "hold parameters "
-            "of the cameras" + (f" (not measured anew: {why})" if why else "")
+            f"measured anew in {counted(len(part.images), 'photograph')} leave no redundancy; "
+            "hold parameters of the cameras" + (f" (not measured anew: {why})" if why else "")
         )
 
 

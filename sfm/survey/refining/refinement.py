@@ -57,8 +57,7 @@ from sfm.survey.refining.windows import (
 )
 
 # Sides of windows that are tried. Larger windows that cover a photograph gain nothing. On a curved surface
-# they
-# measure its mean depth, with the same error in all photographs, and no residual shows it.
+# they measure its mean depth, with the same error in all photographs, and no residual shows it.
 WINDOWS_PX = (15, 11)
 MIN_PHOTOGRAPHS = 4  # of a camera whose principal point is freed
 FOCAL_NAMES = ("f", "fx", "fy")  # any of these names holds the only principal distance of a camera
@@ -75,10 +74,8 @@ MAX_SHIFT_FACTOR = 6.0
 MIN_SHIFT_PX = 2.0
 UNSUPPORTED = f"of a point that fewer than {MIN_RAYS} photographs match"
 # If the RMS after refinement is more than this fraction of the RMS before, and sigma0 is more than twice the
-# value
-# that windows and surfaces explain, not only the key points are wrong. A model that was refined before also
-# has a
-# similar RMS before and after.
+# value that windows and surfaces explain, not only the key points are wrong. A model that was refined before
+# also has a similar RMS before and after.
 HARDLY_BETTER = 0.5
 MAX_SIGMA0 = 2.0
 BEYOND = f"behind the photograph or more than {MAX_OFF_AXIS_DEG:g} degrees off the axis"

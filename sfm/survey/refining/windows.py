@@ -30,8 +30,7 @@ TRIAL_PHOTOGRAPHS = 3  # whose points choose the window
 MIN_RAYS = 3  # of a point that is measured
 SHRINKS = (1, 2, 4)  # pixels of the photograph along the side of one pixel of the reduced photograph
 # Ratio of precisions up to which finer pixels are preferred. Surfaces are not plane over large windows, which
-# shifts
-# the matches of all photographs alike, and no residual shows it.
+# shifts the matches of all photographs alike, and no residual shows it.
 MAX_REDUCED_RATIO = 1.5
 TRIAL_RAYS = 100  # with fewer rays the window stays as it is
 

@@ -45,7 +45,7 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     if survey.tie_points is not None:
         if survey.targets.codes != "none":
             raise SurveyFileError(
-                f"{where}: [tie_points] take the place of targets, codes = '{survey.targets.codes}' asks for "
+                f"{where}: [tie_points] replace targets, but codes = '{survey.targets.codes}' asks for "
                 "targets; needed codes = 'none', or no [tie_points]"
             )
         if survey.tie_points.window_px % 2 == 0:
@@ -54,8 +54,8 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
             )
         if survey.start_points is not None:
             raise SurveyFileError(
-                f"{where}: [approximate] points are of targets, natural points are other ones in every run; "
-                "start values of [tie_points] are those of the photographs, [approximate] images"
+                f"{where}: [approximate] points are start values of targets, and tie points differ in every "
+                "run; with [tie_points] give start values of the photographs, [approximate] images"
             )
     names = [camera.name for camera in survey.cameras]
     for name in names:
@@ -71,12 +71,12 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     for rig in survey.rigs:
         if rig.moment == "exif" and survey.observations is not None:
             raise SurveyFileError(
-                f"{where}: rig {rig.name}: moment = 'exif' beside [observations], which have no photographs; "
+                f"{where}: rig {rig.name}: moment = 'exif' needs photographs, [observations] have none; "
                 "name the moments by an expression, 'order' or a table"
             )
     globs = sum(len(camera.images or ()) for camera in survey.cameras)
     if globs > MAX_GLOBS:
-        raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are looked for")
+        raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are searched")
     if survey.compare.baseline != "none" and survey.observations is not None:
         raise SurveyFileError(
             f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
@@ -91,7 +91,7 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     refuse_free_points_without_turn(survey.targets, survey.datum.kind, where)
     plate = plate_control(survey.targets)
     if plate is not None and survey.control is not None and not isinstance(survey.control, KnownPoints):
-        raise SurveyFileError(f"{where}: [control] beside a calibration plate, which is the control itself")
+        raise SurveyFileError(f"{where}: [control] is given, but the calibration plate is the control")
     _refuse_contradicting_exterior(survey)
     observed = survey.exterior is not None or survey.exif_sigma_m is not None
     known = survey.control is not None or observed or plate is not None
@@ -141,7 +141,7 @@ def _refuse_contradicting_sizes(targets: TargetSettings, where: str, unit: str) 
         inner, outer = targets.ring_radii
         if targets.codes in ("none", *DICTIONARIES, *WIDTHS, *PLATES):
             raise SurveyFileError(
-                f"{where}: targets.ring_radii are of rings, codes = '{targets.codes}' has none"
+                f"{where}: targets.ring_radii belong to rings, codes = '{targets.codes}' has none"
             )
         if not 1 < inner < outer:
             raise SurveyFileError(
@@ -205,7 +205,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         for parameter in names:
             if names.count(parameter) > 1:
                 raise SurveyFileError(
-                    f"{at}: parameter '{parameter}' is {names.count(parameter)} times in {key}, once is "
+                    f"{at}: parameter '{parameter}' occurs {names.count(parameter)} times in {key}, once is "
                     "needed"
                 )
     for one, other, both in (
@@ -227,7 +227,9 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         )
     if camera.calibration is not None:
         for key in sorted(camera.model_fields_set - {"name", "images", "size_px", *CALIBRATION_KEYS}):
-            raise SurveyFileError(f"{at}: {key} and calibration are both given; a calibration gives all")
+            raise SurveyFileError(
+                f"{at}: {key} and calibration are both given; a calibration sets all parameters"
+            )
     elif camera.calibration_use != "fixed":
         raise SurveyFileError(f"{at}: calibration_use is given, calibration is needed with it")
     for parameter in start:
@@ -237,8 +239,7 @@ def _refuse_contradictions_of_camera(camera: CameraSettings, at: str) -> None:
         if parameter not in camera.adjusted:
             key = "per_photograph" if parameter in camera.per_photograph else "per_group"
             raise SurveyFileError(
-                f"{at}: parameter '{parameter}' is in {key} but is not adjusted, it is needed in free or "
-                "weighted"
+                f"{at}: parameter '{parameter}' is in {key} but is not adjusted, needed in free or weighted"
             )
     if bool(camera.per_group) != bool(camera.groups):
         missing, given = ("groups", "per_group") if camera.per_group else ("per_group", "groups")
@@ -266,11 +267,13 @@ def _refuse_contradictions_of_rigs(
                 raise SurveyFileError(f"{here}: no camera is named '{name}'; cameras are {some}")
             if name in owner:
                 raise SurveyFileError(
-                    f"{here}: camera {name} is on rig {owner[name]} already, needed one rig"
+                    f"{here}: camera {name} is already on rig {owner[name]}, needed one rig"
                 )
             owner[name] = rig.name
         if rig.blocks and rig.mounts is not None:
-            raise SurveyFileError(f"{here}: mounts and blocks, of which one is needed: blocks find theirs")
+            raise SurveyFileError(
+                f"{here}: mounts and blocks are both given, needed one: blocks find their own mounts"
+            )
         if "tolerance_s" in rig.model_fields_set and rig.moment != "exif":
             raise SurveyFileError(
                 f"{here}: tolerance_s is given, moment = \"exif\" is needed with it; moment is '{rig.moment}'"
@@ -284,7 +287,7 @@ def _refuse_contradictions_of_rigs(
                 "interior orientation for each camera of a survey with rigs"
             )
     if len({rig.name for rig in rigs}) < len(rigs):
-        raise SurveyFileError(f"{where}: two rigs have one name")
+        raise SurveyFileError(f"{where}: two rigs have the same name")
 
 
 def _refuse_pattern(pattern: str, where: str) -> None:
@@ -292,7 +295,7 @@ def _refuse_pattern(pattern: str, where: str) -> None:
     try:
         groups = re.compile(pattern).groups
     except (re.error, OverflowError, RecursionError) as error:
-        raise SurveyFileError(f"{where}: moment = '{pattern}' is no regular expression: {error}") from None
+        raise SurveyFileError(f"{where}: moment = '{pattern}' is not a regular expression: {error}") from None
     if groups != 1:
         raise SurveyFileError(
             f"{where}: moment = '{pattern}' has {counted(groups, 'group')}, needed 1, such as "

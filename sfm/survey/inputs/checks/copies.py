@@ -1,6 +1,6 @@
 """Copies of photographs that were saved again or compressed, found by their errors.
 
-A copy is no second observation: it would only make the result look more precise than it is. However, if
+A copy is not a second observation: it would only make the result look more precise than it is. However, if
 compression causes larger errors than the original has, the errors differ, and the copy counts as an
 observation. Two photographs from one position have the residuals r_i and r_j, which differ by d = r_i - r_j.
 With independent errors the square sum of d equals that of both residuals together. With identical errors it
@@ -35,7 +35,7 @@ from sfm.survey.inputs.measurements import Measurements
 
 ALPHA = 0.001  # probability of taking two exposures for one, over all pairs
 MIN_CORRELATION = 0.7  # of the errors; it is 0.99 for real photographs saved as JPEG of quality 40
-SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are no copies
+SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are not copies
 MIN_COMMON = 4  # image points that must agree
 DIGIT_PX = 1e-6  # smaller differences are from writing, not from measuring, px
 
@@ -96,9 +96,8 @@ def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]])
     if keep.sum() < 2:
         raise GeometryError(
             f"{len(copies)} of {counted(len(keep), 'photograph')} {agreeing(len(copies), 'shows|show')} "
-            "the object "
-            f"as another one does, down to the errors ({listed(copies)}): copies, or nothing moved "
-            "between the exposures; photograph from other directions, or move the plate"
+            f"the object as another one does, down to the errors ({listed(copies)}): copies, or nothing "
+            "moved between the exposures; photograph from other directions, or move the plate"
         )
     every = np.ones(len(network.image_points), dtype=bool)
     points = np.ones(len(network.points), dtype=bool)
