@@ -120,7 +120,7 @@ def run_batch(
     with _no_empty_folders(out), locked(out / LOCK, out) as before:
         if before is not None:
             watch.remark(f"an earlier run was cut off ({before}); what it had finished is safe")
-        _clean(out, plans)
+        _remove_half_written(out, plans)
         watch.planned([plan.folder for plan in plans])
         try:
             with engine as running:
@@ -131,7 +131,7 @@ def run_batch(
                     pictures_mb=pictures_mb,
                 )
         finally:
-            _clean(out, plans)
+            _remove_half_written(out, plans)
         ordered = tuple(rows[plan.folder] for plan in plans)
         write_batch_pages(ordered, out)
     return ordered
@@ -165,11 +165,11 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
             raise SurveyFileError("an empty name stands for no survey")
         path = Path(name)
         if path.exists() or not glob.has_magic(name):
-            found.update(dict.fromkeys(_below(path)))
+            found.update(dict.fromkeys(_survey_files_in(path)))
             continue
         matches = _matches(path)
         for match in matches:
-            found.update(dict.fromkeys(_below(match)))
+            found.update(dict.fromkeys(_survey_files_in(match)))
     return tuple(found)
 
 
@@ -206,7 +206,7 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     return max(1, calls)
 
 
-def _below(path: Path) -> list[Path]:
+def _survey_files_in(path: Path) -> list[Path]:
     """Return the survey files of a folder, or a file itself."""
     if not path.is_dir():
         return [path.resolve()]
@@ -282,7 +282,7 @@ def _run(
                 if earlier is None:
                     works[plan.folder] = _work(job, plan.survey, comparers)
             except Exception as error:
-                finish(plan.folder, _without_result(plan, out, "failed", error))
+                finish(plan.folder, _row_without_result(plan, out, "failed", error))
                 continue
             if earlier is not None:  # a run killed at the last moment may have left its log
                 remove_log(out / LOGS / f"{plan.folder}.jsonl")
@@ -309,7 +309,7 @@ def _run(
     for suspect in suspects:
         for event in lost([works[suspect]], 1):
             died = BackendError(f"set aside: {event.reason}, alone as well as beside others")
-            row = _without_result(by_name[event.key], out, "set aside", died)
+            row = _row_without_result(by_name[event.key], out, "set aside", died)
             finish(event.key, replace(row, fault=True))
     return rows
 
@@ -328,14 +328,14 @@ def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     return Work(job.folder, parts, Call(reconstruct, (job, comparers)))
 
 
-def _without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
+def _row_without_result(plan: _Plan, out: Path, status: str, error: Exception) -> SurveyRow:
     """Return the row of a survey that no worker finished, and write its log."""
     name = plan.survey.name if isinstance(plan.survey, SurveyFile) else plan.folder
     with SurveyLog(out / LOGS / f"{plan.folder}.jsonl", append=True) as log:
         return failed_row(log, error, SurveyRow(name, as_plain(str(plan.file)), plan.folder, status))
 
 
-def _clean(out: Path, plans: Sequence[_Plan]) -> None:
+def _remove_half_written(out: Path, plans: Sequence[_Plan]) -> None:
     """Remove half-written files of killed workers, but not files that others write beside this batch."""
     for plan in plans:
         if any(out.glob(f".{glob.escape(plan.folder)}.*")):

@@ -267,8 +267,10 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
         name,
         judge(batch_remarks(rows), {"good": headline, "fair": headline, "bad": headline}),
         (
-            Section("Surveys", _surveys(rows, above), Note(f"Files are below {above}") if above else None),
-            Section("Without a result", _without(without, above) if without else None),
+            Section(
+                "Surveys", _table_of_results(rows, above), Note(f"Files are below {above}") if above else None
+            ),
+            Section("Without a result", _table_of_failures(without, above) if without else None),
         ),
         tiles=(
             Tile("Surveys", len(rows), f"{good} with a dependable result"),
@@ -282,7 +284,7 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
     )
 
 
-def _surveys(rows: Sequence[SurveyRow], above: str) -> Table:
+def _table_of_results(rows: Sequence[SurveyRow], above: str) -> Table:
     """Return the table of surveys with their results."""
     columns = (
         *(Column("survey"), Column("file"), Column("result"), Column("photographs", format=str)),
@@ -305,7 +307,7 @@ def _surveys(rows: Sequence[SurveyRow], above: str) -> Table:
     return Table(columns, cells)
 
 
-def _without(rows: Sequence[SurveyRow], above: str) -> Table:
+def _table_of_failures(rows: Sequence[SurveyRow], above: str) -> Table:
     """Return the table of surveys without a result, with the reasons."""
     cells = [
         (

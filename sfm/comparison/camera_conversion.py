@@ -80,9 +80,9 @@ def convert_camera(
 
     # Parameters are scaled by their effect in px, so that the tolerance has the same meaning for all.
     fit = least_squares(
-        lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[0].ravel(),
+        lambda p: _residuals(start.index, start.linear_frame, _padded(p, fitted), xy, uv)[0].ravel(),
         start.parameters[fitted],
-        jac=lambda p: _residuals(start.index, start.linear_frame, _filled(p, fitted), xy, uv)[1].reshape(
+        jac=lambda p: _residuals(start.index, start.linear_frame, _padded(p, fitted), xy, uv)[1].reshape(
             2 * len(xy), -1
         )[:, fitted],
         method="lm",
@@ -93,7 +93,7 @@ def convert_camera(
         max_nfev=1000,
     )
     free = corresponding_free(camera, model) & fitted
-    converted = replace(start.with_parameters(_filled(fit.x, fitted)), free=free)
+    converted = replace(start.with_parameters(_padded(fit.x, fitted)), free=free)
     misfit = pixel_from_tangents(converted, uv) - xy
     if not np.isfinite(misfit).all():
         raise GeometryError(
@@ -154,7 +154,7 @@ def _affinity_in_pixels(camera: Camera) -> Camera:
     return replace(folded, pixel_mm=np.array([sx * stretch, sy]))
 
 
-def _filled(p: FloatArray, fitted: BoolArray) -> FloatArray:
+def _padded(p: FloatArray, fitted: BoolArray) -> FloatArray:
     """Return all parameters of a model, with 0 for those that are not fitted."""
     values = np.zeros(len(fitted))
     values[fitted] = p
@@ -185,7 +185,7 @@ def start_values(camera: Camera, model: str) -> Camera:
         if MODELS[model].names == camera.names:
             values |= dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         if backward and to_opencv:
-            k1, k2, k3 = _reversed(*(camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3)))
+            k1, k2, k3 = _reversed_series(*(camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3)))
             values |= {"k1": k1, "k2": k2, "p1": c * camera.value("P2"), "p2": -c * camera.value("P1")}
             values |= {"k3": k3}
     else:
@@ -204,7 +204,7 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
         if MODELS[model].corrects and same:
             opencv = _as_full_opencv(camera)
-            K = _reversed(*_power_series(opencv))
+            K = _reversed_series(*_power_series(opencv))
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
             values |= {"P1": -opencv["p2"] / c, "P2": opencv["p1"] / c}
     if to_opencv:
@@ -237,7 +237,7 @@ def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:
     return {role}
 
 
-def _reversed(a: float, b: float, c: float) -> tuple[float, float, float]:
+def _reversed_series(a: float, b: float, c: float) -> tuple[float, float, float]:
     """Return the coefficients of the inverse of r (1 + a r^2 + b r^4 + c r^6) to the same order."""
     return -a, 3 * a**2 - b, 8 * a * b - 12 * a**3 - c
 

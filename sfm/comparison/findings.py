@@ -63,12 +63,12 @@ def remarks_of_cause(
             numbers = {"lengths": one.lengths, "sigma": one.sigma}
             if cause.unit is not None:
                 numbers["factor"] = cause.unit.factor
-            yield remark("strained", axis=_words(one.axis), moved=moved, **numbers, **between)
+            yield remark("strained", axis=_describe_direction(one.axis), moved=moved, **numbers, **between)
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)
 
 
-def _words(axis: FloatArray) -> str:
+def _describe_direction(axis: FloatArray) -> str:
     """Return a direction as text, with its largest component positive."""
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
     return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
@@ -83,7 +83,7 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
             found.cause, first, second, len(found.points), (float(longest.max()), unit)
         )
     elif found.changed:
-        yield _differences(found, longest, unit)
+        yield _remark_on_differences(found, longest, unit)
     tested = int(np.isfinite(found.statistic).sum())
     if found.untested is not None:
         if found.cause is None or found.untested.kind != "untestable":  # a cause was found and tested
@@ -93,10 +93,10 @@ def _remarks(found: ResultComparison) -> Iterator[Remark]:
     elif tested <= MAX_POINTS < len(found.points):
         yield remark("tested_part", tested=tested, points=len(found.points))
     if found.changed and found.independent:
-        yield from _interior(found)
+        yield from _remarks_on_cameras(found)
 
 
-def _differences(found: ResultComparison, longest: FloatArray, unit: str) -> Remark:
+def _remark_on_differences(found: ResultComparison, longest: FloatArray, unit: str) -> Remark:
     """Return the remark on differences without any other cause than that points moved."""
     if not found.majority:
         return remark("no_majority_agrees", first=found.names[0], second=found.names[1])
@@ -112,7 +112,7 @@ def _differences(found: ResultComparison, longest: FloatArray, unit: str) -> Rem
     )
 
 
-def _interior(found: ResultComparison) -> Iterator[Remark]:
+def _remarks_on_cameras(found: ResultComparison) -> Iterator[Remark]:
     """Yield remarks on cameras whose interior orientation differs, which shows that a lens moved."""
     for one in found.interior:
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -110,7 +110,7 @@ def _free(count: int, taken: IntArray) -> BoolArray:
     return free
 
 
-def _best(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
+def _best_pairs(votes: IntArray, weight: IntArray, enough: FloatArray) -> IntArray:
     """Return the pairs (i, j) with enough votes, and with more votes than any other pair of i or of j."""
     if not len(votes):
         return votes
@@ -168,7 +168,7 @@ def _images_of_places(
         return none
     votes, weight = np.unique(np.array(found), axis=0, return_counts=True)
     count_a, count_b = np.bincount(ours.image), np.bincount(theirs.image)
-    return _best(votes, weight, MAJORITY * np.minimum(count_a[votes[:, 0]], count_b[votes[:, 1]]))
+    return _best_pairs(votes, weight, MAJORITY * np.minimum(count_a[votes[:, 0]], count_b[votes[:, 1]]))
 
 
 def _points_by_image_points(
@@ -198,7 +198,7 @@ def _points_by_image_points(
     votes, weight = np.unique(np.concatenate(found), axis=0, return_counts=True)
     shared_a = np.bincount(ours.point[np.isin(ours.image, images[:, 0])], minlength=len(free_a))
     shared_b = np.bincount(theirs.point[np.isin(theirs.image, images[:, 1])], minlength=len(free_b))
-    return _best(votes, weight, MAJORITY * np.minimum(shared_a[votes[:, 0]], shared_b[votes[:, 1]]))
+    return _best_pairs(votes, weight, MAJORITY * np.minimum(shared_a[votes[:, 0]], shared_b[votes[:, 1]]))
 
 
 def _frame(a: Solution, b: Solution, points: IntArray, images: IntArray) -> Similarity | None:

@@ -157,7 +157,7 @@ def compare_results(
             f"{a.name} and {b.name} have no points and no photographs in common: they share neither names, "
             "nor image points, nor positions of points"
         )
-    chosen = _chosen(names, align, control)
+    chosen = _alignment_points(names, align, control)
     scale = known_scale(a, b)
     transform = _align(a, b, align, pairing, chosen, scale)
     same_share = _same_share(a.network, b.network, pairing)
@@ -207,7 +207,7 @@ def compare_results(
     )
 
 
-def _chosen(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> BoolArray:
+def _alignment_points(names: tuple[str, ...], align: str, control: tuple[str, ...]) -> BoolArray:
     """Return the common points that the alignment may use, (n,)."""
     if align != "control":
         return np.ones(len(names), dtype=bool)
@@ -349,7 +349,7 @@ def judge_points(
     pa, pb = pairing.points.T
     n = len(pa)
     rounding = rounding_of(a.estimate.points[pa]) ** 2
-    blocks = _sum(a.point_covariance, b.point_covariance, pa, pb, transform, rounding)
+    blocks = _covariance_of_differences(a.point_covariance, b.point_covariance, pa, pb, transform, rounding)
     variance = np.einsum("njj->nj", blocks)
     sigma = np.sqrt(np.where(variance >= 0, variance, np.nan))
     nothing = np.full(n, np.nan)
@@ -379,7 +379,7 @@ def judge_points(
         except GeometryError as error:
             return without(remark("untestable", reason=str(error)))
         sigma[together] = 0.0  # held in both results, or overwritten below
-        return _of_congruency(found, free, sigma, together)
+        return _congruency_test(found, free, sigma, together)
     if not all(one.datum in FREE_DATUMS for one in known):
         return without(remark("no_joint_covariance"))
     difference = transform.apply(b.estimate.points[pb]) - a.estimate.points[pa]
@@ -393,7 +393,9 @@ def judge_points(
     )
 
 
-def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
+def _congruency_test(
+    found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray
+) -> PointTest:
     """Return the test of all points, of which some took no part; `sigma` is overwritten in place."""
     n = len(together)
     statistic = np.full(n, np.nan)
@@ -410,7 +412,7 @@ def _of_congruency(found: Congruency, tested: IntArray, sigma: FloatArray, toget
     )
 
 
-def _sum(
+def _covariance_of_differences(
     a: FloatArray | None,
     b: FloatArray | None,
     pa: IntArray,

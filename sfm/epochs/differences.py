@@ -125,7 +125,7 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
             f"{first.name} is in {a.unit} and {second.name} in {b.unit}: give both the same unit"
         )
     moved = fit_robustly(b.estimate.points[pb], a.estimate.points[pa], scale=scale)
-    C, shared = (_correlated if together else _shared)(first, second, pairs)
+    C, shared = (_correlation_of_joint if together else _correlation_of_shared)(first, second, pairs)
     points = replace(pairs_of_results(a, b, pairs, scale)[0], C=C)
     difference, Q = points.differences(moved)
     held_alike, held_apart = _held_cameras(a, b)
@@ -204,7 +204,9 @@ def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
             )
 
 
-def _correlated(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
+def _correlation_of_joint(
+    first: Epoch, second: Epoch, pairs: IntArray
+) -> tuple[FloatArray | None, tuple[str, ...]]:
     """Return C of two epochs that were adjusted together, and a text on each shared given value."""
     assert first.common is not None and second.common is not None
     a, b = first.common, second.common
@@ -215,7 +217,9 @@ def _correlated(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArra
     return _covariance(first, second, a.columns * a.signs, b.columns, pairs), words
 
 
-def _shared(first: Epoch, second: Epoch, pairs: IntArray) -> tuple[FloatArray | None, tuple[str, ...]]:
+def _correlation_of_shared(
+    first: Epoch, second: Epoch, pairs: IntArray
+) -> tuple[FloatArray | None, tuple[str, ...]]:
     """Return C of two epochs with the same given values, and a text on each of these."""
     mine: list[FloatArray] = []
     yours: list[FloatArray] = []

@@ -180,7 +180,7 @@ def analyse_epochs(
                 block_motion(moved, _group(found, name, patterns), name=name, model=model)
                 for name, patterns in (groups or {}).items()
             ),
-            _together(moved),
+            _common_motion(moved),
             mount_changes(first.result, second.result, alpha=alpha, redundancy=found.redundancy),
         )
 
@@ -229,7 +229,7 @@ def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
     return np.array([matches(name, pattern) for name in names], dtype=bool)
 
 
-def _together(found: Displacements) -> BlockMotion | None:
+def _common_motion(found: Displacements) -> BlockMotion | None:
     """Return the motion of all points that moved as one block; None if it is not determined or checked."""
     if found.moved.sum() <= MIN_POINTS["rigid"]:
         return None
@@ -328,7 +328,7 @@ def block_motion(
     parts = PARTS[: MODELS[model]]
     x = found.differences.xyz[chosen]
     centre = x.mean(axis=0)
-    A = _columns(x, centre, MODELS[model])
+    A = _motion_columns(x, centre, MODELS[model])
     spread = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), compute_uv=False)
     if spread[-1] < RANK * spread[0]:
         raise GeometryError(
@@ -364,7 +364,7 @@ def block_motion(
     )
 
 
-def _columns(xyz: FloatArray, centre: FloatArray, parts: int) -> FloatArray:
+def _motion_columns(xyz: FloatArray, centre: FloatArray, parts: int) -> FloatArray:
     """Return the derivatives of the coordinates of k points by the parameters, (3 k, p)."""
     motion = similarity_motions(xyz, centre=centre)
     columns = [motion[:, :, : (0, 3, 6, 7, 7)[parts]]]

@@ -86,7 +86,7 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
     Source: Koch (1999), secs. 3.2.7 and 4.2.
     """
     shared = _shared_cameras(epochs)
-    alone = [_adjusted_alone(epoch, shared) for epoch in epochs]
+    alone = [_adjust_alone(epoch, shared) for epoch in epochs]
     keys = _shared_keys(alone)
     conditions, owner = _conditions(alone, shared)
     given = [_given_columns(one, keys) for one in alone]
@@ -168,7 +168,7 @@ def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
     return kept
 
 
-def _adjusted_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
+def _adjust_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
     """Adjust an epoch from its image points as its survey did; refuse it if the result differs."""
     result = epoch.result
     network = _network_of(epoch)

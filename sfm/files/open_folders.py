@@ -326,7 +326,7 @@ def refuse_foreign_folder(out: Path) -> None:
     if not stat.S_ISDIR(mode):
         raise OutputError(f"{out}: a file has this name, --out needs a folder")
     with disk_errors(f"{out}: the folder cannot be read"):
-        foreign = _foreign(out, names_below(out))
+        foreign = _describe_foreign(out, names_below(out))
     _refuse(out, foreign, "--out needs a new or empty folder or an unchanged earlier result")
 
 
@@ -341,11 +341,11 @@ def refuse_foreign_files(folder: Path, names: Iterable[str]) -> None:
     for name in wanted:
         refuse_links(folder / name)
     with disk_errors(f"{folder}: the folder cannot be read"):
-        foreign = _foreign(folder, [name for name in wanted if os.path.lexists(folder / name)])
+        foreign = _describe_foreign(folder, [name for name in wanted if os.path.lexists(folder / name)])
     _refuse(folder, foreign, "which would be replaced; another folder is needed")
 
 
-def _foreign(folder: Path, names: Iterable[str]) -> list[str]:
+def _describe_foreign(folder: Path, names: Iterable[str]) -> list[str]:
     """Return texts on the files of a folder that Kolinear did not write, or that were changed."""
     known, foreign = read_manifest(folder), []
     for name in names:

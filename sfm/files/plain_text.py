@@ -263,28 +263,28 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
     try:
         return text, tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise SurveyFileError(f"{path}{_slip(text, str(error), repeated)}") from error
+        raise SurveyFileError(f"{path}{_advice_on_mistake(text, str(error), repeated)}") from error
     except (ValueError, RecursionError) as error:
         reason = "brackets nested too deeply" if isinstance(error, RecursionError) else "a number is too long"
         raise SurveyFileError(f"{path}: not a TOML file: {reason}") from error
 
 
-def _slip(text: str, message: str, repeated: Collection[str]) -> str:
+def _advice_on_mistake(text: str, message: str, repeated: Collection[str]) -> str:
     """Return position and advice for a usual mistake; for others the message of the parser."""
     found = re.search(r"\(at line (\d+), column \d+\)$", message)
     number = int(found[1]) if found else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
     if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
-        return f", line {number}: {_doubled(text.splitlines(), number, section[1], repeated)}"
+        return f", line {number}: {_advice_on_duplicate(text.splitlines(), number, section[1], repeated)}"
     if message.startswith("Cannot overwrite a value"):
         return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} is there twice"
     for looks, write in SLIPS if len(line) <= MAX_SAID else ():
         if looks.search(line):
             return f", line {number}: {as_plain(line.strip())}: {write}"
-    return f": not a TOML file: {_cut(message)}"
+    return f": not a TOML file: {_shorten_message(message)}"
 
 
-def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
+def _advice_on_duplicate(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
     """Return where a duplicate section occurs first, with advice."""
     found = (_SECTION.match(one) for one in lines[: number - 1])
     first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
@@ -294,7 +294,7 @@ def _doubled(lines: list[str], number: int, name: str, repeated: Collection[str]
     return f"[{shown}] is there twice{where}; {write}"
 
 
-def _cut(message: str) -> str:
+def _shorten_message(message: str) -> str:
     """Return the parser's message without the middle of a long key; its end states the position."""
     kept = (
         message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"

@@ -193,7 +193,7 @@ def accept_result(
         coverage,
         decision,
         diagonal,
-        tuple(_lacking(lengths, directions, diagonal, result.unit)),
+        tuple(_unmet_requirements(lengths, directions, diagonal, result.unit)),
     )
 
 
@@ -224,7 +224,9 @@ def _refuse_tested_scale(
                 )
 
 
-def _lacking(lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str) -> list[Remark]:
+def _unmet_requirements(
+    lengths: CalibratedLengths, directions: FloatArray, diagonal: float, unit: str
+) -> list[Remark]:
     """Return remarks on requirements of part 1 that the data do not meet."""
     lines = list(dict.fromkeys(lengths.line))
     found = []

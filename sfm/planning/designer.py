@@ -139,19 +139,19 @@ class _Designer:
         chosen: list[int] = []
         while len(chosen) < min(MIN_PHOTOGRAPHS, self.most):
             chosen.append(self._next(chosen))
-        short = self._full(chosen)[1]
+        short = self._predict_fully(chosen)[1]
         for _ in range(ROUNDS):
             before, idle = short, 0
             while short > 1 and len(chosen) < self.most and idle < PATIENCE:
                 chosen.append(self._next(chosen))
-                new = self._full(chosen)[1]
+                new = self._predict_fully(chosen)[1]
                 idle = idle + 1 if new > NO_BETTER * short else 0
                 short = min(short, new)
-            chosen, prediction, short = self._exchanged(chosen)
+            chosen, prediction, short = self._exchange(chosen)
             if short <= 1 or len(chosen) >= self.most or short > NO_BETTER * before:
                 break
         if short <= 1:
-            chosen, prediction, short = self._fewer(chosen, prediction, short)
+            chosen, prediction, short = self._remove_unneeded(chosen, prediction, short)
         return Design(
             prediction,
             short,
@@ -164,7 +164,7 @@ class _Designer:
         """Return the covariance of each point with the chosen photographs, (n, 3, 3)."""
         return np.asarray(np.linalg.inv(self.prior + self.single[list(chosen)].sum(axis=0)))
 
-    def _open(self, chosen: Sequence[int]) -> BoolArray:
+    def _available(self, chosen: Sequence[int]) -> BoolArray:
         """Return the candidates that may be taken: each station once, either upright or rolled."""
         open_ = np.ones(len(self.found.stations), dtype=bool)
         taken = np.array(chosen, dtype=np.int64)
@@ -181,7 +181,7 @@ class _Designer:
         return open_
 
     def _next(self, chosen: Sequence[int]) -> int:
-        gain = gains(self._cofactors(chosen), self.rows, self.scale * self.ratio, self._open(chosen))
+        gain = gains(self._cofactors(chosen), self.rows, self.scale * self.ratio, self._available(chosen))
         if not (gain > 0).any():
             raise GeometryError("plan: fewer stations show the object than a network needs")
         return int(np.argmax(gain))
@@ -189,7 +189,7 @@ class _Designer:
     def _cost(self, chosen: Sequence[int]) -> float:
         return cost_of(np.trace(self._cofactors(chosen), axis1=1, axis2=2) / 3, self.scale * self.ratio)
 
-    def _full(self, chosen: Sequence[int]) -> tuple[Prediction | None, float]:
+    def _predict_fully(self, chosen: Sequence[int]) -> tuple[Prediction | None, float]:
         """Return the full prediction and its shortfall; update the ratios of full to limiting variances."""
         which = np.array(chosen, dtype=np.int64)
         report_step(f"predicting {counted(len(chosen), 'photograph')}")
@@ -211,9 +211,9 @@ class _Designer:
         self.ratio = np.clip(ratio, 1.0, MAX_RATIO)
         return prediction, short_of(prediction, self.wanted, self.seeable)
 
-    def _exchanged(self, chosen: list[int]) -> tuple[list[int], Prediction, float]:
+    def _exchange(self, chosen: list[int]) -> tuple[list[int], Prediction, float]:
         """Exchange stations for better ones as long as the full prediction improves."""
-        prediction, short = self._full(chosen)
+        prediction, short = self._predict_fully(chosen)
         for _ in range(SWEEPS):
             tried = list(chosen)
             cost = self._cost(tried)
@@ -225,7 +225,7 @@ class _Designer:
                     tried, cost = [*tried[:k], new[-1], *tried[k + 1 :]], new_cost
             if tried == chosen:
                 break
-            other, other_short = self._full(tried)
+            other, other_short = self._predict_fully(tried)
             if other_short >= short:
                 break
             chosen, prediction, short = tried, other, other_short
@@ -235,7 +235,7 @@ class _Designer:
             )
         return chosen, prediction, short
 
-    def _fewer(
+    def _remove_unneeded(
         self, chosen: list[int], prediction: Prediction, short: float
     ) -> tuple[list[int], Prediction, float]:
         """Remove photographs that the requirements do not need."""
@@ -243,9 +243,9 @@ class _Designer:
             order = np.argsort([self._cost(chosen[:k] + chosen[k + 1 :]) for k in range(len(chosen))])
             for k in order[:3]:
                 fewer = chosen[: int(k)] + chosen[int(k) + 1 :]
-                new, new_short = self._full(fewer)
+                new, new_short = self._predict_fully(fewer)
                 if new_short > 1:
-                    fewer, new, new_short = self._exchanged(fewer)
+                    fewer, new, new_short = self._exchange(fewer)
                 if new is not None and new_short <= 1:
                     chosen, prediction, short = fewer, new, new_short
                     break

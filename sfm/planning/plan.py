@@ -303,7 +303,7 @@ def further_photographs(
     variance = np.trace(before.covariance.points, axis1=1, axis2=2) / 3
     known &= variance > 0
     rows = np.flatnonzero(known)
-    planned = _faced(network, estimate, rows)
+    planned = _with_mean_normals(network, estimate, rows)
     camera = int(np.bincount(network.camera[oriented]).argmax())
     seeing = Seeing(sigma_px=sigma_px, max_incidence_deg=max_incidence_deg)
     room = candidates(
@@ -356,7 +356,7 @@ def further_photographs(
     )
 
 
-def _faced(network: Network, estimate: Estimate, rows: IntArray) -> PlannedObject:
+def _with_mean_normals(network: Network, estimate: Estimate, rows: IntArray) -> PlannedObject:
     """Return the selected points, with the mean direction of their rays as their normals."""
     seen = network.image_points
     ray = estimate.position[seen.image] - estimate.points[seen.point]

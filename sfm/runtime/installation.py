@@ -48,7 +48,7 @@ def public_names(package: str, folder: str) -> Face:
     Raises:
         AttributeError: from `__getattr__`, if a name is not public.
     """
-    module_of = _listed(package, os.path.join(folder, "__init__.pyi"))
+    module_of = _modules_of_stub(package, os.path.join(folder, "__init__.pyi"))
     names = sorted(module_of)
 
     def get(name: str) -> object:
@@ -62,7 +62,7 @@ def public_names(package: str, folder: str) -> Face:
     return get, lambda: list(names), names
 
 
-def _listed(package: str, stub: str) -> dict[str, str]:
+def _modules_of_stub(package: str, stub: str) -> dict[str, str]:
     """Return the module of each name that a stub imports."""
     module_of = {}
     with open(stub, encoding="utf-8") as lines:
@@ -137,12 +137,14 @@ def closed_current_folder() -> Iterator[None]:
     """
     before = {name: os.environ.get(name) for name in (SAFE_PATH, MODULES, LIBRARIES)}
     os.environ[SAFE_PATH] = "1"
-    if modules := _folders(MODULES):
+    if modules := _without_empty_folders(MODULES):
         os.environ[MODULES] = modules
     else:
         os.environ.pop(MODULES, None)
     if os.name != "nt":
-        os.environ[LIBRARIES] = _folders(LIBRARIES) or os.path.dirname(os.path.abspath(__file__))
+        os.environ[LIBRARIES] = _without_empty_folders(LIBRARIES) or os.path.dirname(
+            os.path.abspath(__file__)
+        )
     try:
         yield
     finally:
@@ -153,6 +155,6 @@ def closed_current_folder() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _folders(variable: str) -> str:
+def _without_empty_folders(variable: str) -> str:
     """Return a path of folders without empty entries, which mean the current folder."""
     return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)

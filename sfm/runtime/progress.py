@@ -115,7 +115,7 @@ class StageClock:
 
 def give_back_memory() -> None:
     """Return freed memory to the system, if the C library supports it (glibc)."""
-    trim = _asked("malloc_trim")
+    trim = _libc_function("malloc_trim")
     if trim is not None:
         trim(0)
 
@@ -123,7 +123,7 @@ def give_back_memory() -> None:
 @cache
 def share_freed_memory() -> None:
     """Let threads that start later share one pool of freed memory, if the C library supports it (glibc)."""
-    option = _asked("mallopt")
+    option = _libc_function("mallopt")
     if option is not None:
         option(ARENA_MAX, 1)
 
@@ -140,7 +140,7 @@ def keep_freed_memory() -> None:
 
 
 @cache
-def _asked(function: str) -> Callable[..., int] | None:
+def _libc_function(function: str) -> Callable[..., int] | None:
     """Return a function of the C library, or None if it does not exist."""
     if sys.platform != "linux":
         return None

@@ -63,7 +63,7 @@ def check_circles(
     numbers, point = np.unique(seen.point[rows], return_inverse=True)
     if not len(numbers):
         return CircleCheck(network, estimate, (), None)
-    views = _views(photographs, naming, network, estimate, rows, point)
+    views = _circle_views(photographs, naming, network, estimate, rows, point)
     circles = fit_circles(views, len(numbers))
     no_circle = numbers[(circles.misfit > NOT_A_CIRCLE) & (naming.code[numbers] < 0)]
     points = estimate.points.copy()
@@ -74,12 +74,12 @@ def check_circles(
         return CircleCheck(network, estimate, names, None)
     names_of_circles = tuple(network.points[j] for j in numbers)
     known = _known_radius(survey, names_of_circles)
-    remarks = _unknown_ids(survey.diameters, network.points)
+    remarks = _remark_on_unknown_ids(survey.diameters, network.points)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
         other: tuple[Remark, ...] = ()
         if np.isfinite(scale):
-            other = _other_sizes(survey, names_of_circles, known, scale * circles.radius)
+            other = _remarks_on_diameters(survey, names_of_circles, known, scale * circles.radius)
             remarks += other
         if other or not np.isfinite(scale):  # a bar may be wrong: the targets alone give the scale
             scale = float(np.nanmedian(known / circles.radius))
@@ -116,7 +116,7 @@ def circle_misfit(
     numbers, point = np.unique(network.image_points.point[rows], return_inverse=True)
     if not len(numbers):
         return float("inf")
-    circles = fit_circles(_views(photographs, naming, network, estimate, rows, point), len(numbers))
+    circles = fit_circles(_circle_views(photographs, naming, network, estimate, rows, point), len(numbers))
     return float(np.median(circles.misfit))
 
 
@@ -126,7 +126,7 @@ def _seen_twice(
     """Return which image points belong to targets with outlines in two or more oriented photographs, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _named(naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
+    rows &= _values_of_image_points(naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
 
@@ -141,7 +141,7 @@ def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
     return radius
 
 
-def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Remark, ...]:
+def _remark_on_unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Remark, ...]:
     """Return a remark on ids in the table of diameters that no target of the survey has."""
     known = set(points)
     unknown = [name for name in given.names if name not in known] if given is not None else []
@@ -150,7 +150,7 @@ def _unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Rema
     return (remark("diameters_of_unknown", targets=unknown),)
 
 
-def _other_sizes(
+def _remarks_on_diameters(
     survey: Survey, points: tuple[str, ...], stated: FloatArray, found: FloatArray
 ) -> tuple[Remark, ...]:
     """Return remarks on stated diameters that the ellipses contradict.
@@ -197,7 +197,7 @@ def _other_sizes(
     return tuple(remarks)
 
 
-def _named(naming: Naming, values: list[AnyArray]) -> AnyArray:
+def _values_of_image_points(naming: Naming, values: list[AnyArray]) -> AnyArray:
     """Return the values of the named targets in the order of the image points, (k, ...).
 
     values: one array for each photograph, with a row for each of its targets.
@@ -206,7 +206,7 @@ def _named(naming: Naming, values: list[AnyArray]) -> AnyArray:
     return np.concatenate([of_photograph[named != UNNAMED] for of_photograph, named in targets])
 
 
-def _views(
+def _circle_views(
     photographs: MeasuredPhotographs,
     naming: Naming,
     network: Network,
@@ -216,7 +216,7 @@ def _views(
 ) -> CircleViews:
     """Return the ellipses of the selected image points, with their rays."""
     shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
-    shape = _named(naming, shapes)[rows]
+    shape = _values_of_image_points(naming, shapes)[rows]
     seen = network.image_points.select(rows)
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]

@@ -85,7 +85,7 @@ def choose_free_parameters(
         part, start = reduce_network(network, estimate, images, points, everything)
         alone = None
         if images.sum() >= MIN_DETERMINING_C:  # control may be wrong, and hide what the image points demand
-            alone = _determined(without_given(part), start, names, "free", extend=extend)
+            alone = _determined_parameters(without_given(part), start, names, "free", extend=extend)
         elif datum != "control":
             seen = set(silent) & set(part.camera.tolist())
             settings = tuple(
@@ -94,9 +94,9 @@ def choose_free_parameters(
             )
             of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
             part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
-            alone = _determined(part, start, names, "free", extend=extend)
+            alone = _determined_parameters(part, start, names, "free", extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
-            with_control = _determined(part, start, names, datum, extend=extend)
+            with_control = _determined_parameters(part, start, names, datum, extend=extend)
             if alone is None or _has_each_c(start, names, with_control):
                 alone = with_control
         names = [
@@ -140,9 +140,11 @@ def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
     return all(name in (free or ()) for name, may, free in each if name in (may or ()))
 
 
-def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool) -> Chosen:
+def _determined_parameters(
+    part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool
+) -> Chosen:
     """Return the candidates that a network determines, and other parameters that its image points demand."""
-    names, adjusted = _held_back(part, start, names, datum)
+    names, adjusted = _hold_undetermined(part, start, names, datum)
     index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
         demanded = () if adjusted is None else contradicted_parameters(adjusted)
@@ -152,26 +154,28 @@ def _determined(part: Network, start: Estimate, names: Chosen, datum: str, *, ex
                 wider[index[camera]] = (wider[index[camera]] or set()) | {parameter}
         if adjusted is None or wider == names:
             break
-        tried, adjusted = _held_back(part, adjusted.estimate, wider, datum)
+        tried, adjusted = _hold_undetermined(part, adjusted.estimate, wider, datum)
         if adjusted is None or tried == names:
             break
         names = tried
     return names
 
 
-def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tuple[Chosen, Adjustment | None]:
+def _hold_undetermined(
+    part: Network, start: Estimate, names: Chosen, datum: str
+) -> tuple[Chosen, Adjustment | None]:
     """Hold the worst parameters one by one until all others are determined; also the last adjustment.
 
     Observed parameters are never held: they take part with the precision of their values.
     """
     observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
     while any(names):
-        adjusted = _adjusted(part, _with_free(start, names), datum)
+        adjusted = _adjust_or_none(part, _with_free(start, names), datum)
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
             for name in sorted((one for one in chosen or () if (a, index(one)) not in observed), key=_rank):
-                now = np.inf if adjusted is None else _reach(adjusted, a, name)
+                now = np.inf if adjusted is None else _corner_shift(adjusted, a, name)
                 if now > reach:
                     worst, reach = (a, name), now
         if worst is None:
@@ -182,7 +186,7 @@ def _held_back(part: Network, start: Estimate, names: Chosen, datum: str) -> tup
     return names, None
 
 
-def _adjusted(part: Network, start: Estimate, datum: str) -> Adjustment | None:
+def _adjust_or_none(part: Network, start: Estimate, datum: str) -> Adjustment | None:
     """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
         found = adjust(part, start, datum=Datum(datum), reject="tau", redundancy_numbers=False)
@@ -203,7 +207,7 @@ def _defect_of_points(part: Network, found: Adjustment) -> int:
     return int(np.maximum(left - known, 0).sum())
 
 
-def _reach(adjusted: Adjustment, a: int, name: str) -> float:
+def _corner_shift(adjusted: Adjustment, a: int, name: str) -> float:
     """Return the image shift at the corner by one sigma of a parameter, in half diagonals."""
     camera = adjusted.estimate.cameras[a]
     s = camera.names.index(name)

@@ -83,7 +83,7 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
         if survey.tie_points:
             return _orient_strongest(network, values)
         return _orient_on_control(
-            network, values, given=survey.observations is not None, judge=_judge(measured)
+            network, values, given=survey.observations is not None, judge=_circle_judge(measured)
         )
 
     found, failure = None, None
@@ -143,14 +143,14 @@ def _orient_on_control(
     except GeometryError as error:
         failure = error
     if not len(network.control) or (found is not None and _fits(network, found).all()):
-        return _known(found, failure)
+        return _require(found, failure)
     points = estimate.points.copy()
     points[network.control.point] = np.nan
     alone = replace(network, control=ObjectPoints())
     try:
         other = _orient(alone, replace(estimate, points=points), contradicting=given, judge=judge)
     except GeometryError:
-        return _known(found, failure)
+        return _require(found, failure)
     if found is not None and _fits(network, other).sum() <= _fits(network, found).sum():
         return found
     with suppress(GeometryError):  # fewer than three control points, or on a line
@@ -161,7 +161,7 @@ def _orient_on_control(
     return other
 
 
-def _known(found: Orientation | None, failure: GeometryError | None) -> Orientation:
+def _require(found: Orientation | None, failure: GeometryError | None) -> Orientation:
     """Return the orientation, or raise the reason why there is none."""
     if found is None:
         raise failure or GeometryError("orientation: none")
@@ -202,7 +202,7 @@ def _hold_cameras_of_two(
     return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(remarks)
 
 
-def _judge(measured: Measurements) -> Judge | None:
+def _circle_judge(measured: Measurements) -> Judge | None:
     """Return a function for the misfit of the outlines as circles; None without circular targets."""
     photographs, naming = measured.photographs, measured.naming
     if photographs is None or naming is None or naming.corners:
@@ -278,7 +278,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
         found = orient_survey(survey, measured)
     except GeometryError as error:
         failure = error
-    likelihood, fitting = (-math.inf, 0) if found is None else _fit(measured, found)
+    likelihood, fitting = (-math.inf, 0) if found is None else _likelihood(measured, found)
     few = fitting < MIN_FITTING_FRACTION * len(measured.network.image_points)
     wide = [a for a in unsaid if found is None or few or _is_wide(found.estimate.cameras[a])]
     if not wide:
@@ -299,7 +299,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
             raise failure or GeometryError("orientation: none") from None
         return survey, measured, found
     search = len(wide) * (math.log(2 * len(measured.network.image_points)) / 2 + math.log(1 / ALPHA))
-    likelihood_of_other, fitting_other = _fit(other_measured, other)
+    likelihood_of_other, fitting_other = _likelihood(other_measured, other)
     if found is not None and likelihood_of_other <= likelihood + search:
         return survey, measured, found
     taken = tuple(
@@ -327,7 +327,7 @@ def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
     return camera_from_values(camera.name, FISHEYE, camera.size_px, pixel, c_mm=c_mm, free=free)
 
 
-def _fit(measured: Measurements, found: Orientation) -> tuple[float, int]:
+def _likelihood(measured: Measurements, found: Orientation) -> tuple[float, int]:
     """Return the log-likelihood of all image points, and how many of them fit.
 
     Points that do not fit have a uniform distribution over the format.

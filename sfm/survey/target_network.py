@@ -173,7 +173,7 @@ def match_uncoded(
         if oriented[i]:
             camera = estimate.cameras[photographs.camera[i]]
             projected = project(camera, estimate.position[i], estimate.rotation[i], known)
-            named = _nearest(
+            named = _coinciding_points(
                 found.xy,
                 projected,
                 found.code,
@@ -208,7 +208,7 @@ def match_uncoded(
     )
 
 
-def _nearest(
+def _coinciding_points(
     xy: FloatArray,
     projected: FloatArray,
     code: IntArray,

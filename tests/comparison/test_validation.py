@@ -11,7 +11,7 @@ from adapters.colmap.adjuster import ColmapBackend, adjust_with_colmap
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjuster_validation import (
     Validation,
-    _ended,
+    _remark_on_end,
     make_trial,
     validate,
 )
@@ -92,7 +92,7 @@ HUNDREDTH = 0.01**2 * 0.5**2 / 2  # what a difference of 0.01 standard deviation
 def test_how_two_adjusters_end(
     a: float, b: float, ours: tuple[str, ...], theirs: tuple[str, ...], ended: str, severity: str
 ) -> None:
-    kind = _ended(a, b, 0.5, ours, theirs)
+    kind = _remark_on_end(a, b, 0.5, ours, theirs)
     assert kind == ended
     assert remark(kind).severity == severity
 

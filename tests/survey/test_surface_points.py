@@ -236,7 +236,7 @@ def test_rays_that_do_not_fit_tell_nothing_of_the_surface() -> None:
         np.repeat(np.arange(3), n), np.tile(np.arange(n), 3), xy, np.tile(np.eye(2), (3 * n, 1, 1))
     )
     network = Network(("a", "b", "c"), np.zeros(3, dtype=np.int64), tuple(map(str, range(n))), seen)
-    fits = surface_points._fitting(network, truth)
+    fits = surface_points._fitting_rays(network, truth)
     assert (~fits).nonzero()[0].tolist() == [4, n + 4, 2 * n + 4]
 
 

@@ -151,9 +151,9 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
     network, plan = made.network, made.plan
     control = plan.datum == "control"
     begun = time.perf_counter()
-    ours, our_failure = _tried(lambda: _adjust(made, covariance=False))
+    ours, our_failure = _try_adjuster(lambda: _adjust(made, covariance=False))
     our_seconds = time.perf_counter() - begun
-    theirs, their_failure = _tried(lambda: backend.adjust(network, made.start, control=control))
+    theirs, their_failure = _try_adjuster(lambda: backend.adjust(network, made.start, control=control))
     if ours is not None:
         our_failure = ours.undetermined or (() if ours.converged else ("not_converged",))
     if theirs is not None and not theirs.converged:
@@ -164,7 +164,7 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
     covariances = (np.nan,) * 3
     if ours is not None and not our_failure:
         at_optimum = ours.estimate
-        full, our_failure = _tried(lambda: _adjust(made, covariance=True, start=at_optimum))
+        full, our_failure = _try_adjuster(lambda: _adjust(made, covariance=True, start=at_optimum))
         if full is not None and theirs is not None and np.isfinite(cost_b):
             sigmas = _differences(full, theirs.estimate, control=control)
         if full is not None:
@@ -181,7 +181,7 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
         *sigmas,
         *covariances,
         remark(
-            _ended(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
+            _remark_on_end(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
             network=number,
             program=program_name(backend.name),
             apart=sigmas_apart(cost_a, cost_b, plan.noise_px),
@@ -202,7 +202,9 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
     context = multiprocessing.get_context("spawn")
     with (
         closed_current_folder(),
-        ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin, initargs=(backend,)) as pool,
+        ProcessPoolExecutor(
+            jobs, mp_context=context, initializer=_prepare_worker, initargs=(backend,)
+        ) as pool,
     ):
         try:
             yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
@@ -211,7 +213,7 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
             raise
 
 
-def _begin(backend: ValidationBackend) -> None:
+def _prepare_worker(backend: ValidationBackend) -> None:
     """Prepare a worker: one thread, Ctrl-C ignored (the parent ends the worker), kernels loaded."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
@@ -226,8 +228,8 @@ def warm_up(backend: ValidationBackend) -> None:
         if made.plan.model in waiting and len(made.network.image_points) < WARM_UP_IMAGE_POINTS:
             waiting.remove(made.plan.model)
             control = made.plan.datum == "control"
-            _tried(partial(_adjust, made, covariance=True))
-            _tried(partial(backend.adjust, made.network, made.start, control=control))
+            _try_adjuster(partial(_adjust, made, covariance=True))
+            _try_adjuster(partial(backend.adjust, made.network, made.start, control=control))
         if not waiting:
             return
 
@@ -244,7 +246,7 @@ def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = N
     )
 
 
-def _tried(run: Callable[[], T]) -> tuple[T | None, tuple[str, ...]]:
+def _try_adjuster(run: Callable[[], T]) -> tuple[T | None, tuple[str, ...]]:
     """Run an adjuster; every failure is a result here, including faults of a program."""
     try:
         return run(), ()
@@ -277,7 +279,9 @@ def sigmas_apart(a: float, b: float, sigma_px: float) -> float:
     return float(np.sqrt(2 * abs(a - b)) / sigma_px)
 
 
-def _ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> str:
+def _remark_on_end(
+    a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]
+) -> str:
     """Return the kind of remark on how two adjusters ended, from their costs (px^2) and failures."""
     # An adjuster that ends at the other's optimum has solved the network, whatever it reports.
     if sigmas_apart(a, b, sigma_px) <= SAME_SIGMAS:
@@ -326,7 +330,7 @@ def _covariances(
     spread = np.trace(full.covariance.points, axis1=1, axis2=2)
     moved: BoolArray = spread > 0
     ratio = np.sqrt(spread[moved] / np.trace(conditional[moved], axis1=1, axis2=2))
-    found, _ = _tried(lambda: backend.covariance(network, full.estimate, control=control))
+    found, _ = _try_adjuster(lambda: backend.covariance(network, full.estimate, control=control))
     if found is None:
         return np.nan, np.nan, float(np.median(ratio))
     points = [

@@ -320,7 +320,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
         compared: in-house adjustment of this network with the cameras of the comparison.
     """
     own_cameras = survey.estimate.cameras
-    more = _held_there(own_cameras, compared.estimate.cameras)
+    more = _parameters_to_free(own_cameras, compared.estimate.cameras)
     if not more or not compared.converged:
         return None
     adjusted = partial(adjust, network, datum=Datum("free"), sigma_px=survey.sigma_px, reject="none")
@@ -337,7 +337,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     return replace(found, free=clear or more)
 
 
-def _held_there(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
+def _parameters_to_free(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
     """Return the survey's fixed parameters whose counterparts are free in the comparison."""
     names: dict[str, None] = {}
     for ours, theirs in zip(cameras, compared, strict=True):

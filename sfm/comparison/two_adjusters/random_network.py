@@ -189,7 +189,7 @@ def _stations(rng: np.random.Generator, plan: Plan) -> tuple[FloatArray, FloatAr
         position += 0.05 * rng.standard_normal((m, 3))
         aim = position * [1, 1, 0] + 0.2 * rng.standard_normal((m, 3)) * [1, 1, 0]
         roll = rng.uniform(-0.1, 0.1, m) + np.pi * (np.arange(m) % 2)
-        return position, _looking(position, aim, roll)
+        return position, _rotations_towards(position, aim, roll)
     if plan.arrangement == "ring":
         elevation = np.deg2rad(np.full(m, rng.uniform(max(lowest, 30.0), 60.0)) + rng.uniform(-5, 5, m))
     elif plan.arrangement == "hemisphere":
@@ -204,10 +204,10 @@ def _stations(rng: np.random.Generator, plan: Plan) -> tuple[FloatArray, FloatAr
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
     )
     position = distance[:, None] * direction
-    return position, _looking(position, aim, roll)
+    return position, _rotations_towards(position, aim, roll)
 
 
-def _looking(position: FloatArray, aim: FloatArray, roll: FloatArray) -> FloatArray:
+def _rotations_towards(position: FloatArray, aim: FloatArray, roll: FloatArray) -> FloatArray:
     """Return rotations whose -z axis points from position to aim, turned about it by the roll."""
     z = position - aim
     z /= np.linalg.norm(z, axis=1, keepdims=True)

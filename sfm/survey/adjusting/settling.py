@@ -146,14 +146,14 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         refuse_too_few_observations(part, start, task.datum.kind)
         used = images[network.image_points.image] & points[network.image_points.point]
-        adjustment = _tested(task, part, start, covariance=False, rejected=~accepted[used])
+        adjustment = _adjust_with_snooping(task, part, start, covariance=False, rejected=~accepted[used])
         start_sigma0 = start_sigma0 if iterations else adjustment.start_sigma0
         iterations += adjustment.iterations
         if not adjustment.converged:
-            adjustment, held = _converged(task, part, start, adjustment)
+            adjustment, held = _readjust_until_converged(task, part, start, adjustment)
             iterations += adjustment.iterations
         estimate = merge_estimate(adjustment.estimate, images, points)
-        accepted = _accepted(network, adjustment, images, points)
+        accepted = _accepted_image_points(network, adjustment, images, points)
         if wrong is None:  # once only: errors of windows are not quite normal, each round would find more
             wrong = np.zeros(len(points), dtype=bool)
             if task.survey.tie_points is not None and task.survey.reject != "none":
@@ -215,17 +215,17 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
     part, estimate = without_idle_cameras(part, estimate, count=len(task.survey.cameras))
 
     def adjust_part(factor: FloatArray) -> Adjustment:
-        return _tested(task, part, estimate, covariance=True, factor=factor, rejected=rejected)
+        return _adjust_with_snooping(task, part, estimate, covariance=True, factor=factor, rejected=rejected)
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(is_observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     others = len(part.scale_bars) or len(part.interior) or len(part.observations) or weighted
     if others and task.survey.adjust.weights == "components":
-        return _weighed(adjust_part, len(part.image_points), task.factor)
+        return _adjust_with_component(adjust_part, len(part.image_points), task.factor)
     return adjust_part(np.ones(len(part.image_points)))
 
 
-def _converged(
+def _readjust_until_converged(
     task: Task, part: Network, start: Estimate, ended: Adjustment
 ) -> tuple[Adjustment, tuple[Remark, ...]]:
     """Return the adjustment from nearer start values, and remarks on parameters held to make it converge.
@@ -238,7 +238,7 @@ def _converged(
         return ended, ()
     for held in HELD_ONE_AFTER_ANOTHER[: None if not len(part.interior) else 1]:
         cameras = tuple(replace(one, free=one.free & ~one.plays(*held)) for one in nearer.cameras)
-        found = _tested(
+        found = _adjust_with_snooping(
             *(task, part, replace(nearer, cameras=cameras)),
             covariance=False,
             method="gauss-newton",
@@ -249,7 +249,7 @@ def _converged(
     return ended, ()
 
 
-def _tested(
+def _adjust_with_snooping(
     task: Task,
     network: Network,
     estimate: Estimate,
@@ -303,7 +303,9 @@ def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
     return replace(datum, points=on)
 
 
-def _weighed(adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float) -> Adjustment:
+def _adjust_with_component(
+    adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float
+) -> Adjustment:
     """Return the adjustment with the image points weighted by their variance component.
 
     Lengths and control keep their stated standard deviations. Without the component, sigma0 a posteriori,
@@ -338,7 +340,9 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     return np.asarray(large)
 
 
-def _accepted(network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray) -> BoolArray:
+def _accepted_image_points(
+    network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray
+) -> BoolArray:
     """Return which image points of the whole network the adjustment of its part accepted, (k,)."""
     seen = network.image_points
     part = images[seen.image] & points[seen.point]
@@ -359,7 +363,13 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
     Returns:
         The start values, with the cameras as in `start`; None if no adjustment converges.
     """
-    found = [one for one in (_held(network, one, datum) for one in _candidates(start, ended, datum)) if one]
+    found = [
+        one
+        for one in (
+            _adjust_with_cameras_held(network, one, datum) for one in _start_candidates(start, ended, datum)
+        )
+        if one
+    ]
     if not found:
         return None
     best = min(found, key=lambda one: one.vPv)
@@ -379,7 +389,7 @@ def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> t
     )
 
 
-def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
+def _start_candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
     """Yield the ended adjustment scaled to c of the start, and the start; each also reversed in depth."""
     factor = start.cameras[0].c_px / ended.cameras[0].c_px
     back = replace(scaled(ended, factor), cameras=start.cameras) if factor > 0 else start
@@ -389,7 +399,7 @@ def _candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Esti
             yield reverse_depth(one)
 
 
-def _held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
+def _adjust_with_cameras_held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
     """Return the adjustment with all cameras held, damped at first; None if it does not converge."""
     values = replace(
         start, cameras=tuple(replace(one, free=np.zeros_like(one.free)) for one in start.cameras)

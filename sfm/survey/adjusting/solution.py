@@ -113,12 +113,12 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     Raises:
         GeometryError: too little is left to adjust, or the datum is control but no control is seen.
     """
-    found = _solution(survey, matched)
-    varying = _varying(survey, found)
+    found = _solve(survey, matched)
+    varying = _cameras_with_varying_c(survey, found)
     if varying:
         report_step("adjusting c of each photograph")
         with suppress(GeometryError):
-            zoomed = _solution(survey, matched, varying)
+            zoomed = _solve(survey, matched, varying)
             a, focal = (
                 zoomed.adjustment,
                 [c for _, c, _ in _c_per_photograph(varying, zoomed.adjustment.estimate)],
@@ -129,7 +129,7 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     return found
 
 
-def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
+def _cameras_with_varying_c(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
     """Return the cameras whose c, as texture shows, differs among their photographs."""
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     if survey.tie_points is None or survey.rigs or not differs:
@@ -137,18 +137,16 @@ def _varying(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
     return frozenset(one.name for one in survey.cameras if not one.states_free)
 
 
-def _solution(
-    survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()
-) -> SolvedSurvey:
+def _solve(survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()) -> SolvedSurvey:
     """Return the solution of a survey; the cameras `varying` have c per photograph."""
-    start = _prepared(survey, matched, varying)
+    start = _prepare(survey, matched, varying)
     free = _free_network(start)
-    mounts, of_mounts = _judged_mounts(start, free)
-    plates = _plates(survey, matched.naming, matched.network)
-    task, given = _judged(start, free, plates, checks_scale=bool(len(mounts)))
-    settled, gross = _settled(start, free, task, given, mounts)
+    mounts, of_mounts = _confirmed_mounts(start, free)
+    plates = _points_of_plates(survey, matched.naming, matched.network)
+    task, given = _with_confirmed_values(start, free, plates, checks_scale=bool(len(mounts)))
+    settled, gross = _settle_with_given(start, free, task, given, mounts)
     report_step("adjusting all observations")
-    found, better = _best(start, settled)
+    found, better = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
     if survey.tie_points is not None:
         report_step("estimating the errors that neighbours have in common")
@@ -165,12 +163,12 @@ def _solution(
     listed = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     report_step("testing the assumptions")
-    plates = _plates(survey, matched.naming, final.network)
+    plates = _points_of_plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)
     return SolvedSurvey(
         final,
         found.check,
-        _dropped(start, settled),
+        _dropped_photographs(start, settled),
         (
             *start.remarks,
             *(() if settled.per_photograph is None else settled.per_photograph.remarks),
@@ -199,7 +197,7 @@ def _solution(
     )
 
 
-def _plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:
+def _points_of_plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:
     """Return the names of the points of each plate; empty without plates."""
     if naming is None:
         return ()
@@ -228,7 +226,7 @@ class _Final:
     others: tuple[OtherSolution, ...]
 
 
-def _prepared(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
+def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
     """Bring network and approximate values into the frame and cameras of the survey.
 
     varying: names of the cameras with c per photograph, if c is adjusted.
@@ -308,7 +306,7 @@ def _has_no_identity(survey: Survey) -> bool:
     return plate is not None and plate.is_ambiguous
 
 
-def _judged_mounts(
+def _confirmed_mounts(
     start: _Prepared, free: StableAdjustment | None
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the given mounts that the image points confirm, and remarks on the others."""
@@ -319,7 +317,7 @@ def _judged_mounts(
     return judge_mounts(mounts, free.adjustment)
 
 
-def _judged(
+def _with_confirmed_values(
     start: _Prepared,
     free: StableAdjustment | None,
     plates: tuple[tuple[str, ...], ...],
@@ -363,7 +361,7 @@ def _judged(
     return replace(task, network=given.network, needed=needed), given
 
 
-def _settled(
+def _settle_with_given(
     start: _Prepared,
     free: StableAdjustment | None,
     task: Task,
@@ -386,11 +384,11 @@ def _settled(
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate = start.estimate
     if free is not None:
-        estimate = _completed(estimate, free.whole, task, given)
+        estimate = _free_network_in_frame(estimate, free.whole, task, given)
     estimate = scale_to_bars(task.network, estimate, task.datum)
     gross: tuple[Remark, ...] = ()
     if task.network.observations and free is not None:
-        task, gross = _without_gross(task, free, estimate)
+        task, gross = _without_gross_observations(task, free, estimate)
         if gross and task.datum.kind != "control":
             estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
@@ -428,25 +426,25 @@ def _with_mounts(
     return replace(task, network=network), estimate, said
 
 
-def _best(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:
+def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:
     """Return the final adjustment, and a remark if it starts from another solution of smaller v'Pv."""
-    found = _final(start, settled)
+    found = _finish(start, settled)
     if not found.others or not found.others[0].converges:
         return found, ()
     other = found.others[0]
     estimate = merge_estimate(other.estimate, settled.images, settled.points)
-    again = _final(start, settle(settled.task, estimate).after(settled), before=found.adjustment)
+    again = _finish(start, settle(settled.task, estimate).after(settled), before=found.adjustment)
     if not again.adjustment.converged:  # the better start leads to no solution
         return found, ()
-    return again, (_better_taken(found.adjustment, other),)
+    return again, (_remark_on_better_start(found.adjustment, other),)
 
 
-def _final(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:
+def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:
     """Return the final adjustment of a settled network, and other solutions that its image points allow.
 
     before: the solution that this one replaces.
     """
-    final, check = _placed(start, settled)
+    final, check = _place_settled(start, settled)
     final = replace(
         final, iterations=settled.iterations + final.iterations, start_sigma0=settled.start_sigma0
     )
@@ -454,13 +452,13 @@ def _final(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | 
     asked = {one.name for one in start.estimate.cameras if one.free[0]}
     c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
     report_step("looking for other solutions")
-    starts = _of_pair(final)
+    starts = _solutions_of_pair(final)
     if before is not None and len(before.network.points) == len(final.network.points):
         starts = (*starts, before.estimate)
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
-def _without_gross(
+def _without_gross_observations(
     task: Task, settled: StableAdjustment, estimate: Estimate
 ) -> tuple[Task, tuple[Remark, ...]]:
     """Return the task without tabulated observations that contradict all others in the settled network."""
@@ -484,7 +482,7 @@ def _without_gross(
     return replace(task, network=without_observations(task.network, estimate, wrong, whole)), remarks
 
 
-def _completed(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
+def _free_network_in_frame(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
     """Return the free network in the frame of the given values; single-ray control keeps its start values."""
     if given.placing is not None and task.datum.kind == "control":
         found = given.placing.apply_estimate(found)
@@ -503,7 +501,7 @@ def _with_given(settled: StableAdjustment) -> StableAdjustment:
     return replace(settled, adjustment=replace(settled.adjustment, network=part))
 
 
-def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
+def _solutions_of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     """Return the solutions that the image points of a pair allow; empty with control, which decides."""
     if len(final.network.images) > 2 or final.datum == "control":
         return ()
@@ -513,7 +511,7 @@ def _of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     )
 
 
-def _placed(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, ControlCheck | None]:
+def _place_settled(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, ControlCheck | None]:
     """Return the final adjustment of a settled network, placed on its control or the frame of its datum."""
     task, last, check = settled.task, settled.estimate, None
     if task.datum.kind != "control" and len(settled.part.control.complete) >= MIN_CONTROL:
@@ -529,7 +527,7 @@ def _placed(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, Co
     return adjust_finally(task, settled.part, last, settled.rejected), check
 
 
-def _dropped(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Remark], ...]:
+def _dropped_photographs(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Remark], ...]:
     """Return the oriented photographs that are not in the result, with the reason."""
     reasons = {} if settled.per_photograph is None else dict(settled.per_photograph.left_out)
     task = start.task
@@ -542,7 +540,7 @@ def _dropped(start: _Prepared, settled: StableAdjustment) -> tuple[tuple[str, Re
     )
 
 
-def _better_taken(final: Adjustment, other: OtherSolution) -> Remark:
+def _remark_on_better_start(final: Adjustment, other: OtherSolution) -> Remark:
     """Return the remark that the network was adjusted again from a solution of smaller v'Pv."""
     first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
     return remark(

@@ -189,7 +189,7 @@ def remarks_on_principal_distances(
         estimate: has the adjusted cameras.
         sigma: standard deviation of the principal distance of each camera, in its unit.
     """
-    if _calibrates(survey):
+    if _is_calibration(survey):
         return ()
     given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
     remarks = []
@@ -237,7 +237,7 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
         estimate: has the adjusted cameras; a per-photograph camera has the name of its camera followed by
             that of the photograph.
     """
-    if not _calibrates(survey):
+    if not _is_calibration(survey):
         return ()
     remarks, names = [], [one.name for one in survey.cameras]
     for one in survey.cameras:
@@ -250,7 +250,7 @@ def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     return tuple(remarks)
 
 
-def _calibrates(survey: Survey) -> bool:
+def _is_calibration(survey: Survey) -> bool:
     """Return whether the points of a survey are on a plate of known coordinates."""
     return plate_family(survey.targets) is not None and survey.datum.kind == "control"
 

@@ -166,7 +166,7 @@ def plates_not_in_result(family: TargetFamily | None, code: IntArray) -> tuple[R
 def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Describe the targets and codes found where more are needed, and the settings that matter."""
     if plates := missing_plates(survey.family, photographs):
-        return _in_error(*plates)
+        return _as_error_text(*plates)
     targets = [len(found) for found in photographs.targets]
     codes = [int((found.code >= 0).sum()) for found in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
@@ -175,7 +175,7 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
         f"{counted(sum(targets), 'target')} found in {counted(len(targets), 'photograph')}, "
         f"{counted(sum(codes), 'code')} read in "
-        f"{with_codes} of them{_by_photograph(photographs, codes)}; check in [targets] "
+        f"{with_codes} of them{_list_codes_read(photographs, codes)}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
         f"{_describe_size(survey, photographs)}{_other_settings(survey, photographs)}"
@@ -211,7 +211,7 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
     )
 
 
-def _in_error(one: Remark) -> str:
+def _as_error_text(one: Remark) -> str:
     """Return a remark as part of an error message."""
     return f"{one.text.rstrip('.')}: {one.remedy.rstrip('.')}"
 
@@ -219,7 +219,7 @@ def _in_error(one: Remark) -> str:
 def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Report codes too small to read, else candidates below the least diameter, if there are any."""
     if small := small_codes(photographs.targets):
-        return f"; {_in_error(*small)}"
+        return f"; {_as_error_text(*small)}"
     count = sum(int((found.rejected_flag == Flag.TOO_SMALL).sum()) for found in photographs.targets)
     if count < MIN_POINTS * len(photographs.targets):
         return ""
@@ -230,7 +230,7 @@ def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     )
 
 
-def _by_photograph(photographs: MeasuredPhotographs, codes: list[int]) -> str:
+def _list_codes_read(photographs: MeasuredPhotographs, codes: list[int]) -> str:
     """List how many codes were read in each of the first photographs, if any were."""
     if not any(codes):
         return ""
@@ -276,10 +276,10 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
             if family != settings.codes and isinstance(family, str):
                 differ.append(f"codes = '{family}'")
             words = f"; in {photographs.names[fullest]} {' and '.join(differ)} reads {counted(count, 'code')}"
-    return words or _tags(photograph, photographs.names[fullest], settings.codes)
+    return words or _tag_family_shown(photograph, photographs.names[fullest], settings.codes)
 
 
-def _tags(photograph: AnyArray, name: str, codes: str) -> str:
+def _tag_family_shown(photograph: AnyArray, name: str, codes: str) -> str:
     """Name the family of square tags that a photograph shows, if any."""
     best, words = MIN_TAGS - 1, ""
     for family in DICTIONARIES:

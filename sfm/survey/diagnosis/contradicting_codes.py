@@ -45,11 +45,11 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
         photographs: all measured targets.
         naming: point of each target in the adjusted network.
     """
-    whole, shown = _places(photographs, naming)
+    whole, shown = _points_by_code(photographs, naming)
     contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
     groups = _groups(contested)
     largest = groups[0] if groups else frozenset()
-    accepted = _accepted(contested, largest)
+    accepted = _points_of_group(contested, largest)
     elsewhere: dict[int, set[int]] = {}
     for code, places in contested.items():
         for image, at in places.items():
@@ -64,8 +64,12 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
     for image, codes in foreign.items():
         group = next(one for one in groups if image in one)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
-        left_out[image] = _foreign(codes, others)
-    main = {code: place for code, places in contested.items() if (place := _most(places, largest)) != UNNAMED}
+        left_out[image] = _reason_for_other_object(codes, others)
+    main = {
+        code: place
+        for code, places in contested.items()
+        if (place := _majority_point(places, largest)) != UNNAMED
+    }
     away = {image: frozenset(codes) for image, codes in elsewhere.items()}
     return ContestedCodes(contested, left_out, main, away)
 
@@ -136,7 +140,7 @@ def remarks_on_contested(
     return tuple(remarks)
 
 
-def _places(
+def _points_by_code(
     photographs: MeasuredPhotographs, naming: Naming
 ) -> tuple[dict[int, dict[int, frozenset[int]]], Counter[int]]:
     """Return the points of each code, by code and photograph, and the number of codes of each photograph."""
@@ -176,7 +180,7 @@ def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[i
         seed = max(left, key=lambda image: (len(of_image[image]), -image))
         group = frozenset({seed})
         for _ in left:
-            accepted = _accepted(contested, group)
+            accepted = _points_of_group(contested, group)
             agreeing = {seed}
             for image in left:
                 same = sum(bool(at & accepted[code]) for code, at in of_image[image].items())
@@ -193,7 +197,7 @@ def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[i
     return sorted(groups, key=lambda one: (-len(one), min(one)))
 
 
-def _accepted(
+def _points_of_group(
     contested: dict[int, dict[int, frozenset[int]]], group: frozenset[int]
 ) -> dict[int, frozenset[int]]:
     """Return the points at which the photographs of a group show each contested code."""
@@ -203,13 +207,13 @@ def _accepted(
     }
 
 
-def _most(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
+def _majority_point(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
     """Return the point at which most photographs of a group show a code, UNNAMED without one."""
     counted = Counter(k for image, at in places.items() if image in group for k in at if k != UNNAMED)
     return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
 
 
-def _foreign(codes: set[int], agreeing: list[str]) -> Remark:
+def _reason_for_other_object(codes: set[int], agreeing: list[str]) -> Remark:
     """Return why a photograph of another object is not in the result."""
     numbers = [str(code) for code in sorted(codes)]
     return remark("photograph_with_codes_elsewhere", codes=numbers, agreeing=agreeing or None)

@@ -103,7 +103,7 @@ def explain_lost_photographs(network: Network, found: Orientation, *, named: boo
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
             reasons[network.images[i]] = remark("photograph_not_connected", shared=count, needed=MIN_POINTS)
     groups.sort(key=lambda one: -len(one.images))
-    remarks = (_not_connected(network, oriented, group, named=named) for group in groups)
+    remarks = (_remark_on_unconnected(network, oriented, group, named=named) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)
     return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
 
@@ -162,11 +162,11 @@ def try_other_principal_distances(
     if lost < 2:  # a single lost photograph has another cause
         misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
         held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
-        best = _likeliest(network, estimate, found, held, orient, least=_count_oriented(found))
-        return (found if best is None else _restored(best, estimate)), ()
+        best = _find_likelier(network, estimate, found, held, orient, least=_count_oriented(found))
+        return (found if best is None else _with_original_freedom(best, estimate)), ()
     others = [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
     least = _count_oriented(found) + int(MAJORITY_FRACTION * lost) + 1
-    best = _likeliest(network, estimate, found, others, orient, least=least)
+    best = _find_likelier(network, estimate, found, others, orient, least=least)
     if best is None:
         return found, ()
     remarks = tuple(
@@ -181,10 +181,10 @@ def try_other_principal_distances(
         )
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
-    return (_restored(best, estimate) if free else found), remarks
+    return (_with_original_freedom(best, estimate) if free else found), remarks
 
 
-def _likeliest(
+def _find_likelier(
     network: Network,
     estimate: Estimate,
     found: Orientation | None,
@@ -221,7 +221,7 @@ def _count_oriented(found: Orientation | None) -> int:
     return 0 if found is None else int(found.estimate.oriented.sum())
 
 
-def _restored(found: Orientation, estimate: Estimate) -> Orientation:
+def _with_original_freedom(found: Orientation, estimate: Estimate) -> Orientation:
     """Return the orientation with the same free parameters as the start values."""
     cameras = tuple(
         replace(new, free=old.free) for new, old in zip(found.estimate.cameras, estimate.cameras, strict=True)
@@ -258,9 +258,9 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
     return replace(estimate, cameras=tuple(cameras))
 
 
-def _not_connected(network: Network, oriented: BoolArray, group: LostGroup, *, named: bool) -> Remark:
+def _remark_on_unconnected(network: Network, oriented: BoolArray, group: LostGroup, *, named: bool) -> Remark:
     """Return the remark on a group of photographs that is not connected, with points to connect it."""
-    theirs = _often_seen(network, group.images) if named else []
+    theirs = _most_seen_points(network, group.images) if named else []
     return remark(
         "not_connected",
         photographs=[network.images[i] for i in group.images],
@@ -268,11 +268,11 @@ def _not_connected(network: Network, oriented: BoolArray, group: LostGroup, *, n
         shared=[network.points[j] for j in group.shared if named] or None,
         needed=MIN_POINTS,
         points=theirs if len(theirs) >= MIN_POINTS else None,
-        others=(_often_seen(network, np.flatnonzero(oriented)) or None) if named else None,
+        others=(_most_seen_points(network, np.flatnonzero(oriented)) or None) if named else None,
     )
 
 
-def _often_seen(network: Network, images: IntArray) -> list[str]:
+def _most_seen_points(network: Network, images: IntArray) -> list[str]:
     """Return the names of the points that these photographs show most often."""
     seen = network.image_points
     rays = np.bincount(seen.point[np.isin(seen.image, images)], minlength=len(network.points))
@@ -399,7 +399,9 @@ def find_second_objects(
         images = np.flatnonzero(left)[other.estimate.oriented]
         left[images] = False
         try:
-            reason = _reason(_adjusted(network, found), _adjusted(part, other), tuple(names[images]))
+            reason = _reason_for_misfit(
+                _adjust_fitting(network, found), _adjust_fitting(part, other), tuple(names[images])
+            )
         except (GeometryError, np.linalg.LinAlgError):  # too little is determined to compare
             continue
         if reason is not None:
@@ -407,7 +409,7 @@ def find_second_objects(
     return reasons
 
 
-def _adjusted(network: Network, found: Orientation) -> Solution | None:
+def _adjust_fitting(network: Network, found: Orientation) -> Solution | None:
     """Adjust the image points that fit an orientation by themselves; None without a solution."""
     alone = Network(network.images, network.camera, network.points, network.image_points)
     images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
@@ -418,7 +420,9 @@ def _adjusted(network: Network, found: Orientation) -> Solution | None:
     return a.solution.with_joint_covariance
 
 
-def _reason(others: Solution | None, group: Solution | None, images: tuple[str, ...]) -> Remark | None:
+def _reason_for_misfit(
+    others: Solution | None, group: Solution | None, images: tuple[str, ...]
+) -> Remark | None:
     """Return why photographs do not fit the others; None if they show the same object or too little of it."""
     if others is None or group is None:
         return None

@@ -125,7 +125,7 @@ def find_photograph_cameras(
             )
         )
     if changed:
-        cameras[: len(estimate.cameras)] = [_sharing(camera) for camera in estimate.cameras]
+        cameras[: len(estimate.cameras)] = [_with_parameter_groups(camera) for camera in estimate.cameras]
         own_network = replace(network, camera=owner)
         own_estimate = replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation)
         if _explained_otherwise(network, estimate, own_network, own_estimate, accepted, ~out):
@@ -208,13 +208,13 @@ def _photograph_camera(
         ObjectPoints(np.arange(n), points, np.zeros((n, 3, 3))),
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
-    shared = _alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
+    shared = _adjust_alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
     search = np.log(len(SCALES)) + np.log(len(FREED_ROLES) * len(network.images) / ALPHA)
     best, most = None, 0.0
     for roles in FREED_ROLES:
         freed = camera.plays(*roles)
         freed[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
-        found = _alone(alone, start, points, freed)
+        found = _adjust_alone(alone, start, points, freed)
         if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
             continue
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
@@ -234,13 +234,14 @@ def _photograph_camera(
         parameters=np.where(freed, found.estimate.cameras[0].parameters, camera.parameters),
         free=camera.free | freed,
         shared=tuple(
-            "" if mine else group for mine, group in zip(freed, _sharing(camera).shared, strict=True)
+            "" if mine else group
+            for mine, group in zip(freed, _with_parameter_groups(camera).shared, strict=True)
         ),
     )
     return variant, found
 
 
-def _alone(
+def _adjust_alone(
     alone: Network, start: tuple[Camera, FloatArray, FloatArray] | None, points: FloatArray, free: BoolArray
 ) -> Adjustment | None:
     """Adjust one photograph on known points, with some parameters free; None if there is no solution."""
@@ -289,7 +290,7 @@ def _scaled_resection(
     return None if best is None else best[1:]
 
 
-def _sharing(camera: Camera) -> Camera:
+def _with_parameter_groups(camera: Camera) -> Camera:
     """Return the camera with its parameters in groups, which it shares with cameras split off from it."""
     shared = tuple(camera.owner_of(s) for s in range(len(camera.names)))
     return camera if camera.shared else replace(camera, shared=shared)

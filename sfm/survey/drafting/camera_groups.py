@@ -67,14 +67,14 @@ def group_photographs(
     by_name = not any(one.make for one in metadata.values())
     for name, one in sorted(metadata.items()):
         key = (one.make, one.model, one.serial, one.lens, _rounded(one.focal_mm), one.size_px)
-        groups.setdefault((*key, _series(name) if by_name else ""), []).append(name)
+        groups.setdefault((*key, _name_before_number(name) if by_name else ""), []).append(name)
     largest = max((len(names) for names in groups.values()), default=0)
     kept, left_out = [], []
     for names in sorted(groups.values(), key=lambda names: (-len(names), names)):
         if len(names) >= MIN_IN_GROUP or largest < MIN_IN_GROUP:
             kept.append(names)
         else:
-            left_out += [(name, _alone(metadata[name], metadata[kept[0][0]])) for name in names]
+            left_out += [(name, _reason_left_out(metadata[name], metadata[kept[0][0]])) for name in names]
     labels = _labels([metadata[names[0]] for names in kept])
     return Grouping(
         tuple(
@@ -155,7 +155,7 @@ def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...
     return tuple(remarks)
 
 
-def _alone(one: Metadata, main: Metadata) -> str:
+def _reason_left_out(one: Metadata, main: Metadata) -> str:
     """Return why the only photograph of a camera is left out."""
     if one.size_px == main.size_px[::-1] and (one.make, one.model) == (main.make, main.model):
         return "the only one stored upright; a photograph turned by a program has lost its camera"
@@ -173,7 +173,7 @@ def _rounded(focal: float | None) -> float | None:
     return None if focal is None else float(f"{focal:.3g}")
 
 
-def _series(name: str) -> str:
+def _name_before_number(name: str) -> str:
     """Return the part of a name before its last number; "" if it contains a date."""
     found = re.fullmatch(r"(.*?)\d+(\D*)", name)
     prefix = found[1] if found else ""

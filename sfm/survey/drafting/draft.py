@@ -87,7 +87,7 @@ def draft_survey(
     return Draft(
         name,
         _text(name, grouping, trial, pitch, left_out, positions),
-        _found(grouping, trial, positions),
+        _findings(grouping, trial, positions),
         _remarks(grouping, trial, pitch),
         left_out,
     )
@@ -148,7 +148,7 @@ def _text(
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     for camera in grouping.cameras:
-        lines += ["", *_camera_lines(camera, _free(trial))]
+        lines += ["", *_camera_lines(camera, _free_parameters(trial))]
     if left_out:
         lines += ["", "# Left out:"]
         lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
@@ -175,7 +175,7 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
-def _free(trial: TargetTrial) -> tuple[str, ...]:
+def _free_parameters(trial: TargetTrial) -> tuple[str, ...]:
     """Return the free parameters of the cameras; empty for texture, where the adjustment chooses them."""
     if trial.plate is not None:
         return FREE_BY_PLATES
@@ -298,7 +298,7 @@ def _position_lines(positions: int) -> list[str]:
     ]
 
 
-def _found(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
+def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
     """Return the findings for the terminal."""
     found = [
         (

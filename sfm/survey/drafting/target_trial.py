@@ -99,7 +99,7 @@ def try_targets(
         GeometryError: fewer than two of them can be decoded.
     """
     progress.stage("trial", TRIED + 5)
-    tried, photographs, unreadable = _readable(paths, progress)
+    tried, photographs, unreadable = _read_spread(paths, progress)
     names = tuple(path.name for path in tried)
     if min(one.size for one in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
         greys = [_as_bytes(photograph) for photograph in photographs]
@@ -114,20 +114,20 @@ def try_targets(
         if all(len(codes) < MIN_REPEATED for codes in counts.values()):
             for family in families:
                 codes = list(map(partial(_ring_codes, family), photographs, plain))
-                counts[family] = _repeated(codes)
+                counts[family] = _repeated_codes(codes)
     progress.advance("rings")
     best, measured = max(counts, key=lambda family: len(counts[family])), plain
     plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
     if len(counts[best]) < MIN_REPEATED:
         refused = {name for name, _ in unreadable}
-        more = [paths[k] for k in _spread(len(paths), PLATES_TRIED) if paths[k].name not in refused]
+        more = [paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED) if paths[k].name not in refused]
         read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
         tags, plates = _tags_and_boards(read_already, more, progress)
         if not plates and tags:
             measured = [_measure(path, tags, store) for path in tried]
-            counts[tags], best = _repeated([one.code for one in measured]), tags
+            counts[tags], best = _repeated_codes([one.code for one in measured]), tags
         else:
-            dots = _dots(plain, [path for path in more if path not in tried], store)
+            dots = _dot_plate(plain, [path for path in more if path not in tried], store)
             seen = zip(read_already.values(), plain, strict=True)
             if dots is None or not plates:
                 plates = plates if dots is None else (dots,)
@@ -138,7 +138,7 @@ def try_targets(
         progress.advance("plates of dots")
         if not plates and not tags:
             read = [read_resolved(photograph) for photograph in photographs]
-            counts |= {family: _repeated([one[family] for one in read]) for family in CONCENTRIC}
+            counts |= {family: _repeated_codes([one[family] for one in read]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
             if len(counts[best]) >= MIN_REPEATED:
                 measured = [_measure(path, best, store) for path in tried]
@@ -216,7 +216,7 @@ def _tags_and_boards(
         read += [read_dictionaries(photograph) for photograph in others]
     progress.advance("tags")
     repeated = {
-        family: _shared([one.get(family, none)[0] for one in read]) for family in LARGEST_DICTIONARIES
+        family: _shared_numbers([one.get(family, none)[0] for one in read]) for family in LARGEST_DICTIONARIES
     }
     family = max(repeated, key=lambda name: len(repeated[name]))
     if not len(repeated[family]):
@@ -227,13 +227,13 @@ def _tags_and_boards(
     return family, boards if charuco is None else (charuco,)
 
 
-def _shared(photographs: Sequence[IntArray]) -> IntArray:
+def _shared_numbers(photographs: Sequence[IntArray]) -> IntArray:
     """Return the numbers that at least two photographs have."""
     number, times = np.unique(np.concatenate([np.unique(one) for one in photographs]), return_counts=True)
     return np.asarray(number[times > 1])
 
 
-def _dots(
+def _dot_plate(
     plain: Sequence[Targets], others: Sequence[Path], store: MeasuredStore | None
 ) -> PlateFamily | None:
     """Return the plate of dots that photographs show; `others` are measured if one has a lattice."""
@@ -252,7 +252,7 @@ def _as_bytes(photograph: AnyArray) -> AnyArray:
     return as_bytes(photograph, scale_of(photograph))
 
 
-def _spread(count: int, tried: int) -> list[int]:
+def _spread_evenly(count: int, tried: int) -> list[int]:
     """Return `tried` indices spread evenly over `count`."""
     return sorted({round(i * (count - 1) / max(tried - 1, 1)) for i in range(tried)})
 
@@ -292,13 +292,13 @@ def _look(grey: AnyArray) -> _Look:
     return _Look(board or len(read_april_tags(whole, KALIBR_TAGS)[0]) >= MIN_CODES, circles, part)
 
 
-def _readable(
+def _read_spread(
     paths: Sequence[Path], progress: Progress
 ) -> tuple[list[Path], list[AnyArray], tuple[tuple[str, str], ...]]:
     """Return photographs spread over the folder, their pixels, and the undecodable ones with the reason."""
     tried: dict[int, AnyArray] = {}
     refused: dict[int, tuple[str, str]] = {}
-    for place in _spread(len(paths), TRIED):
+    for place in _spread_evenly(len(paths), TRIED):
         for k in sorted(range(len(paths)), key=lambda k: abs(k - place)):
             if k in tried or k in refused:
                 continue
@@ -321,7 +321,7 @@ def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:
     return measure_photograph(path, TargetSettings(), code_family(family), store)[0]
 
 
-def _repeated(photographs: Sequence[IntArray]) -> tuple[int, ...]:
+def _repeated_codes(photographs: Sequence[IntArray]) -> tuple[int, ...]:
     """Return the codes that occur exactly once in each of at least two photographs, most frequent first."""
     seen = Counter[int]()
     for read in photographs:

@@ -239,8 +239,8 @@ def split_cameras(
     for a, settings in enumerate(cameras):
         images = np.flatnonzero(network.camera == a)
         first = len(variants)
-        made, member = _variants(settings, estimate.cameras[a], [network.images[i] for i in images])
-        variants += [_started(camera, settings, given) for camera in made]
+        made, member = _photograph_cameras(settings, estimate.cameras[a], [network.images[i] for i in images])
+        variants += [_with_start_values(camera, settings, given) for camera in made]
         owner[images] = first + member
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
@@ -287,7 +287,7 @@ def _correlation(
     return R
 
 
-def _started(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
+def _with_start_values(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
     """Return the camera of a photograph or group with its given start values.
 
     A parameter that several cameras share starts from the value of the survey file's camera.
@@ -367,7 +367,9 @@ def group_of_image(settings: CameraSettings, image: str, source: str = "survey")
     return matches[0]
 
 
-def _variants(settings: CameraSettings, camera: Camera, images: list[str]) -> tuple[list[Camera], IntArray]:
+def _photograph_cameras(
+    settings: CameraSettings, camera: Camera, images: list[str]
+) -> tuple[list[Camera], IntArray]:
     """Return a camera for each photograph or group with varying parameters, and each photograph's camera."""
     observed = [name for name, _ in settings.weighted]
     camera = replace(camera, free=camera.free | np.array([name in observed for name in camera.names]))

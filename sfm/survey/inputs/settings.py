@@ -37,7 +37,7 @@ def _pairs(value: Any) -> Any:
     return tuple(value.items()) if isinstance(value, dict) else value
 
 
-def _listed(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """Turn a single text into a list."""
     return (value,) if isinstance(value, str) else value
 
@@ -76,7 +76,7 @@ Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
 Globs = Annotated[
-    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_GLOBS), BeforeValidator(_listed)
+    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_GLOBS), BeforeValidator(_as_list)
 ]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Values = Annotated[
@@ -338,7 +338,7 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
     if kind == "extra_forbidden":
         table = _key(location[:-1])
         inside = f"[{table}]" if table else "the file" if text else "it"
-        known = _known(location[:-1], whole)
+        known = _known_keys(location[:-1], whole)
         return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):
         found = _found(list(first["input"]))
@@ -386,7 +386,7 @@ def _key(location: tuple[str | int, ...]) -> str:
     return ".".join(words)
 
 
-def _known(location: tuple[str | int, ...], whole: type[Section]) -> str:
+def _known_keys(location: tuple[str | int, ...], whole: type[Section]) -> str:
     """Return the keys that the table at a location may have."""
     section = whole
     for key in (part for part in location if isinstance(part, str)):

@@ -115,7 +115,7 @@ def find_covering_points(
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
     covered = CoveredPixels([estimate.cameras[lens].size_px[::-1] for lens in camera])
     grey = GreyPhotographs(photographs.__getitem__)
-    found = [_none()]
+    found = [_no_points()]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
@@ -129,10 +129,10 @@ def find_covering_points(
             of &= visible.sum(axis=0) == rays
         if not of.any():
             return
-        measured = _followed(
+        measured = _match_squares(
             *(grey, estimate, camera, squares.select(of), free[:, of], windows, threads), both_ways=not more
         )
-        new, used = _agreeing(measured.image_points, estimate, camera, rays)
+        new, used = _points_that_meet(measured.image_points, estimate, camera, rays)
         found.append(new)
         covered.cover(new.image_points.image, new.image_points.xy, side_px * measured.scale[used])
 
@@ -145,7 +145,7 @@ def find_covering_points(
     for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
         cover(i, 2, more=False)
         give_back_memory()
-    return _joined(found)
+    return _concatenate_points(found)
 
 
 def _visible(
@@ -176,7 +176,7 @@ def _visible(
     return visible, free
 
 
-def _followed(
+def _match_squares(
     photographs: GreyPhotographs,
     estimate: Estimate,
     camera: IntArray,
@@ -249,12 +249,12 @@ def _followed(
 
     measure(first, squares.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
-        _concatenated(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
+        _concatenate_image_points(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
     ).points
     measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
     some = number > 0
     parts[0].covariance[some] = in_reference[some] / number[some, None, None]
-    seen = _concatenated(parts)
+    seen = _concatenate_image_points(parts)
     some = some[seen.point]
     return _Rays(seen.select(some), np.concatenate(scales)[some])
 
@@ -280,7 +280,7 @@ def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, w
     return good
 
 
-def _agreeing(
+def _points_that_meet(
     seen: ImagePoints, estimate: Estimate, camera: IntArray, min_rays: int
 ) -> tuple[CoveringPoints, BoolArray]:
     """Return the points with enough rays that meet, and which rays these are, (k,)."""
@@ -295,7 +295,7 @@ def _agreeing(
     return CoveringPoints(image_points, met.points[kept], residuals, matched), used
 
 
-def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
+def _concatenate_image_points(parts: Sequence[ImagePoints]) -> ImagePoints:
     """Concatenate image points."""
     return ImagePoints(
         np.concatenate([one.image for one in parts]),
@@ -305,7 +305,7 @@ def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
     )
 
 
-def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
+def _concatenate_points(found: Sequence[CoveringPoints]) -> CoveringPoints:
     """Concatenate points and renumber them consecutively."""
     first = np.cumsum([0, *(len(one.points) for one in found)])
     moved = [
@@ -313,14 +313,14 @@ def _joined(found: Sequence[CoveringPoints]) -> CoveringPoints:
         for one, start in zip(found, first.tolist(), strict=False)
     ]
     return CoveringPoints(
-        _concatenated(moved),
+        _concatenate_image_points(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
         sum(one.matched for one in found),
     )
 
 
-def _none() -> CoveringPoints:
+def _no_points() -> CoveringPoints:
     """Return an empty set of points."""
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))

@@ -87,7 +87,7 @@ def cover_photographs(
     if files is None or settings is None:
         return None
     seen = network.image_points
-    fits = _fitting(network, estimate)
+    fits = _fitting_rays(network, estimate)
     if not fits.any():
         return None
     path_of = dict(zip(files.names, files.paths, strict=True))
@@ -169,7 +169,7 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
     return replace(network, image_points=replace(seen, covariance=shown))
 
 
-def _fitting(network: Network, estimate: Estimate) -> BoolArray:
+def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     """Return which rays of the tie points fit and belong to points that keep enough rays, (k,)."""
     seen = network.image_points
     off = np.hypot(

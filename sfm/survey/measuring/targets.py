@@ -311,7 +311,7 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             if size == main:
                 continue
             what = _kind(size, main)
-            held = _held(camera) and what != RESAMPLED
+            held = _is_held(camera) and what != RESAMPLED
             if len(rows) < MIN_OWN or held:
                 reason = remark(
                     "photograph_outside_calibration" if held else "photograph_of_other_size",
@@ -379,7 +379,7 @@ def _kind(size: Size, main: Size) -> str:
     return RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
 
 
-def _held(camera: CameraSettings) -> bool:
+def _is_held(camera: CameraSettings) -> bool:
     """Return whether a camera is held at given values, which apply to its whole format only."""
     return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 

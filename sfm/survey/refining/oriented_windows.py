@@ -296,14 +296,14 @@ def measure_model_targets(
     part = Estimate(
         estimate.cameras, estimate.position[oriented], estimate.rotation[oriented], np.zeros((0, 3))
     )
-    points = _intersected(measured, part, tolerance_px)[1]
+    points = _intersect_targets(measured, part, tolerance_px)[1]
     if not np.isfinite(points).all(axis=1).any():
         raise GeometryError(
             f"no coded target ({survey.targets.codes}) in two of the {len(names)} photographs of the model"
         )
     circles = check_circles(survey, photographs, naming, measured, replace(part, points=points))
-    targets, points, contradicting = _intersected(circles.network, part, tolerance_px)
-    placement, found_of_given = _placement(survey, targets, points)
+    targets, points, contradicting = _intersect_targets(circles.network, part, tolerance_px)
+    placement, found_of_given = _object_frame(survey, targets, points)
     seen = targets.image_points
     return ModelTargets(
         replace(
@@ -342,7 +342,7 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
     ), replace(estimate, points=np.concatenate([estimate.points, targets.points]))
 
 
-def _intersected(
+def _intersect_targets(
     network: Network, estimate: Estimate, tolerance_px: float
 ) -> tuple[Network, FloatArray, int]:
     """Return the network without contradicting image points, all targets, and the number of these points."""
@@ -354,7 +354,9 @@ def _intersected(
     return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())
 
 
-def _placement(survey: Survey, targets: Network, points: FloatArray) -> tuple[Similarity, tuple[Remark, ...]]:
+def _object_frame(
+    survey: Survey, targets: Network, points: FloatArray
+) -> tuple[Similarity, tuple[Remark, ...]]:
     """Return the transformation from model to object frame, by control, else by scale bars, and remarks.
 
     Raises:

@@ -298,7 +298,7 @@ def refine_model(
     whole, further = whole_model(network, estimate, final.estimate, windows, images, points, tolerance_px)
     taken = np.zeros(len(seen), dtype=bool)
     taken[adjusted], taken[further] = ~final.rejected[: len(adjusted)], True
-    rejected = ~taken & (_off_px(network, whole, windows) > tolerance_px)
+    rejected = ~taken & (_residual_px(network, whole, windows) > tolerance_px)
     rejected[adjusted] = final.rejected[: len(adjusted)]
     left = int((np.isfinite(windows.xy).all(axis=1) & ~taken & ~rejected).sum())
     return Refinement(
@@ -321,7 +321,7 @@ def refine_model(
     )
 
 
-def _off_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
+def _residual_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
     """Return the larger residual of each new image point, px, NaN if its point has few rays, (k,)."""
     seen = network.image_points
     measured = np.isfinite(windows.xy).all(axis=1)
@@ -446,7 +446,7 @@ def adjust_finally(
 
 
 def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -> tuple[Camera, ...]:
-    """Return the cameras with the parameters to estimate free; see `_freed`.
+    """Return the cameras with the parameters to estimate free; see `_free_determined`.
 
     Raises:
         GeometryError: a name to hold is not a parameter of any camera.
@@ -459,7 +459,8 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
             )
     photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
     return tuple(
-        _freed(camera, int(count), fixed) for camera, count in zip(estimate.cameras, photographs, strict=True)
+        _free_determined(camera, int(count), fixed)
+        for camera, count in zip(estimate.cameras, photographs, strict=True)
     )
 
 
@@ -468,7 +469,7 @@ def _other_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(FIRST_RADIAL.get(name, name) for name in names)
 
 
-def _freed(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
+def _free_determined(camera: Camera, photographs: int, fixed: tuple[str, ...]) -> Camera:
     """Free the parameters that the image points of a model determine, except for those to hold.
 
     These are the principal distances, the principal point, and the distortion that the model has. COLMAP

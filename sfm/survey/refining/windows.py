@@ -105,7 +105,7 @@ def match_windows(
     rows, reference, limits = keys.rows if rows is None else rows, keys.reference, keys.limits
     window_px = size.window_px
     shrink = size.shrink
-    network, estimate = _reduced(keys.network, estimate, shrink)
+    network, estimate = _reduce_model(keys.network, estimate, shrink)
     seen, camera = network.image_points, network.camera
     xy, covariance = np.full((len(seen), 2), np.nan), np.full((len(seen), 2, 2), np.nan)
     flag = np.zeros(len(seen), dtype=np.int64)
@@ -150,7 +150,7 @@ def match_windows(
     return Windows(shrink * (xy + 0.5) - 0.5, shrink**2 * covariance, flag)
 
 
-def _reduced(network: Network, estimate: Estimate, shrink: int) -> tuple[Network, Estimate]:
+def _reduce_model(network: Network, estimate: Estimate, shrink: int) -> tuple[Network, Estimate]:
     """Return a model in the pixels of reduced photographs."""
     seen = network.image_points
     small = replace(seen, xy=(seen.xy + 0.5) / shrink - 0.5, covariance=seen.covariance / shrink**2)
@@ -187,7 +187,7 @@ def best_size(
     costs = []
     for size in sizes:
         found = match_windows(keys, estimate, size, rows=some)
-        used, v = _meeting(network, estimate, found, tolerance_px)
+        used, v = _rays_that_meet(network, estimate, found, tolerance_px)
         apart = points_apart(replace(seen, xy=found.xy), used, size.side_px, n_points=len(network.points))
         number = int((used & apart[seen.point]).sum())
         enough = len(v) >= TRIAL_RAYS
@@ -214,13 +214,13 @@ def match_reduced(
     seen, n = network.image_points, len(network.points)
     xy, covariance, flag = windows.xy.copy(), windows.covariance.copy(), windows.flag.copy()
     asked = np.bincount(seen.point[rows], minlength=n)
-    rays = np.bincount(seen.point[_meeting(network, estimate, windows, tolerance_px)[0]], minlength=n)
+    rays = np.bincount(seen.point[_rays_that_meet(network, estimate, windows, tolerance_px)[0]], minlength=n)
     for shrink in [coarser for coarser in SHRINKS if coarser > size.shrink]:
         some = rows[(rays < asked)[seen.point[rows]]]
         if not len(some):
             break
         found = match_windows(keys, estimate, size._replace(shrink=shrink), rows=some)
-        used, _ = _meeting(network, estimate, found, tolerance_px)
+        used, _ = _rays_that_meet(network, estimate, found, tolerance_px)
         now = np.bincount(seen.point[used], minlength=n)
         taken = np.flatnonzero((now > rays)[seen.point])
         xy[taken], covariance[taken], flag[taken] = (
@@ -232,7 +232,7 @@ def match_reduced(
     return Windows(xy, covariance, flag)
 
 
-def _meeting(
+def _rays_that_meet(
     network: Network, estimate: Estimate, windows: Windows, tolerance_px: float
 ) -> tuple[BoolArray, FloatArray]:
     """Return which rays meet in their points, (k,), and the residuals of these rays, tangents, (r, 2)."""
