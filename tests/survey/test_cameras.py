@@ -41,7 +41,7 @@ def test_all_that_is_missing_of_all_cameras_is_said_before_anything_is_measured(
     survey = sfm.Survey(name="s", cameras=cameras, folder=tmp_path)
     with pytest.raises(
         SurveyFileError,
-        match=r"what is needed of camera a: pixel_mm or sensor_mm and c_mm; camera b: c_mm$",
+        match=r"values that are needed: camera a: pixel_mm or sensor_mm and c_mm; camera b: c_mm$",
     ):
         sfm.run_survey(survey, compare_with="none")
 
