@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import get_args
 
+import numpy as np
 import pytest
 from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
 
-from sfm.conventions import METRES, SWELLING, UNITS, find_unit, finer_unit
+from sfm.conventions import METRES, SWELLING, UNITS, find_unit, finer_unit, rotation_from_vector
 from sfm.survey.inputs.settings import Unit
+from tests.synthetic import seed_of
 
 MM = {"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "foot": 304.8, "m": 1000.0}
 
@@ -60,3 +63,11 @@ def test_lengths_are_shown_in_a_unit_that_reads_well() -> None:
     assert finer_unit("network units", 2.12e-5) == (1e6, "× 10⁻⁶ network units")
     assert finer_unit("network units", 0.5) == (1e3, "× 10⁻³ network units")
     assert finer_unit("network units", 5.0) == (1.0, "network units")
+
+
+def test_a_rotation_by_a_vector_is_that_of_scipy() -> None:
+    rng = seed_of("vectors")
+    for length in (0.0, 1e-9, 1e-5, 1e-3, 0.3, 3.0):
+        vectors = length * rng.normal(size=(20, 3))
+        expected = Rotation.from_rotvec(vectors).as_matrix()
+        np.testing.assert_allclose(rotation_from_vector(vectors), expected, atol=4e-16, rtol=1e-12)

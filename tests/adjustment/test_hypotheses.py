@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import hypotheses
+from sfm.adjustment.hypotheses import hypotheses, score
 from sfm.adjustment.hypotheses import refit as refitting
 from sfm.adjustment.hypotheses.alternatives import explain_rejections, interiors
 from sfm.adjustment.hypotheses.columns import (
@@ -547,3 +547,23 @@ def test_a_parameter_of_all_photographs_is_tried_with_what_its_errors_in_common_
     monkeypatch.setattr(hypotheses, "reported", refitted)
     with pytest.raises(StopIteration):
         hypotheses._best(SimpleNamespace(), ())  # type: ignore[arg-type]
+
+
+def test_control_counts_by_its_variance_over_that_of_unit_weight() -> None:
+    stated = np.diag([4e-6, 0.0, np.inf])
+    points = np.array([[1.0, 2.0, 3.0], [5.0, 6.0, 7.0]])
+    control = SimpleNamespace(
+        point=np.array([1]), xyz=points[1:] - [0.01, 0.02, 0.03], covariance=stated[None]
+    )
+    a = SimpleNamespace(
+        datum="control",
+        sigma0=2.0,
+        network=SimpleNamespace(points=("a", "b"), control=control),
+        estimate=SimpleNamespace(points=points),
+    )
+    weight, slope, fixed = score._given_points(a)  # type: ignore[arg-type]
+    expected = np.zeros((2, 3, 3))
+    expected[1, 0, 0] = 1 / (4 * 4e-6)
+    np.testing.assert_allclose(weight, expected)
+    np.testing.assert_allclose(slope, [[0, 0, 0], [0.01 * expected[1, 0, 0], 0, 0]], rtol=1e-9)
+    assert fixed.tolist() == [[False] * 3, [False, True, False]]

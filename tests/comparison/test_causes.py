@@ -206,3 +206,14 @@ def test_a_pattern_is_found_whatever_the_names() -> None:
 
 def test_the_level_is_that_of_all_rows() -> None:
     assert causes.ALPHA == 0.001 and len(causes.ROWS) == 9 and causes.PERMUTATIONS == 999
+
+
+def test_every_parameter_of_a_cause_has_the_price_of_bic() -> None:
+    """Of equal points nothing is left to gain; a scale that is known already costs one parameter."""
+    a = seed_of("price").uniform(-1, 1, (20, 3))
+    Q = 1e-8 * np.eye(60)
+    pairs = PointPairs(tuple(map(str, range(20))), a, a, Q, Q, None, 1.0, None)
+    fits = [causes._fitted(pairs, row, np.ones(20, dtype=bool), 5.0) for row in (Row(), Row(scale=True))]
+    plain, scaled = (one.L for one in fits)
+    assert plain == pytest.approx(0.0, abs=1e-6)
+    assert scaled == pytest.approx(-np.log(60) / 2, abs=1e-6)

@@ -23,6 +23,7 @@ from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
+from sfm.survey import rigs
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs, planned_mounts
 from tests.rigs import make_rig
@@ -337,3 +338,13 @@ def test_a_plan_needs_one_rig_of_all_cameras(rigs: list[tuple[int, ...]]) -> Non
         planned_mounts(Survey(name="plan", cameras=cameras, rigs=given))
     on = "camera 1, camera 2" if rigs else "none;"
     assert f"on rigs {on}" in str(error.value) and "one rig of all cameras" in str(error.value)
+
+
+def test_a_mount_is_the_mean_of_the_majority() -> None:
+    """Two of seven rotations are wrong by 60 degrees, and come first."""
+    rng = seed_of("majority")
+    true = rotation_from_vector(np.array([0.2, -0.4, 0.3]))
+    R = true @ rotation_from_vector(0.01 * rng.normal(size=(7, 3)))
+    R[:2] = R[:2] @ rotation_from_vector(np.array([0.0, np.pi / 3, 0.0]))
+    away = np.arccos((np.trace(rigs._middle(R).T @ true) - 1) / 2)
+    assert away < 0.02

@@ -25,8 +25,8 @@ from sfm.network import (
     ScaleBars,
     values_of,
 )
-from sfm.observations import TABLES
-from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind
+from sfm.observations import TABLES, planes_and_lines
+from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind, inverse_of_determined
 from sfm.observations.planes_and_lines import Lines, PlumbLines
 from sfm.observations.point_pairs import HeightDifferences, HorizontalDirections, OffsetDistances
 from sfm.observations.pose import MountObservations
@@ -594,3 +594,25 @@ def test_differences_of_directions_have_no_mean() -> None:
     directions = HorizontalDirections("station", np.arange(7), value, rng.uniform(1e-4, 3e-4, (6, 1)))
     l, w = directions.fit(X).difference[:, 0], directions.weights
     assert np.abs(l).max() > 0.5 and abs((w * l).sum() / w.sum()) < 1e-12
+
+
+def test_a_plane_is_that_of_the_weights() -> None:
+    rng = seed_of("weights of a plane")
+    X = rng.normal(size=(8, 3)) * [1.0, 1.0, 0.1]
+    w = rng.uniform(0.01, 10.0, 8)
+    away = X - w @ X / w.sum()
+    values, vectors = np.linalg.eigh((away * w[:, None]).T @ away)
+    normal = planes_and_lines._normal(X, w)
+    assert abs(normal @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-12)
+    assert (w * (away @ normal) ** 2).sum() == pytest.approx(values[0])
+
+
+def test_the_inverse_is_over_what_is_determined() -> None:
+    """However different the units; parameters that nothing determines are left out."""
+    A = seed_of("determined").normal(size=(9, 4)) * [1.0, 1e4, 1e-4, 1.0]
+    N = A.T @ A
+    np.testing.assert_allclose(inverse_of_determined(N) @ N, np.eye(4), atol=1e-6)
+    N[3, :] = N[:, 3] = 0.0
+    found = inverse_of_determined(N)
+    assert not found[3].any()
+    np.testing.assert_allclose(found[:3, :3] @ N[:3, :3], np.eye(3), atol=1e-6)

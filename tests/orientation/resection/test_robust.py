@@ -121,3 +121,14 @@ def test_every_triple_of_few_points_is_tried_once(n: int, triples: int):
     uv, points, _, _ = scene(seed_of("every triple"), n, sigma=1e-4)
     uv[0] += 0.2
     assert resect_robust(uv, points, tolerance=1e-3, max_trials=3).trials == triples
+
+
+def test_trials_are_those_expected_and_three_standard_deviations():
+    """Of the share of points that fit: E(k) + 3 SD(k), Fischler and Bolles (1981)."""
+    right = 0
+    for k in range(10):
+        uv, points, _, _ = scene(seed_of(f"trials {k}"), 200, outliers=0.5)
+        found = resect_robust(uv, points, tolerance=6 * SIGMA, seed=k)
+        mean, deviation = expected_trials(float(found.inliers.mean()), 3)
+        right += found.trials == int(np.ceil(mean + 3 * deviation))
+    assert right >= 8
