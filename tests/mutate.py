@@ -102,6 +102,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/survey/test_rigs.py",
         "tests/planning/test_planned_rigs.py",
         "tests/test_new_kind.py",
+        "tests/adjustment/test_solve.py",
     ),
     **{
         f"sfm/adjustment/{module}.py": (

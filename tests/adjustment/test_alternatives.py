@@ -719,3 +719,21 @@ def test_photographs_that_differ_are_the_fewer_ones() -> None:
     one = made(Gain(20.0, 2, np.zeros(2)))
     for factor, few in (([0, 1, 0], [1]), ([1, 0, 1], [1]), ([-1, 0, 1], [2]), ([1, 0, 0, 1], [0, 3])):
         assert replace(one, factor=np.array(factor, dtype=float)).photographs.tolist() == few
+
+
+def test_more_points_are_tried_until_twice_as_many_and_four_more_gain_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Evidence falls at the second point and is largest at the third: eleven sets are tried."""
+    network, truth = make_network(seed_of("moved sets"), images=10, points=40, free=())
+    a = adjust(network, truth, datum=Datum("free"))
+    reduced = reduce_adjustment(a, columns_of(a))
+    tried: list[int] = []
+
+    def scored(*_: object, points: IntArray) -> SimpleNamespace:
+        tried.append(len(points))
+        return SimpleNamespace(evidence={1: 5.0, 2: 4.0, 3: 9.0}.get(len(points), 1.0), points=points)
+
+    monkeypatch.setattr(moved, "score_alternative", scored)
+    found = next(moved._moved_at(reduced, np.repeat([0.0, 1.0], 5), 0.0))
+    assert len(found.points) == 3 and tried == list(range(1, 12))

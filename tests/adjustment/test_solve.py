@@ -13,7 +13,7 @@ from sfm.adjustment.engine.collinearity import collinearity, new_workspace, resi
 from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import angles_from_rotation
+from sfm.conventions import angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import GENERAL_MODELS, MODELS
 from sfm.errors import GeometryError
 from sfm.network import (
@@ -334,3 +334,10 @@ def test_a_network_far_from_the_origin_is_adjusted_as_one_near_it(kind: str) -> 
         np.testing.assert_array_equal(a.estimate.points[:5], distant.control.xyz)
         np.testing.assert_allclose(a.estimate.points - far, near.estimate.points, atol=1e-7)
     np.testing.assert_allclose(a.covariance.points, near.covariance.points, rtol=1e-4, atol=1e-15)
+
+
+def test_angles_at_ninety_degrees_of_phi_have_no_separate_sigma() -> None:
+    """Derivatives of omega and kappa grow to 1e8, not to infinity."""
+    R = rotation_from_angles(0.3, np.pi / 2, 0.0)
+    J = angle_jacobian(R.T[None])[0]
+    assert np.isfinite(J).all() and np.linalg.norm(J[0]) == pytest.approx(1e8, rel=1e-6)
