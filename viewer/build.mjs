@@ -1,4 +1,4 @@
-// Builds the viewer of the reports: one classic script, since browsers load no modules from file://.
+// Builds the viewer of the reports as one classic script, because browsers do not load modules from file://.
 //   npm ci && node build.mjs            writes ../sfm/report/viewer/viewer.js
 //   node build.mjs OTHER_FILE           writes it there
 import { readFileSync } from "node:fs"
@@ -15,7 +15,7 @@ await build({
   minify: true,
   format: "iife",
   target: "es2022",
-  charset: "ascii", // the script stands in pages of any encoding
-  legalComments: "none", // the licences stand in LICENSES.txt beside the script
+  charset: "ascii", // the script is embedded in pages of any encoding
+  legalComments: "none", // the licences are in LICENSES.txt beside the script
   banner: { js: `/* Viewer of Kolinear with three.js ${three.version}; licences: LICENSES.txt of its source. */` },
 })

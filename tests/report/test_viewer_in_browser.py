@@ -253,9 +253,9 @@ def test_legends_are_beside_the_scene_and_rays_are_drawn_on_demand(tab: Tab, sce
     )
     page.evaluate(SELECT, ["point", 8])
     assert page.evaluate(drawn) == 0
-    page.get_by_label("rays of what is chosen").check()
+    page.get_by_label("rays of the selection").check()
     assert page.evaluate(drawn) == 2 * int((scene.rays.point == 8).sum())
-    page.get_by_label("rays of what is chosen").uncheck()
+    page.get_by_label("rays of the selection").uncheck()
     assert page.evaluate(drawn) == 0
     page.get_by_role("button", name="reset").click()
 
@@ -384,8 +384,8 @@ def test_rejected_candidates_tell_their_reason(tab: Tab) -> None:
 
 def test_what_was_seen_and_not_used_opens_with_what_matters(tab: Tab) -> None:
     page = tab.page
-    page.get_by_role("tab", name=re.compile("seen and not used")).click()
-    rows = page.get_by_role("table", name="seen and not used").locator("tbody tr[data-row]")
+    page.get_by_role("tab", name=re.compile("detected but not used")).click()
+    rows = page.get_by_role("table", name="detected but not used").locator("tbody tr[data-row]")
     assert [REASONS[k] in rows.nth(k).inner_text() for k in range(2)] == [True, True]
     page.get_by_role("tab", name=re.compile("^points")).click()
 
@@ -462,7 +462,7 @@ def test_large_scenes_turn_with_fewer_points_and_say_so(browser: Any, tmp_path: 
         " window.drawn = scene.points.geometry.drawRange.count }"
     )
     n = len(many.points)
-    told = re.fullmatch(r"one point in (\d+) while the scene turns", page.evaluate("window.told"))
+    told = re.fullmatch(r"1 in (\d+) points shown while the scene moves", page.evaluate("window.told"))
     assert told is not None and int(told[1]) >= 2
     assert page.evaluate("window.drawn") == -(-n // int(told[1]))
     tab.until("n => document.getElementById('explore').viewer.scene.points.geometry.drawRange.count === n", n)

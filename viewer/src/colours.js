@@ -2,27 +2,27 @@
 
 import { roundStep, significant } from "./numbers.js"
 
-// Viridis (Smith and van der Walt 2015): light and dark in order of the value, also in grey; without its darkest
-// tenth, which nobody sees on a dark page.
+// Viridis (Smith and van der Walt 2015): lightness follows the value, so it reads in grey too. Its darkest tenth is
+// omitted, because it is invisible on a dark page.
 const STEPS = [
   [72, 40, 120], [66, 64, 134], [54, 92, 141], [42, 118, 142], [33, 145, 140],
   [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37],
 ]
-// Blue, grey, red for deviations: neither sign is the better one (after Moreland 2009).
+// Blue, grey, red for deviations, where neither sign is better (after Moreland 2009).
 const SIGNED = [
   [33, 82, 196], [92, 134, 222], [150, 172, 214], [190, 190, 190], [226, 160, 130], [221, 100, 76], [178, 24, 43],
 ]
-// The darker steps of viridis are under the contrast of 3 : 1 with a dark page (WCAG 2.2, criterion 1.4.11).
+// The darker steps of viridis have less than 3 : 1 contrast with a dark page (WCAG 2.2, criterion 1.4.11).
 const DARK_STEPS = STEPS.slice(3)
 const UNKNOWN = [128, 134, 142]
 
-/** A scale of colours from one value to another, in equal parts or in equal ratios. */
+/** A colour scale from one value to another, linear or logarithmic. */
 export class Scale {
   constructor(name, unit, from, to, { log = false, factor = 1, reversed = false, signed = false } = {}) {
     Object.assign(this, { name, unit, from, to, log, factor, reversed, signed, dark: false })
   }
 
-  /** Place of a value on the scale, 0 to 1. */
+  /** Position of a value on the scale, 0 to 1. */
   place(value) {
     const of = this.log ? (x) => Math.log(Math.max(x, 1e-300)) : (x) => x
     return Math.min(1, Math.max(0, (of(value) - of(this.from)) / (of(this.to) - of(this.from))))
@@ -33,7 +33,7 @@ export class Scale {
     return Number.isFinite(value) ? this.shade(this.place(value)) : UNKNOWN
   }
 
-  /** Red, green, blue of a place on the scale. */
+  /** Red, green, blue of a position on the scale. */
   shade(place) {
     const steps = this.signed ? SIGNED : this.dark ? DARK_STEPS : STEPS
     const at = (this.reversed ? 1 - place : place) * (steps.length - 1)
@@ -95,35 +95,35 @@ export function pointScales(model) {
   return { scales, values }
 }
 
-/** The largest size of values; 1 where all are 0, so that a scale has an extent. */
+/** The largest absolute value; 1 if all are 0, so that a scale has an extent. */
 function largest(values) {
   return values.reduce((most, d) => (Math.abs(d) > most ? Math.abs(d) : most), 0) || 1
 }
 
-/** The scale of the photographs; null where they have no residuals. */
+/** The scale of the photographs; null if they have no residuals. */
 export function photoScale(model) {
   return model.hasResiduals ? ratioScale("RMS residual of a photograph", "px", model.a["photo.rms"]) : null
 }
 
-/** A scale of equal ratios from the smallest value above 0 to the largest. */
+/** A logarithmic scale from the smallest value above 0 to the largest. */
 function ratioScale(name, unit, values, { factor = 1 } = {}) {
   const [from, to] = ends(values.filter((x) => x > 0 && Number.isFinite(x)), [0.1, 1])
   return new Scale(name, unit, from, to > from ? to : 2 * from, { log: true, factor })
 }
 
-/** A scale of equal parts from the smallest value to the largest. */
+/** A linear scale from the smallest value to the largest. */
 function equalScale(name, unit, values, options) {
   const [from, to] = ends(values.filter(Number.isFinite), [0, 1])
   return new Scale(name, unit, from, to > from ? to : from + 1, options)
 }
 
-/** The smallest and the largest of values; others without any. */
+/** The smallest and the largest of values; the others if there are none. */
 function ends(values, others) {
   if (!values.length) return others
   return values.reduce(([low, high], x) => [Math.min(low, x), Math.max(high, x)], [Infinity, -Infinity])
 }
 
-/** Draw a scale with its labels; its ends can be typed. */
+/** Draw a scale with its labels and with fields for its limits. */
 export function drawLegend(scale, element, make, onchange) {
   const bar = make("canvas", { width: 240, height: 1, className: "v-bar" })
   const context = bar.getContext("2d")
@@ -143,7 +143,7 @@ export function drawLegend(scale, element, make, onchange) {
     const input = make("input", {
       className: "v-end",
       value: scale.words(scale[key]),
-      "aria-label": `${words} of the scale of ${scale.name}`,
+      "aria-label": `${words} of the scale: ${scale.name}`,
     })
     input.addEventListener("change", () => {
       const typed = Number(input.value) / scale.factor
@@ -157,6 +157,6 @@ export function drawLegend(scale, element, make, onchange) {
   const unit = scale.unit ? ` [${scale.unit}]` : ""
   element.replaceChildren(
     make("div", { className: "v-legend-name" }, scale.name + unit),
-    make("div", { className: "v-legend-row" }, end("from", "lower end"), make("div", { className: "v-scale" }, bar, ticks), end("to", "upper end")),
+    make("div", { className: "v-legend-row" }, end("from", "lower limit"), make("div", { className: "v-scale" }, bar, ticks), end("to", "upper limit")),
   )
 }

@@ -1,4 +1,4 @@
-// The tables below the scene: points, photographs, image points, what was rejected, scale bars.
+// The tables below the scene: points, photographs, image points, rejected and unused ones, scale bars.
 
 import { range } from "./data.js"
 import { make } from "./page.js"
@@ -67,7 +67,7 @@ export function tablesOf(model, hub, element) {
   add("image points", fresh(), every(model.rayCount), pointOf, "ray")
   add("rejected image points", fresh(), every(model.rayCount).filter((k) => model.rejected(k)), pointOf, "ray")
   add(
-    "seen and not used",
+    "detected but not used",
     [
       text("photograph", "photograph", (k) => model.photographs[a["mark.photo"][k]]),
       text("reason", "reason", (k) => model.reasons[a["mark.reason"][k]]),
@@ -83,7 +83,7 @@ export function tablesOf(model, hub, element) {
       text("name", "scale bar", (b) => `${model.points[model.bars[b].from]} - ${model.points[model.bars[b].to]}`),
       number("length", "length", (b) => model.bars[b].length ?? NaN, (v) => significant(v, 9), unit),
       number("difference", "adjusted minus given", (b) => (model.bars[b].difference ?? NaN) * fine.factor, short, fine.unit),
-      number("sigma", "sigma given", (b) => (model.bars[b].sigma ?? NaN) * fine.factor, short, fine.unit),
+      number("sigma", "given sigma", (b) => (model.bars[b].sigma ?? NaN) * fine.factor, short, fine.unit),
     ],
     every(model.bars.length),
     (b) => ({ kind: "point", index: model.bars[b].from }),
@@ -96,7 +96,7 @@ export function tablesOf(model, hub, element) {
   })
 }
 
-/** One table at a time, chosen by tabs (WAI-ARIA Authoring Practices, tabs). */
+/** Tabs that show one table at a time (WAI-ARIA Authoring Practices, tabs). */
 function tabs(made, element) {
   const list = make("div", { role: "tablist", className: "v-tabs", "aria-label": "tables" })
   const show = (chosen, focus) => {

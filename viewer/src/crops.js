@@ -9,12 +9,12 @@ export const GREEN = "#2fd06f"
 export const RED = "#ff4d42"
 export const YELLOW = "#ffc81a"
 
-/** By what residual vectors are enlarged, so that one of the size of the RMS has this length in px. */
+/** Exaggeration of residual vectors: one as long as the RMS is drawn with this length in px. */
 export function arrowFactor(model, length) {
   return model.rms_px > 0 ? roundStep(length / model.rms_px) : 1
 }
 
-/** A crop with its caption, or what is known of the ray where there is no picture of it. */
+/** A crop with its caption, or the caption alone if there is no picture. */
 export function cropCard(model, k, hub, factor) {
   const i = model.a["ray.photo"][k]
   const j = model.a["ray.point"][k]
@@ -76,7 +76,7 @@ function drawn(model, k, crop, factor) {
   return canvas
 }
 
-/** Draw ellipse, measured centre and residual vector of a ray; `at` turns pixels into places. */
+/** Draw ellipse, measured centre and residual vector of a ray; `at` converts pixels to canvas positions. */
 export function drawTarget(context, model, k, at, scale, factor, { width = 2 } = {}) {
   const xy = model.pair("ray.xy", k)
   const [a, b, angle] = model.a["ray.ellipse"].subarray(3 * k, 3 * k + 3)
@@ -101,7 +101,7 @@ export function drawTarget(context, model, k, at, scale, factor, { width = 2 } =
   context.stroke()
 }
 
-/** By what the residual vectors in the crops of some rays are enlarged; 0 where there are no crops. */
+/** Exaggeration of the residual vectors in the crops of rays; 0 if there are no crops. */
 export function cropFactor(model, rays) {
   const sides = rays.filter((k) => model.cropOfRay.has(k)).map((k) => model.a["crop.frame"][4 * model.cropOfRay.get(k) + 2])
   if (!sides.length) return 0
@@ -110,5 +110,5 @@ export function cropFactor(model, rays) {
 
 export function cropLegend(factor) {
   if (!factor) return ""
-  return `Green: measured centre and fitted ellipse (red: rejected). Yellow: residual vector v, computed minus measured, ${significant(factor, 1)} times enlarged. A crop is as wide as 2.2 diameters of its target.`
+  return `Green: measured centre and fitted ellipse (red: rejected). Yellow: residual vector v (computed minus measured), exaggerated ${significant(factor, 1)} times. Each crop is 2.2 target diameters wide.`
 }

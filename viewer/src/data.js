@@ -1,9 +1,9 @@
-// What a page holds: names and other texts as JSON, numbers as arrays, pictures as base64.
+// The data of a page: names and other texts as JSON, numbers as arrays, pictures as base64.
 // The writer is sfm/report/viewer/embedded.py.
 
 const TYPES = { f8: Float64Array, f4: Float32Array, u4: Uint32Array, u1: Uint8Array }
 
-/** Return the content of an inert script element unpacked, or null where there is none. */
+/** Return the unpacked content of an inert script element, or null if there is none. */
 export async function unpack(id) {
   const text = document.getElementById(id)?.textContent.trim()
   if (!text) return null
@@ -21,7 +21,7 @@ export async function unpack(id) {
   return new Model(header, arrays)
 }
 
-/** The result that a page shows. Points, photographs and rays are counted by index. */
+/** The result that a page shows. Points, photographs and rays are addressed by index. */
 class Model {
   constructor(header, arrays) {
     Object.assign(this, header)
@@ -47,7 +47,7 @@ class Model {
     return this.a["point.xyz"].subarray(3 * j, 3 * j + 3)
   }
 
-  /** Covariance of a point: xx, xy, xz, yy, yz, zz; NaN where it is not known. */
+  /** Covariance of a point: xx, xy, xz, yy, yz, zz; NaN if unknown. */
   covariance(j) {
     return this.a["point.covariance"].subarray(6 * j, 6 * j + 6)
   }
@@ -85,7 +85,7 @@ class Model {
     return Math.max(Math.abs(x), Math.abs(y))
   }
 
-  /** Length of the displacement of a point; NaN where not known. */
+  /** Length of the displacement of a point; NaN if unknown. */
   displacement(j) {
     return Math.hypot(...this.a["point.displacement"].subarray(3 * j, 3 * j + 3))
   }
@@ -111,7 +111,7 @@ class Model {
     return this.a["photo.rotation"].subarray(9 * i, 9 * i + 9)
   }
 
-  /** Standard deviation of the distance of two points from their joint covariance; NaN where not known. */
+  /** Standard deviation of the distance between two points, from their joint covariance; NaN if unknown. */
   distanceSigma(i, j) {
     const pairs = this.a["pair.sigma"]
     if (!pairs) return NaN
@@ -119,7 +119,7 @@ class Model {
     return pairs[a * this.pointCount - (a * (a + 1)) / 2 + b - a - 1]
   }
 
-  /** The same from the covariances of the two points alone. */
+  /** The same from the separate covariances of the two points. */
   distanceSigmaAlone(i, j) {
     const a = this.xyz(i)
     const b = this.xyz(j)
@@ -133,7 +133,7 @@ class Model {
     return Math.sqrt(sum) / length
   }
 
-  /** Address of an embedded picture, or "" where it lies beside the page. */
+  /** Address of an embedded picture, or "" if it is beside the page. */
   picture(kind, k) {
     const length = this.a[`${kind}.length`]?.[k]
     if (!length) return ""
@@ -142,7 +142,7 @@ class Model {
     return `data:image/jpeg;base64,${this.base64.slice(4 * start, 4 * (start + length))}`
   }
 
-  /** Address of the picture that a crop is in: embedded by itself, or with others in a file beside the page. */
+  /** Address of the picture of a crop: embedded alone, or with others in a file beside the page. */
   cropAddress(crop) {
     return this.picture("crop", crop) || this.crop_files[this.a["ray.photo"][this.a["crop.ray"][crop]]]
   }
@@ -163,7 +163,7 @@ function starts(index, count) {
   return first
 }
 
-/** The numbers from a first one to before an end. */
+/** The integers from start up to, but not including, end. */
 export function range(start, end) {
   const found = new Uint32Array(end - start)
   for (let k = 0; k < found.length; k++) found[k] = start + k

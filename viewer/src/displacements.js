@@ -1,10 +1,10 @@
-// Displacements of the points as enlarged lines that end in a short cross-stroke; those that moved in red.
+// Displacements of the points as exaggerated arrows; points that moved are red.
 
 import * as THREE from "three"
 import { lines } from "./rays.js"
 import { roundStep } from "./numbers.js"
 
-const LONGEST = 0.2 // of the object's radius: the longest line that is drawn
+const LONGEST = 0.2 // of the object's radius: length of the longest arrow
 
 export class Displacements {
   constructor(model, origin, size) {

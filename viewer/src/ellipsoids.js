@@ -1,8 +1,8 @@
-// Error ellipsoids of one standard deviation, enlarged; one sphere, drawn once for every point.
+// Error ellipsoids of one standard deviation, exaggerated: one sphere, drawn once for each point.
 
 import * as THREE from "three"
 
-export const MAX_ELLIPSOIDS = 3000 // more are slow without a graphics card; the largest are drawn
+export const MAX_ELLIPSOIDS = 3000 // more are slow without a graphics card, so only the largest are drawn
 
 export class Ellipsoids {
   constructor(model, origin) {
@@ -20,7 +20,7 @@ export class Ellipsoids {
     this.scale(1)
   }
 
-  /** Draw them so many times as large as they are. */
+  /** Set the exaggeration. */
   scale(factor) {
     this.factor = factor
     const matrix = new THREE.Matrix4()

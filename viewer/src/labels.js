@@ -1,4 +1,4 @@
-// Names, the scale and the axes, drawn over the scene; names that would cover others are left out.
+// Names, the scale and the axes, drawn over the scene; names that would overlap others are omitted.
 
 import * as THREE from "three"
 import { roundStep, significant } from "./numbers.js"
@@ -52,7 +52,7 @@ function overlap(a, b) {
   return a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3]
 }
 
-/** Points in the order in which they get room for their names: control, the ends of scale bars, the others. */
+/** Points in the order in which their names are placed: control, ends of scale bars, others. */
 function byPriority(model) {
   const first = [...model.control, ...model.bars.flatMap((bar) => [bar.from, bar.to])]
   return new Set([...first, ...Array(model.pointCount).keys()])

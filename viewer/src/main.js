@@ -1,4 +1,4 @@
-// The viewer of a report: puts scene, panel and tables into the page, and lets each know what is chosen.
+// The viewer of a report: puts scene, panel and tables into the page and passes the selection between them.
 
 import * as THREE from "three"
 import { drawLegend, photoScale, pointScales } from "./colours.js"
@@ -10,7 +10,7 @@ import { counted, roundStep, sigmaWords, significant } from "./numbers.js"
 import { Scene } from "./scene.js"
 import { tablesOf } from "./columns.js"
 
-THREE.ColorManagement.enabled = false // colours are those of the legend, to the digit
+THREE.ColorManagement.enabled = false // colours equal those of the legend exactly
 
 async function start() {
   const begun = performance.now()
@@ -22,14 +22,14 @@ async function start() {
   const hub = new Hub()
   const canvas = make("canvas", { className: "v-scene", tabIndex: 0 })
   canvas.setAttribute("role", "application")
-  canvas.setAttribute("aria-label", "Scene in space: arrow keys turn, + and - zoom, Home goes back")
+  canvas.setAttribute("aria-label", "3D scene: arrow keys rotate, + and - zoom, Home resets the view")
   const overlay = make("canvas", { className: "v-overlay", "aria-hidden": "true" })
   const hover = make("div", { className: "v-hover", hidden: true })
   const legends = make("div", { className: "v-legends" })
   const stage = make("div", { className: "v-stage" }, canvas, overlay, hover)
   const view = make("div", { className: "v-view" }, legends, stage)
   const tools = make("div", { className: "v-tools v-top" })
-  const panel = make("div", { className: "v-panel", tabIndex: 0, role: "region", "aria-label": "what is chosen" })
+  const panel = make("div", { className: "v-panel", tabIndex: 0, role: "region", "aria-label": "selection" })
   const tables = make("div", { className: "v-tables" })
   root.querySelector(".v-app").replaceChildren(tools, make("div", { className: "v-main" }, view, panel), tables)
 
@@ -37,7 +37,7 @@ async function start() {
   try {
     scene = new Scene(model, canvas, overlay, hub)
   } catch (error) {
-    stage.replaceChildren(make("p", { className: "v-nogl" }, `This browser shows no WebGL, so there is no scene: ${error.message}`))
+    stage.replaceChildren(make("p", { className: "v-nogl" }, `The 3D scene needs WebGL, which this browser does not provide: ${error.message}`))
   }
   if (scene) {
     scene.renderer.outputColorSpace = THREE.LinearSRGBColorSpace
@@ -46,7 +46,7 @@ async function start() {
     stage.append(thin)
     hub.on("thin", (part) => {
       thin.hidden = part === 1
-      if (part > 1) thin.textContent = `one point in ${part} while the scene turns`
+      if (part > 1) thin.textContent = `1 in ${part} points shown while the scene moves`
     })
     hub.on("hover", (told) => showHover(model, stage, hover, told))
     hub.on("select", (found) => scene.select(found))
@@ -57,7 +57,7 @@ async function start() {
     if (event.key === "Escape" && root.contains(event.target)) hub.tell("select", null)
   })
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => scene?.paint())
-  let printed = null // a copy, since the canvas of the scene is empty by the time its page is laid out on paper
+  let printed = null // a copy, because the canvas of the scene is already empty when the page is laid out for print
   const print = (on) => {
     if (!scene) return
     scene.printing = on
@@ -71,7 +71,7 @@ async function start() {
   window.addEventListener("afterprint", () => print(false))
   matchMedia("print").addEventListener("change", () => scene?.paint())
   requestAnimationFrame(() => requestAnimationFrame(() => (root.dataset.ready = (performance.now() - begun).toFixed(0))))
-  root.viewer = { model, scene, hub } // for who writes a test
+  root.viewer = { model, scene, hub } // for tests
 }
 
 function toolbar(model, scene, hub, tools, legends) {
@@ -100,7 +100,7 @@ function toolbar(model, scene, hub, tools, legends) {
   find.addEventListener("change", () => findName(model, scene, hub, find))
   const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
-  const views = [["", "view ..."], ["home", "object alone"], ["all", "with all photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
+  const views = [["", "view\u2026"], ["home", "object only"], ["all", "object and photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {
     if (name) scene.standard(name)
     standard.firstElementChild.value = ""
@@ -108,17 +108,17 @@ function toolbar(model, scene, hub, tools, legends) {
   tools.append(
     find,
     names,
-    choice("points by", options, (value) => (by = value) && paint(), { value: by, id: "points-by" }),
+    choice("colour points by", options, (value) => (by = value) && paint(), { value: by, id: "points-by" }),
     ...(photos
       ? [
-          choice("photographs by", [["rms", "RMS"], ["", "one colour"]], (value) => {
+          choice("colour photographs by", [["rms", "RMS"], ["", "none"]], (value) => {
             byPhoto = value
             paint()
           }),
         ]
       : []),
     standard,
-    button("reset", () => scene.begin(), { title: "as at the start" }),
+    button("reset", () => scene.begin(), { title: "back to the first view" }),
     tick("orthographic", false, (on) => scene.setOrthographic(on)),
     tick("names", false, (on) => {
       scene.names = on
@@ -128,7 +128,7 @@ function toolbar(model, scene, hub, tools, legends) {
       scene.photographs.object.visible = on
       scene.invalidate()
     }),
-    tick("rays of what is chosen", false, (on) => {
+    tick("rays of the selection", false, (on) => {
       scene.rays.on = on
       scene.rays.show(scene.selected ?? null)
       scene.invalidate()
@@ -139,12 +139,12 @@ function toolbar(model, scene, hub, tools, legends) {
     }),
     ...displacementTools(scene),
     ...ellipsoidTools(model, scene),
-    button("save picture", () => savePicture(scene, model.name)),
+    button("save image", () => savePicture(scene, model.name)),
   )
   paint()
 }
 
-/** The box of the displacements, and by what they are enlarged. */
+/** The check box of the displacements, and their exaggeration. */
 function displacementTools(scene) {
   const { displacements } = scene
   if (!displacements.known) return []
@@ -152,22 +152,22 @@ function displacementTools(scene) {
     displacements.object.visible = on
     scene.invalidate()
   })
-  return [box, make("span", { className: "v-count" }, `${significant(displacements.factor, 1)} times enlarged, moved points in red`)]
+  return [box, make("span", { className: "v-count" }, `exaggerated ${significant(displacements.factor, 1)} times, moved points in red`)]
 }
 
-/** The box and the slider of the ellipsoids, and by what they are enlarged. */
+/** The check box of the ellipsoids, and the slider of their exaggeration. */
 function ellipsoidTools(model, scene) {
   const { ellipsoids } = scene
   if (!ellipsoids.known) return []
   const start = Math.log10((0.08 * scene.objectRadius) / ellipsoids.typical)
   const slider = make("input", { type: "range", min: 0, max: Math.max(1, start + 1.5), step: 0.01, value: start, disabled: true })
-  slider.setAttribute("aria-label", "by what the ellipsoids are enlarged")
+  slider.setAttribute("aria-label", "exaggeration of the ellipsoids")
   const told = make("span", { className: "v-count" })
   const change = () => {
     const factor = roundStep(10 ** Number(slider.value))
     ellipsoids.scale(factor)
-    const some = ellipsoids.known > ellipsoids.shown.length ? `, the ${MAX_ELLIPSOIDS} largest of ${ellipsoids.known}` : ""
-    told.textContent = ellipsoids.object.visible ? `1 sigma, ${significant(factor, 1)} times enlarged${some}` : ""
+    const some = ellipsoids.known > ellipsoids.shown.length ? `, only the ${MAX_ELLIPSOIDS} largest of ${ellipsoids.known}` : ""
+    told.textContent = ellipsoids.object.visible ? `1 sigma, exaggerated ${significant(factor, 1)} times${some}` : ""
     scene.invalidate()
   }
   slider.addEventListener("input", change)
@@ -184,7 +184,7 @@ function savePicture(scene, name) {
   make("a", { href: picture, download: `${name.replace(/[^\w.-]+/g, "_")}.png` }).click()
 }
 
-/** A copy of scene and names; what is drawn is kept only until the browser shows it. */
+/** A copy of scene and names: the browser keeps a drawn frame only until it is displayed. */
 function pictureOf(scene) {
   scene.draw()
   const whole = make("canvas", { className: "v-printed", width: scene.canvas.width, height: scene.canvas.height })

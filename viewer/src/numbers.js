@@ -18,7 +18,7 @@ export function toPrecision(value, sigma) {
   return value.toFixed(decimals)
 }
 
-/** A standard deviation: a fixed coordinate has none, nor has one of an adjustment without covariance. */
+/** A standard deviation in words: fixed coordinates and adjustments without covariance have none. */
 export function sigmaWords(sigma, unit = "") {
   if (sigma === 0) return "fixed"
   return Number.isFinite(sigma) ? `sigma ${significant(sigma)} ${unit}`.trimEnd() : `sigma ${UNKNOWN}`
@@ -38,11 +38,11 @@ export function signed(value, decimals) {
   return (value >= 0 ? "+" : "") + value.toFixed(decimals)
 }
 
-/** The largest of 1, 2, 5 times a power of ten that is not above a value. */
+/** The largest 1, 2 or 5 times a power of ten that does not exceed a value. */
 export function roundStep(value) {
   const power = 10 ** Math.floor(Math.log10(value))
   return [5, 2, 1].find((step) => step * power <= value * (1 + 1e-9)) * power
 }
 
-/** Compare names with numbers in them as people do. */
+/** Compare names in natural order, with numbers by value. */
 export const byName = new Intl.Collator("en", { numeric: true }).compare

@@ -16,7 +16,7 @@ export function button(text, onclick, properties = {}) {
   return make("button", { type: "button", onclick, ...properties }, text)
 }
 
-/** A labelled box to tick. */
+/** A labelled check box. */
 export function tick(text, checked, onchange, properties = {}) {
   const box = make("input", { type: "checkbox", checked, ...properties })
   box.addEventListener("change", () => onchange(box.checked))
@@ -26,7 +26,7 @@ export function tick(text, checked, onchange, properties = {}) {
 export function choice(text, options, onchange, properties = {}) {
   const select = make("select")
   for (const [value, words] of options) select.append(make("option", { value }, words))
-  const { value = select.value, ...others } = properties // which is none before there are options
+  const { value = select.value, ...others } = properties // a select has no value before its options
   select.value = value
   for (const [name, one] of Object.entries(others)) select.setAttribute(name, one)
   select.addEventListener("change", () => onchange(select.value))
@@ -41,7 +41,7 @@ export function facts(rows) {
   return make("table", { className: "facts" }, make("tbody", {}, ...body))
 }
 
-/** Who is told of what: select and hover. */
+/** Passes the events select and hover to their listeners. */
 export class Hub {
   #listeners = new Map()
 
@@ -54,7 +54,7 @@ export class Hub {
   }
 }
 
-/** Put a text into the clipboard; browsers without one in pages from a file have the older way. */
+/** Copy a text to the clipboard, the older way where a page from a file has no access to it. */
 export async function copyText(text) {
   try {
     await navigator.clipboard.writeText(text)

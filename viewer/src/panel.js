@@ -1,4 +1,4 @@
-// What is chosen, in words and pictures: a point with its crops, a photograph with its targets.
+// The selection in words and pictures: a point with its crops, or a photograph with its targets.
 
 import { cropCard, cropFactor, cropLegend } from "./crops.js"
 import { button, facts, make } from "./page.js"
@@ -25,12 +25,12 @@ export class Panel {
 
   empty() {
     this.element.replaceChildren(
-      make("h3", { className: "v-hint" }, "Nothing chosen"),
-      make("p", { className: "v-hint" }, "Click a point or a photograph in the scene, or a row of the tables below."),
+      make("h3", { className: "v-hint" }, "Nothing selected"),
+      make("p", { className: "v-hint" }, "Click a point or a photograph in the scene, or a row in the tables below."),
       make(
         "p",
         { className: "note v-hint" },
-        "Drag: turn. Wheel or + and -: nearer and farther. Right button, or two fingers: move. Arrow keys turn, Home goes back, Escape chooses nothing.",
+        "Drag or arrow keys: rotate. Wheel, + or -: zoom. Right button or two fingers: pan. Home: reset the view. Escape: clear the selection.",
       ),
       ...this.model.notes.page.map((words) => make("p", { className: "note" }, words)),
     )
@@ -53,7 +53,7 @@ export class Panel {
       rays.slice(from, from + MAX_CROPS).forEach((k) => cards.append(cropCard(model, k, this.hub, factor)))
       const left = rays.length - from - MAX_CROPS
       if (left > 0) {
-        const more = button(`${left} more`, () => {
+        const more = button(`show ${left} more`, () => {
           more.remove()
           add(from + MAX_CROPS)
         })
@@ -70,16 +70,16 @@ export class Panel {
         model.hasResiduals ? ["RMS residual", `${fixed(model.a["point.rms"][j], 4)} px`] : null,
         Number.isFinite(model.a["point.deviation"]?.[j]) ? ["deviation", `${fixed(model.a["point.deviation"][j] * model.fine.factor, 4)} ${model.fine.unit}`] : null,
         model.a["point.displacement"] && Number.isFinite(model.displacement(j)) ? ["displacement", this.displacementWords(j)] : null,
-        model.control.includes(j) ? ["given as", "control point"] : null,
+        model.control.includes(j) ? ["role", "control point"] : null,
       ]),
       this.distance(j),
-      make("h4", {}, "In the photographs, largest |w| first"),
+      make("h4", {}, "Image points, largest |w| first"),
       make("p", { className: "note" }, cropLegend(factor)),
       cards,
     )
   }
 
-  /** Length and parts of the displacement of a point, and what the test says of it. */
+  /** Length and components of the displacement of a point, and the result of its test. */
   displacementWords(j) {
     const { model } = this
     const { factor, unit } = model.fine
@@ -88,7 +88,7 @@ export class Panel {
     return `${fixed(model.displacement(j) * factor, 2)} ${unit} (${parts.join(", ")})${state ? `, ${state}` : ""}`
   }
 
-  /** The distance to another point, from here or to here. */
+  /** The distance between this point and another, and the button that starts a measurement. */
   distance(j) {
     const model = this.model
     const box = make("div", { className: "v-distance" })
@@ -100,7 +100,7 @@ export class Panel {
     } else if (from < 0) this.scene.measure(-1, -1)
     const begin = button("Measure a distance from here", () => {
       this.from = j
-      begin.replaceWith(make("p", { className: "v-prompt" }, `Now choose the other point (from ${model.points[j]}).`))
+      begin.replaceWith(make("p", { className: "v-prompt" }, `Now select the other point (from ${model.points[j]}).`))
     })
     box.append(begin)
     return box
@@ -116,10 +116,10 @@ export class Panel {
     const sigma = Number.isFinite(joint) ? joint : alone
     const fine = (v) => `${significant(v * model.fine.factor)} ${model.fine.unit}`
     const words = Number.isFinite(joint)
-      ? `sigma ${fine(joint)}, from the covariance of all points together.`
+      ? `sigma ${fine(joint)}, from the joint covariance of all points.`
       : Number.isFinite(alone)
-        ? `sigma ${fine(alone)}, from the covariances of the two points alone: ${model.notes.covariance}`
-        : "Its standard deviation is not known: the result has no covariances."
+        ? `sigma ${fine(alone)}, from the separate covariances of the two points: ${model.notes.covariance}`
+        : "No standard deviation: the result has no covariances."
     const step = [0, 1, 2].map((c) => `d${"XYZ"[c]} ${toPrecision(b[c] - a[c], sigma)}`).join(", ")
     return [
       make("h4", {}, `${model.points[i]} \u2013 ${model.points[j]}`),

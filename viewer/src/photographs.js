@@ -1,4 +1,4 @@
-// The photographs as pyramids: apex in the projection centre, base as the format is, looking where it looked.
+// The photographs as pyramids: apex at the projection centre, base in the shape of the format, along the viewing direction.
 
 import * as THREE from "three"
 

@@ -1,4 +1,4 @@
-// A photograph with targets, residual vectors and rejected candidates; enlarged and moved by wheel and pointer.
+// A photograph with targets, residual vectors and rejected candidates; wheel and pointer zoom and pan it.
 
 import { arrowFactor, drawTarget, GREEN, RED } from "./crops.js"
 import { button, make, tick } from "./page.js"
@@ -7,9 +7,9 @@ import { significant, signed } from "./numbers.js"
 const ARROW_PX = 16 // length on the page of a residual of the size of the RMS
 const MARK = "#5ab4ff"
 const MAX_ZOOM = 40
-const NEAR_PX = 12 // of the pointer: what is told and chosen
-const MANY = 150 // candidates of one reason; more are hidden until they are asked for
-const CELL_PX = 14 // names in one cell would cover one another
+const NEAR_PX = 12 // distance from the pointer within which an image point is described and selected
+const MANY = 150 // candidates of one reason; more than this are hidden at first
+const CELL_PX = 14 // names in the same cell would overlap
 
 export class PhotographView {
   constructor(model, i, hub) {
@@ -23,7 +23,7 @@ export class PhotographView {
     const camera = model.camera(i)
     this.size = [camera.width, camera.height]
     this.canvas = make("canvas", { className: "v-photo", tabIndex: 0 })
-    this.canvas.setAttribute("aria-label", `Photograph ${model.photographs[i]}; + and - enlarge, arrow keys move`)
+    this.canvas.setAttribute("aria-label", `Photograph ${model.photographs[i]}; + and - zoom, arrow keys pan`)
     this.told = make("p", { className: "v-told", "aria-live": "polite" })
     const again = () => this.draw()
     this.element = make(
@@ -32,12 +32,12 @@ export class PhotographView {
       make(
         "div",
         { className: "v-tools" },
-        button("+", () => this.enlarge(1.5), { title: "enlarge" }),
-        button("\u2212", () => this.enlarge(1 / 1.5), { title: "make smaller" }),
-        button("all", () => this.fit(), { title: "the whole photograph" }),
+        button("+", () => this.enlarge(1.5), { title: "zoom in" }),
+        button("\u2212", () => this.enlarge(1 / 1.5), { title: "zoom out" }),
+        button("fit", () => this.fit(), { title: "show the whole photograph" }),
         tick("names", this.names, (on) => (this.names = on) | again()),
         tick("residuals", this.vectors, (on) => (this.vectors = on) | again()),
-        button("wide", () => this.widen(), { title: "more room for the photograph, less for the scene" }),
+        button("wide", () => this.widen(), { title: "more space for the photograph, less for the scene" }),
       ),
       this.canvas,
       this.told,
@@ -49,7 +49,7 @@ export class PhotographView {
     this.observer.observe(this.element)
   }
 
-  /** The embedded picture at once; a larger one, if it lies beside the page, when it is there. */
+  /** Show the embedded picture at once, then a larger one beside the page as soon as it is loaded. */
   load() {
     const embedded = this.model.picture("view", this.i)
     const beside = this.model.files[this.i]
@@ -92,7 +92,7 @@ export class PhotographView {
     return this.fitScale * this.zoom
   }
 
-  /** Place on the canvas of a position in the pixel frame, whose origin is the centre of a pixel. */
+  /** Canvas position of a position in the pixel frame, whose origin is the centre of a pixel. */
   at([x, y]) {
     return [(x + 0.5) * this.scale + this.offset[0], (y + 0.5) * this.scale + this.offset[1]]
   }
@@ -157,10 +157,10 @@ export class PhotographView {
     return this.model.marksOfPhoto(this.i).filter((k) => !this.hidden.has(this.model.a["mark.reason"][k]))
   }
 
-  /** Candidates that were not used, by reason, with boxes that show them. */
+  /** Check boxes that show the candidates that were not used, by reason. */
   reasons() {
     if (!this.counts.size) return ""
-    const box = make("div", { className: "v-reasons" }, make("h4", {}, "Seen and not used (blue)"))
+    const box = make("div", { className: "v-reasons" }, make("h4", {}, "Detected but not used (blue)"))
     for (const [reason, count] of [...this.counts].sort((a, b) => a[1] - b[1])) {
       const change = (on) => {
         if (on) this.hidden.delete(reason)
@@ -176,7 +176,7 @@ export class PhotographView {
     this.element.closest(".v-main").classList.toggle("v-wide")
   }
 
-  /** What is nearest to a place on the canvas. */
+  /** The image point or candidate nearest to a position on the canvas. */
   nearest(x, y) {
     let best = { away: NEAR_PX }
     const look = (kind, rows, name) => {
@@ -193,7 +193,7 @@ export class PhotographView {
 
   tell(found) {
     const model = this.model
-    let words = `Green: accepted, red: rejected, blue: seen and not used, yellow: residual vector${this.factor ? `, ${significant(this.factor, 2)} times enlarged` : ""}.`
+    let words = `Green: accepted, red: rejected, blue: detected but not used, yellow: residual vector${this.factor ? `, exaggerated ${significant(this.factor, 2)} times` : ""}.`
     if (found?.kind === "ray") {
       const k = found.k
       const v = model.pair("ray.v", k)
@@ -254,7 +254,7 @@ export class PhotographView {
     this.move(0, 0)
   }
 
-  /** Move the picture, which never leaves the canvas. */
+  /** Move the picture, within the limits of the canvas. */
   move(dx, dy) {
     const size = [this.size[0] * this.fitScale, this.size[1] * this.fitScale]
     this.offset = [dx, dy].map((d, c) => Math.min(0, Math.max(size[c] * (1 - this.zoom), this.offset[c] + d)))

@@ -1,11 +1,11 @@
-// What is under the pointer: the scene drawn once more, a few pixels of it, with a colour that is a number.
+// The object under the pointer: a few pixels of the scene are drawn again, in colours that encode indices.
 
 import * as THREE from "three"
 import { CORNERS } from "./photographs.js"
 import { material } from "./points.js"
 
-const WINDOW_PX = 11 // side of what is drawn; what is nearest to its middle is picked
-const EXTRA_PX = 4 // by which points are larger to the pointer than to the eye
+const WINDOW_PX = 11 // side of the window drawn; the object nearest to its middle is picked
+const EXTRA_PX = 4 // added to the size of points when picking
 
 export class Picker {
   constructor(scene) {
@@ -35,7 +35,7 @@ export class Picker {
     this.pixels = new Uint8Array(4 * WINDOW_PX * WINDOW_PX)
   }
 
-  /** Return the point or photograph at a place of the canvas, or null. */
+  /** Return the point or photograph at a position on the canvas, or null. */
   at(x, y) {
     const { renderer, camera, canvas, photographs } = this.scene
     const half = (WINDOW_PX - 1) / 2
@@ -53,7 +53,7 @@ export class Picker {
       const [r, g, b] = this.pixels.subarray(4 * k, 4 * k + 3)
       const number = r + 256 * g + 65536 * b
       const away = Math.hypot((k % WINDOW_PX) - half, Math.floor(k / WINDOW_PX) - half)
-      // Points are small: they come before a pyramid that the pointer is inside of.
+      // Points are small, so they take precedence over a pyramid around the pointer.
       const rank = number > this.scene.model.pointCount ? away + WINDOW_PX : away
       if (number && rank < best[0]) best = [rank, number]
     }
@@ -63,7 +63,7 @@ export class Picker {
   }
 }
 
-/** Colours that are numbers from `first` on, each for so many corners. */
+/** Colours that encode the integers from `first` on, each repeated for so many corners. */
 function numbers(count, first, corners) {
   const found = new Uint8Array(3 * count * corners)
   for (let k = 0; k < count * corners; k++) {

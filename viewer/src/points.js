@@ -2,7 +2,7 @@
 
 import * as THREE from "three"
 
-const SIZES_PX = [[500, 9], [2000, 6], [Infinity, 4]] // up to so many points, of this size
+const SIZES_PX = [[500, 9], [2000, 6], [Infinity, 4]] // up to this many points, at this size
 export const MANY = 5000 // more points than this are drawn as small squares without a rim
 const SIZE_OF_MANY_PX = 3
 
@@ -36,12 +36,12 @@ export class Points {
     this.geometry.setAttribute("position", new THREE.BufferAttribute(position, 3))
     this.geometry.setAttribute("color", new THREE.BufferAttribute(new Uint8Array(3 * n), 3, true))
     this.geometry.setAttribute("size", new THREE.BufferAttribute(new Float32Array(n).fill(this.size), 1))
-    this.geometry.setIndex(new THREE.BufferAttribute(shuffled(n), 1)) // so that any part of them is everywhere
+    this.geometry.setIndex(new THREE.BufferAttribute(shuffled(n), 1)) // so that any subset covers the whole object
     this.object = new THREE.Points(this.geometry, material(false, n > MANY))
     this.chosen = -1
   }
 
-  /** Draw one point in so many. */
+  /** Draw one point in `part`. */
   thin(part) {
     this.geometry.setDrawRange(0, Math.ceil(this.geometry.index.count / part))
   }
@@ -75,7 +75,7 @@ export function material(flat, square = false) {
   })
 }
 
-/** The numbers from 0 on in an order that looks like chance and is always the same. */
+/** The integers from 0 on in a pseudo-random order that is always the same. */
 function shuffled(count) {
   const order = Uint32Array.from({ length: count }, (_, k) => k)
   let state = 1

@@ -1,4 +1,4 @@
-// The rays of the chosen point or photograph; rejected ones in red, where they really pass.
+// The rays of the selected point or photograph; rejected ones in red, along their measured direction.
 
 import * as THREE from "three"
 
@@ -41,7 +41,7 @@ export class Rays {
     this.all.visible = on
   }
 
-  /** Projection centre, and where the measured ray is at the depth of the point. */
+  /** The projection centre, and the position of the measured ray at the depth of the point. */
   ends(k) {
     const model = this.model
     const i = model.a["ray.photo"][k]

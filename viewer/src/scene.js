@@ -1,4 +1,4 @@
-// The scene in space: points, photographs, rays, ellipsoids, scale bars and control; turned, picked, measured.
+// The 3D scene: points, photographs, rays, ellipsoids, scale bars and control; rotated, picked from and measured in.
 
 import * as THREE from "three"
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js"
@@ -11,15 +11,15 @@ import { MANY, Points } from "./points.js"
 import { lines, Rays } from "./rays.js"
 
 const FIELD_DEG = 40 // of the perspective camera
-const STEP_RAD = 0.12 // that an arrow key turns
-const SLOW_MS = 36 // from frame to frame: then fewer points are drawn while the scene turns
+const STEP_RAD = 0.12 // rotation per press of an arrow key
+const SLOW_MS = 36 // time between frames above which fewer points are drawn while the scene moves
 const MAX_THIN = 16
 const REST_MS = 250 // after which all points are drawn again
-const FILLED = 0.9 // part of the canvas that a view fills
-const SMALLEST = 1 / 3 // part of the canvas of an object that the first view shows with all photographs
-const FAR_RADII = 1.5 // points farther out than so many radii of the object do not make a view smaller
-const NEIGHBOURS = 6 // points seen around a chosen one
-const CLOSEST = 0.1 // of the object's radius: the smallest radius around a chosen point
+const FILLED = 0.9 // fraction of the canvas that a view fills
+const SMALLEST = 1 / 3 // fraction of the canvas: below it, the first view shows the object only
+const FAR_RADII = 1.5 // points more than this many object radii away do not widen a view
+const NEIGHBOURS = 6 // nearest points shown around a selected one
+const CLOSEST = 0.1 // of the object's radius: the smallest radius shown around a selected point
 const BACKGROUND = { light: 0xf7f9fb, dark: 0x10151b }
 
 export class Scene {
@@ -52,7 +52,7 @@ export class Scene {
     this.listen()
   }
 
-  /** Choose origin, size and the direction that is up: from the object towards the photographs. */
+  /** Set origin, size and the up direction, which points from the object towards the photographs. */
   place(model) {
     const n = model.pointCount
     const middle = [0, 1, 2].map((c) => median(Array.from({ length: n }, (_, j) => model.xyz(j)[c])))
@@ -73,7 +73,7 @@ export class Scene {
       const one = new THREE.Vector3(c[0] - middle[0], c[1] - middle[1], c[2] - middle[2])
       if (one.lengthSq() > 0) towards.add(one.normalize())
     }
-    // Photographs all around an object say nothing of what is up: then it is Z.
+    // Photographs all around an object give no up direction: use Z.
     this.up = towards.length() > 0.3 * model.photoCount ? towards.normalize() : new THREE.Vector3(0, 0, 1)
     const axis = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((v) => new THREE.Vector3(...v))
     const nearest = axis.find((v) => Math.abs(v.dot(this.up)) > 0.94)
@@ -99,7 +99,7 @@ export class Scene {
     return lines(ends, "#e07b1a")
   }
 
-  /** A position relative to the origin of the scene: single precision bears no map coordinates. */
+  /** A position relative to the origin of the scene: map coordinates are too large for single precision. */
   local(xyz) {
     return new THREE.Vector3(xyz[0] - this.origin[0], xyz[1] - this.origin[1], xyz[2] - this.origin[2])
   }
@@ -138,7 +138,7 @@ export class Scene {
     event.preventDefault()
   }
 
-  /** Turn the view about its centre by angles to the side and upwards, rad. */
+  /** Rotate the view about its centre, sideways and upwards, rad. */
   turn(side, upwards) {
     const { target } = this.controls
     const up = this.camera.up
@@ -164,7 +164,7 @@ export class Scene {
     this.invalidate()
   }
 
-  /** Look along a direction so that positions, the object's unless others are given, fill the canvas. */
+  /** Look along a direction so that the given positions, by default the object, fill the canvas. */
   look(direction, up, seen = this.object) {
     const from = direction.clone().normalize()
     const right = new THREE.Vector3().crossVectors(up, from).normalize()
@@ -204,20 +204,20 @@ export class Scene {
     this.camera.updateMatrixWorld()
   }
 
-  /** Look at object and photographs, or at the object where it would be small between them; a plan is of both. */
+  /** Show object and photographs, or the object only where it would be small among them; a plan shows both. */
   begin() {
     this.home([...this.object, ...this.stations])
     if (this.share() < SMALLEST && this.model.hasResiduals) this.home()
   }
 
-  /** Part of the canvas that the object takes, along the side of which it takes more. */
+  /** Fraction of the canvas that the object fills, along the side where it fills more. */
   share() {
     const places = this.object.map((p) => p.clone().project(this.camera))
     const range = (values) => values.reduce((most, v) => Math.max(most, v), -Infinity) + values.reduce((most, v) => Math.max(most, -v), -Infinity)
     return Math.max(range(places.map((p) => p.x)), range(places.map((p) => p.y))) / 2
   }
 
-  /** Look from obliquely above, at the object unless positions are given. */
+  /** Look obliquely from above at the given positions, by default the object. */
   home(seen) {
     const [a, b] = across(this.up)
     this.look(this.up.clone().multiplyScalar(0.75).add(a.multiplyScalar(-0.35)).add(b.multiplyScalar(-0.8)), this.up, seen)
@@ -252,7 +252,7 @@ export class Scene {
     else this.frame()
   }
 
-  /** Bring a position to the middle without turning, and a radius about it to fill the canvas unless nearer. */
+  /** Centre a position without rotating; zoom in until a radius around it fills the canvas, but never zoom out. */
   approach(target, radius) {
     const { clientWidth, clientHeight } = this.canvas
     const across = Math.min(clientWidth, clientHeight) * this.unitsPerPixel()
@@ -266,14 +266,14 @@ export class Scene {
     this.camera.updateProjectionMatrix()
   }
 
-  /** Radius about a point with its nearest neighbours in it. */
+  /** Radius around a position that contains its nearest neighbours. */
   surroundings(position) {
     const lengths = this.object.map((p) => p.distanceTo(position)).sort((a, b) => a - b)
     const near = lengths[Math.min(NEIGHBOURS, lengths.length - 1)] ?? 0
     return Math.max(near, CLOSEST * this.objectRadius)
   }
 
-  /** Show what is chosen: a point in the middle and near; a photograph together with the object if it is not seen. */
+  /** Show the selection: centre a point and zoom in; zoom out to a photograph outside the view. */
   select(found) {
     this.selected = found
     this.points.select(found?.kind === "point" ? found.index : -1)
@@ -331,7 +331,7 @@ export class Scene {
     requestAnimationFrame(() => this.draw())
   }
 
-  /** Draw soon, with fewer points where all of them would take too long, and all when the view is at rest. */
+  /** Draw soon: fewer points if all would take too long, and all of them once the view is at rest. */
   moved() {
     clearTimeout(this.rest)
     this.moving = true
@@ -343,7 +343,7 @@ export class Scene {
     this.invalidate()
   }
 
-  /** Draw one point in so many that a frame takes no longer than it may. */
+  /** Thin out the points until a frame takes no longer than allowed. */
   pace() {
     const now = performance.now()
     const took = this.last ? now - this.last : 0
@@ -378,7 +378,7 @@ export class Scene {
     if (!this.overlay.hidden) drawLabels(this, dark)
   }
 
-  /** Where on the canvas a position is seen, px; null behind the camera. */
+  /** Canvas position of an object position, px; null behind the camera. */
   project(position) {
     const p = position.clone().project(this.camera)
     if (p.z > 1 || p.z < -1) return null

@@ -1,26 +1,26 @@
-// Tables of any length: only the rows in sight are in the page. Sorted, filtered, copied, walked through by keys.
+// Tables of any length, which can be sorted, filtered, copied and used by keyboard. Only visible rows are in the page.
 
 import { button, copyText, make } from "./page.js"
 import { byName } from "./numbers.js"
 
 const ROW_PX = 27
-const SPARE = 8 // rows above and below those in sight
+const SPARE = 8 // rows above and below the visible ones
 
 export class Table {
   /**
    * @param columns of {key, name, unit, value(k), words(k)}; a column without `words` is text.
-   * @param rows numbers of the rows.
-   * @param found what a row stands for, as the hub tells it.
+   * @param rows indices of the rows.
+   * @param found returns the selection that a row stands for.
    */
   constructor(what, columns, rows, found, hub) {
     Object.assign(this, { what, columns, rows, found, hub, all: rows, sorted: null, active: -1 })
-    this.search = make("input", { type: "search", placeholder: filterHint(columns), "aria-label": `filter of ${what}` })
+    this.search = make("input", { type: "search", placeholder: filterHint(columns), "aria-label": `filter ${what}` })
     this.search.addEventListener("input", () => this.filter())
     this.count = make("span", { className: "v-count", "aria-live": "polite" })
     this.body = make("tbody")
     this.head = make("tr", {}, ...columns.map((column) => this.heading(column)))
     this.table = make("table", { "aria-label": what, "aria-rowcount": rows.length }, make("thead", {}, this.head), this.body)
-    this.box = make("div", { className: "v-rows", tabIndex: 0, role: "region", "aria-label": `${what}; arrow keys choose a row` }, this.table)
+    this.box = make("div", { className: "v-rows", tabIndex: 0, role: "region", "aria-label": `${what}; arrow keys select a row` }, this.table)
     this.box.addEventListener("scroll", () => this.draw())
     this.box.addEventListener("keydown", (event) => this.key(event))
     this.element = make(
@@ -100,7 +100,7 @@ export class Table {
     this.draw()
   }
 
-  /** Show a row that was chosen elsewhere. */
+  /** Show a row that was selected elsewhere. */
   reveal(k) {
     this.active = k
     const r = this.rows.indexOf(k)
@@ -141,7 +141,7 @@ function cell(value) {
   return Number.isFinite(value) ? String(Number(value.toPrecision(12))) : ""
 }
 
-/** A cell of CSV; a spreadsheet must not take a name for a formula. */
+/** A cell of CSV, quoted so that a spreadsheet does not read a name as a formula. */
 function quoted(text) {
   const safe = /^[=+\-@\t\r]/.test(text) && Number.isNaN(Number(text)) ? `'${text}` : text
   return /[",\n\r]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe
@@ -158,7 +158,7 @@ function filterHint(columns) {
   return number ? `name, or ${number.key} > 3` : "name"
 }
 
-/** Whether a row is shown: texts that it must contain, and comparisons of a column; null if not understood. */
+/** The test for rows to show, from texts to contain and comparisons of columns; null if it cannot be read. */
 function condition(text, columns) {
   const tests = []
   const rest = text.replace(/([^\s<>=]+)\s*(<=|>=|<|>|=)\s*(\S+)/g, (_, key, sign, value) => {
