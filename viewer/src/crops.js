@@ -1,4 +1,4 @@
-// Crops of the photographs about a measured target: centre, ellipse and residual vector, drawn enlarged.
+// Enlarged crops of the photographs around a measured target, with centre, ellipse and exaggerated residual vector.
 
 import { make } from "./page.js"
 import { roundStep, signed, significant } from "./numbers.js"

@@ -61,7 +61,7 @@ MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 UNUSED = "measured, not part of the result"
 ALIGNED = 8  # bytes to which arrays are aligned
 TYPES = {"f8": "<f8", "f4": "<f4", "u4": "<u4", "u1": "|u1"}
-NO_CROP = "no picture: it is neither in this page nor beside it"
+NO_CROP = "no picture in this page or beside it"
 NO_FILE = "the picture is in the folder of the report, which is not beside this page"
 NO_PICTURE = "no photograph was read for this page"
 
@@ -169,12 +169,8 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
             "no_crop": NO_CROP if pictures.count else NO_PICTURE,
             "no_file": NO_FILE,
             "no_picture": NO_PICTURE,
-            "covariance": "their correlation is not known here"
-            + (
-                f", since it is kept for at most {MAX_POINTS} points."
-                if len(scene.points) > MAX_POINTS
-                else "."
-            ),
+            "covariance": "their correlation is not stored"
+            + (f" for more than {MAX_POINTS} points." if len(scene.points) > MAX_POINTS else "."),
         },
     }
 
