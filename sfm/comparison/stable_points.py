@@ -28,6 +28,7 @@ from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 
 ROBUST_ROUNDS = 100  # of weighting, which converges long before
+SINGULAR = 1e-12  # share of a covariance before a transformation, below which rounding is left of it
 MIN_WEIGHTED = 1e-6  # of the median difference; smaller differences get no larger weight
 
 
@@ -207,7 +208,8 @@ def tests_in_datum(
     of_point, by_coordinates = G.reshape(n, m, -1), A.reshape(n, m, -1)
     mixed = np.einsum("niu,nju->nij", of_point, by_coordinates)
     spread = np.einsum("niu,uv,njv->nij", of_point, H @ A, of_point)
-    return _tests_of_blocks(d, point_blocks(covariance, m) - mixed - np.swapaxes(mixed, 1, 2) + spread)
+    before = point_blocks(covariance, m)
+    return _tests_of_blocks(d, before - mixed - np.swapaxes(mixed, 1, 2) + spread, before)
 
 
 def _motion_in_datum(
@@ -260,14 +262,15 @@ def robust_weights(difference: FloatArray, G: FloatArray, candidates: BoolArray)
 
 def single_tests(difference: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return T = d' Q_dd^-1 d / m of each single point, (n,); NaN where Q_dd is singular."""
-    return _tests_of_blocks(difference, point_blocks(covariance, difference.shape[1]))
+    blocks = point_blocks(covariance, difference.shape[1])
+    return _tests_of_blocks(difference, blocks, blocks)
 
 
-def _tests_of_blocks(difference: FloatArray, blocks: FloatArray) -> FloatArray:
+def _tests_of_blocks(difference: FloatArray, blocks: FloatArray, before: FloatArray) -> FloatArray:
+    """Return T of each point, (n,); NaN if only rounding is left of the covariance that it had before."""
     n, m = difference.shape
     T = np.full(n, np.nan)
-    size = np.einsum("nii->n", blocks)
-    regular = np.linalg.eigvalsh(blocks)[:, 0] > 1e-12 * size
+    regular = np.linalg.eigvalsh(blocks)[:, 0] > SINGULAR * np.einsum("nii->n", before)
     d = difference[regular]
     T[regular] = np.einsum("ni,ni->n", d, np.linalg.solve(blocks[regular], d[..., None])[..., 0]) / m
     return T

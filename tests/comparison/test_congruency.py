@@ -19,6 +19,7 @@ from sfm.comparison.congruency import congruency, motions
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.solutions import compare_baseline, reprojection
+from sfm.comparison.stable_points import tests_in_datum as single_tests_in_datum
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError, SurveyFileError
@@ -406,3 +407,12 @@ def test_baseline_is_compared_at_the_targets(epochs: tuple[Solution, Solution]) 
     assert np.isnan(found.rotation_deg[[1, 5]]).all()
     assert np.nanmax(found.rotation_deg) < 0.1
     assert 1e-5 < found.point_rms < 1e-3
+
+
+def test_points_that_alone_are_the_datum_are_not_tested() -> None:
+    """Two points fix six motions: of their covariance rounding is left, which may be singular or negative."""
+    rng, weight = seed_of("datum points"), (np.arange(6) < 2).astype(float)
+    for _ in range(100):
+        A = rng.normal(size=(18, 18))
+        T = single_tests_in_datum(rng.normal(size=(6, 3)), A @ A.T, rng.normal(size=(18, 6)), weight)
+        assert np.isnan(T).tolist() == [True, True, False, False, False, False]
