@@ -328,7 +328,7 @@ def test_a_ring_is_ten_standard_deviations_larger_than_the_dots() -> None:
     ring = np.arange(20) == 7
     radius[7] *= 2.0
     size = dot_plates.size_of_marks(Lattice(np.arange(20), place, np.zeros((20, 2))), radius, ring)
-    assert size[ring].tolist() == [10.0] and np.abs(size[~ring]).max() < 5.0
+    assert size[ring].tolist() == [10.0] and np.abs(size[~ring]).max() < 8.0
 
 
 @pytest.mark.parametrize("sign", [1, -1])
