@@ -172,7 +172,7 @@ TRIES = (
     Try(
         "a distance without unit", "kolinear plan target-size --distance 3, in m",
         lambda folder: ("plan", "target-size", "--distance", "3", *CAMERA), 2,
-        ("not farther than the principal distance",),
+        ("not larger than the principal distance",),
     ),
     Try("a unit in words", 'unit = "metres"', _unit, 2, ("found 'metres', needed one of 'km', 'm'",)),
 )  # fmt: skip

@@ -1,6 +1,6 @@
-"""The entry point of kolinear, and the one line that a person reads when something is wrong.
+"""The entry point of kolinear: runs a command and reports every error in one line.
 
-Nothing is imported here that takes time: Ctrl-C and wrong arguments are answered at once.
+Slow imports are left to the commands, so Ctrl-C and wrong arguments are answered at once.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from sfm.runtime.installation import (
 )
 from sfm.runtime.progress import share_freed_memory
 
-YOUNG_OBJECTS = 100_000  # that Python waits for before it looks for cycles, far more than usual
-BAD_INPUT = 2  # exit code where a person must put something right
+YOUNG_OBJECTS = 100_000  # new objects before Python collects cycles, far more than its default
+BAD_INPUT = 2  # exit code of errors that the user can correct
 
 
 def main() -> None:
-    """Run the command line; every error is one line.
+    """Run the command line and report every error in one line.
 
-    Exit code 2 means something that a person can put right, 70 an unforeseen error.
+    Exit code 2 is an error that the user can correct, 70 an unforeseen error.
     """
     guard_streams()
     try:
         with stopped_once():
             try:
-                _begin()
+                _prepare()
                 with closed_current_folder():
                     _run()
             finally:
@@ -43,7 +43,7 @@ def main() -> None:
                     sys.stdout.flush()  # while a full disk can still be reported
     except KolinearError as error:
         _refuse(str(error))
-    except OSError as error:  # a disk, a network drive: nothing that a traceback would help with
+    except OSError as error:  # a disk or a network drive; a traceback would not help
         where = f"{error.filename}: " if error.filename else ""
         _refuse(f"{where}{error.strerror or error}")
     except KeyboardInterrupt:
@@ -53,15 +53,16 @@ def main() -> None:
         _report_fault(error)
 
 
-def _begin() -> None:
-    """Refuse what must not decide what is run, and look for cycles less often: a tenth of the time of a run.
+def _prepare() -> None:
+    """Refuse folders and installations that would change the code that runs, and collect cycles less often.
 
-    At the end Python would look through all objects again, for half a second.
+    Rare collection of cycles saves a tenth of the time of a run. At exit, Python would search all objects
+    once more for half a second, which the freeze prevents.
     """
-    share_freed_memory()  # before there is a second thread
+    share_freed_memory()  # before a second thread starts
     gc.set_threshold(YOUNG_OBJECTS)
     atexit.register(gc.freeze)
-    refuse_mixed_installation()  # asked here too: the other project's sfm/__init__.py may lie over ours
+    refuse_mixed_installation()  # checked here too: another project's sfm/__init__.py may have replaced ours
     refuse_folder_settings()
     load_adapters()
 
@@ -73,32 +74,32 @@ def _run() -> None:
     try:
         code = commands()(prog_name="kolinear", standalone_mode=False)
     except USAGE_ERROR as error:
-        if not sys.argv[1:]:  # which asks for the help, and is no mistake
+        if not sys.argv[1:]:  # no arguments: the user asks for help, which is no mistake
             error.show()
             raise SystemExit(BAD_INPUT) from None
         command = error.ctx.command_path if error.ctx else "kolinear"
         said = f"{error.format_message().rstrip()}{_decimal_comma(error, sys.argv[1:])}"
         _refuse(f"{said} (see {command} --help)".replace(". (see", " (see"))
-    if code == INTERRUPTED:  # which typer makes of Ctrl-C without a message
+    if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a message
         raise KeyboardInterrupt
     if isinstance(code, int) and code:
         raise SystemExit(code)
 
 
 def _decimal_comma(error: Any, arguments: Sequence[str]) -> str:
-    """Return what is wrong with a decimal comma in a numeric option; nothing for other errors."""
+    """Return a hint if the value of a numeric option has a decimal comma, else an empty text."""
     if "number" not in error.format_message():
         return ""
     for name in getattr(getattr(error, "param", None), "opts", ()):
         for given, following in zip(arguments, (*arguments[1:], ""), strict=True):
             value = following if given == name else given.removeprefix(f"{name}=")
             if re.fullmatch(r"[-+]?\d+,\d+", value):
-                return f"; a number has a decimal point, not a comma: {value.replace(',', '.')}"
+                return f"; use a decimal point, not a comma: {value.replace(',', '.')}"
     return ""
 
 
 def _report_fault(error: Exception) -> None:
-    """End with one line about an unforeseen error; not enough memory is something to put right."""
+    """Exit with one line about an unforeseen error, or about a lack of memory, which the user can correct."""
     from sfm.runtime.faults import ending_of
 
     message, code = ending_of(error)
@@ -106,11 +107,11 @@ def _report_fault(error: Exception) -> None:
 
 
 def _refuse(message: str, *, code: int = BAD_INPUT) -> None:
-    """End with one line and an exit code."""
+    """Print one line and exit with a code."""
     print(f"kolinear: {_printable(message)}", file=sys.stderr)
     raise SystemExit(code) from None
 
 
 def _printable(text: str) -> str:
-    """Return a message on one line, without control characters that a file name may carry."""
+    """Return a message on one line, without the control characters that a file name may contain."""
     return "".join(c if c.isprintable() else " " for c in text)

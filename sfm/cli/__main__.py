@@ -1,4 +1,4 @@
-"""python -m sfm.cli, the same as kolinear."""
+"""Runs kolinear as `python -m sfm.cli`."""
 
 from sfm.cli import main
 

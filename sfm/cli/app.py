@@ -1,4 +1,4 @@
-"""The commands of kolinear, put together; what they need is imported where they run."""
+"""The typer application with all commands of kolinear. Each command imports its libraries when it runs."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import typer
 
 from sfm.cli.commands import batching, inspecting, measuring, planning, solvers, starting, surveying
 
-USAGE_ERROR: Any = typer.BadParameter.__base__  # of all messages of typer on wrong arguments; it has no name
+USAGE_ERROR: Any = (
+    typer.BadParameter.__base__
+)  # base of typer's errors of arguments; typer does not export it
 
 app = typer.Typer(
     name="kolinear",
-    help="Close-range photogrammetry: targets, orientation, bundle adjustment, and COLMAP beside it.",
+    help="Close-range photogrammetry: targets, orientation, bundle adjustment and comparison with COLMAP.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -24,7 +26,7 @@ app = typer.Typer(
 
 
 def _show_version(wanted: bool) -> None:
-    """Print the versions that a report of a fault needs, and end."""
+    """Print the versions that a bug report needs, and exit."""
     if wanted:
         print(f"kolinear {version('kolinear')}, Python {platform.python_version()}, {platform.platform()}")
         raise typer.Exit
@@ -66,5 +68,5 @@ app.add_typer(planning.plan)
 
 @cache
 def commands() -> Any:
-    """Return the commands as they are called, which takes 0.1 s to put together."""
+    """Return the command line that typer builds from the application, which takes 0.1 s."""
     return typer.main.get_command(app)

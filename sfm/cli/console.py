@@ -1,4 +1,4 @@
-"""The summary of a result on the terminal, printed whatever the terminal can show."""
+"""The summary of a result on the terminal."""
 
 from __future__ import annotations
 
@@ -35,10 +35,16 @@ STYLES: dict[Severity, str] = {"error": "red", "warning": "yellow", "note": "dim
 
 
 def print_result(findings: Findings, page: Path, *, seconds: float, verbose: bool) -> bool:
-    """Print the summary: verdict, figures with their units, what failed, where the report is.
+    """Print the summary of a survey: verdict, figures with units, remarks, failures and path of the report.
+
+    Args:
+        findings: the result and its remarks.
+        page: path of the report.
+        seconds: duration of the run, s.
+        verbose: whether to add details, photographs and cameras.
 
     Returns:
-        Whether the result can be depended on.
+        Whether the result is dependable.
     """
     result, verdict = findings.result, findings.verdict
     a = result.adjustment
@@ -77,7 +83,14 @@ def print_verdict(verdict: Verdict | Banner) -> None:
 
 
 def print_remarks(console: Console, lines: Iterable[Line]) -> None:
-    """Print remarks: errors and warnings behind `!`, then notes; remedies but of notes on nothing lost."""
+    """Print remarks: errors and warnings with a leading `!`, then notes.
+
+    Remedies are printed except for notes on which no photograph or point was lost.
+
+    Args:
+        console: console of the terminal.
+        lines: remarks in order of severity.
+    """
     for line in lines:
         is_note = line.severity == "note"
         remedy = "" if is_note and not line.lost else line.remedy
@@ -86,9 +99,9 @@ def print_remarks(console: Console, lines: Iterable[Line]) -> None:
 
 
 def _failures(findings: Findings) -> list[str]:
-    """Return why photographs are not in the result and what helps: once for those alike.
+    """Return the reasons why photographs are not in the result, with remedies; equal reasons are merged.
 
-    Remarks explained by another one are left out.
+    Reasons that another remark explains are left out.
     """
     said = {
         (image, kind)
@@ -108,7 +121,7 @@ def _failures(findings: Findings) -> list[str]:
 
 
 def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
-    """Return the figures of the summary, each with its unit."""
+    """Return names and values of the figures of the summary, with units."""
     result, precision = findings.result, findings.precision
     a = result.adjustment
     coded = int((result.code >= 0).sum())
@@ -166,7 +179,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
 
 
 def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
-    """Yield what a calibration is for: the cameras, where no coordinate was adjusted."""
+    """Yield the calibrated cameras, if the survey is a calibration without adjusted coordinates."""
     for one in findings.calibrated[:MAX_LISTED]:
         values, sigmas, within, projection = describe_calibration(one)
         yield f"camera {one.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
@@ -198,7 +211,7 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
 
 
 def _photograph_table(result: SurveyResult) -> Table:
-    """Return measured targets and rejected candidates of each photograph."""
+    """Return the table of measured targets and rejected candidates of each photograph."""
     table = Table(box=None, padding=(0, 2, 0, 0))
     for name in ("photograph", "targets", "rejected candidates"):
         table.add_column(name, justify="left" if name != "targets" else "right")

@@ -127,11 +127,11 @@ BAD = [
         ("plate:1,1", "--camera", "brownie", "--c-mm", "5", "--sigma-px", "1", "--stations", "ring:6"),
         "one of full-frame-24",
     ),
-    (("plate:1,1", *LENS), "neither --stations nor what is wanted"),
-    (("plate:1,1", *CAMERA, "--stations", "ring:6"), "needed --sigma-px or --target-diameter"),
+    (("plate:1,1", *LENS), "expected --stations, or a wanted precision"),
+    (("plate:1,1", *CAMERA, "--stations", "ring:6"), "expected --sigma-px or --target-diameter"),
     (
         ("plate:1,1", *LENS, "--stations", "ring:6", "--f-number", "8"),
-        "--f-number and --focus are needed together",
+        "needs both --f-number and --focus",
     ),
     (
         ("plate:1,1", *LENS, "--stations", "ring:6", "--free", "c,K9"),
@@ -201,7 +201,7 @@ def test_the_camera_of_a_survey_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     text = survey.read_text(encoding="utf-8").replace("c_mm = 10.0\n", "")
     survey.write_text(text, encoding="utf-8")
     assert plan(*given, "--stations", "hemisphere:8") == 2
-    assert "camera synthetic has no focal length, needed c_mm there or --c-mm" in capsys.readouterr().err
+    assert "camera synthetic has no focal length, expected c_mm or --c-mm" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("command", "file"), [("simulate", "plan.json"), ("more", "summary.json")])

@@ -226,7 +226,7 @@ def test_picture_tells_how_many_it_leaves_out(photographs: tuple[Path, Path], tm
 def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="either --point COL,ROW or --points FILE"):
         match_command(*photographs)
-    with pytest.raises(SurveyFileError, match="needed COL,ROW such as"):
+    with pytest.raises(SurveyFileError, match="expected COL,ROW such as"):
         match_command(*photographs, point="12")
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
         match_command(*photographs, point="80,80", template_px=20)

@@ -210,9 +210,9 @@ def test_a_rig_without_which_nothing_is_determined_gives_all_points() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("--camera", "full-frame-24"), "needed --camera or --survey, one of them"),
-        (("--free", "c"), "--c-mm, --camera-name and --free are for --camera"),
-        (("--unit", "mm"), "unit 'm', the plan is in 'mm'"),
+        (("--camera", "full-frame-24"), "expected either --camera or --survey"),
+        (("--free", "c"), "--c-mm, --camera-name and --free belong to --camera"),
+        (("--unit", "mm"), "has unit 'm', but the plan has 'mm'"),
     ],
 )
 def test_contradicting_options_are_refused(

@@ -131,7 +131,7 @@ def test_bad_files(tmp_path, four):
     refused("principal distance is missing")
     refused("it must be positive", c_mm=-1)
     refused("the table cannot be read: No such file", path=tmp_path / "none.csv", c_mm=24)
-    refused(r"--start '1,2': X,Y,Z or X,Y,Z,omega,phi,kappa", c_mm=24, start="1,2")
+    refused(r"--start '1,2': expected X,Y,Z or X,Y,Z,omega,phi,kappa", c_mm=24, start="1,2")
     (tmp_path / "a.csv").write_text("point,X,Y,x_mm,y_mm\n1,2,3,4,5\n")
     refused("a.csv, line 1: no column Z, needed point,X,Y,Z,x_mm,y_mm", path=tmp_path / "a.csv", c_mm=24)
     (tmp_path / "b.csv").write_text("point,X,Y,Z,x_mm,y_mm\n1,2,3,four,5,6\n")
@@ -141,7 +141,7 @@ def test_bad_files(tmp_path, four):
     (tmp_path / "c.csv").write_text("point,X,Y,Z,x_mm,y_mm\n")
     refused("c.csv: no rows below the header", path=tmp_path / "c.csv", c_mm=24)
     (tmp_path / "cam.csv").write_text("parameter,value\nc,24\nfocus,3\n")
-    refused("cam.csv, line 3: no parameter 'focus'", camera_file=tmp_path / "cam.csv")
+    refused("cam.csv, line 3: unknown parameter 'focus'", camera_file=tmp_path / "cam.csv")
 
 
 def test_bad_geometry(tmp_path, four):

@@ -1,1 +1,1 @@
-"""The commands of the command line, a module for those of one purpose."""
+"""The commands of the command line, one module for each purpose."""

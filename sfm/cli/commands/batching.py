@@ -1,8 +1,7 @@
-"""Command about many surveys: batch.
+"""The command `batch`, which runs many surveys, and the choice of the engine that does the work.
 
-Who does the work of a batch: Dask on this computer or elsewhere, or this process where it is missing.
-
-An engine without processes: one call after the other, here, where no library for more is installed.
+The engine is Dask, with worker processes on this computer or on a cluster. Where Dask is not installed,
+`InProcess` runs the surveys one after the other in this process.
 """
 
 from __future__ import annotations
@@ -36,11 +35,12 @@ def batch(
         list[str],
         typer.Argument(
             metavar="SURVEYS...",
-            help="Survey files; folders (every survey.toml in and below, else the *.toml in them); globs.",
+            help="Survey files, glob patterns, or folders (every survey.toml in or below the folder; "
+            "without any, the *.toml files in it).",
         ),
     ],
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of the batch, with a folder per survey.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder of the batch, with one folder per survey.")
     ] = Path("out/batch"),
     jobs: Annotated[
         int | None,
@@ -48,7 +48,7 @@ def batch(
             "--jobs",
             metavar="N",
             min=1,
-            help="Worker processes.  [default: as many as there are cores and 1.5 GiB of memory]",
+            help="Number of worker processes.  [default: one per core and 1.5 GiB of memory]",
         ),
     ] = None,
     cluster: Annotated[
@@ -56,24 +56,24 @@ def batch(
         typer.Option(
             "--cluster",
             metavar="ADDRESS",
-            help="A Dask scheduler, such as tcp://192.168.1.5:8786, in place of processes on this computer; "
-            "its workers need Kolinear and see the same folders.",
+            help="Dask scheduler, such as tcp://192.168.1.5:8786, used instead of processes on this "
+            "computer. Its workers need Kolinear and access to the same folders.",
         ),
     ] = None,
     pictures_mb: PicturesMb = 15.0,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Keep what an earlier run finished, if its inputs are the same.")
+        bool, typer.Option("--resume", help="Keep finished results of an earlier run with the same inputs.")
     ] = False,
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run many surveys side by side, each with its report.
+    """Run many surveys in parallel, each with its own report.
 
-    One table lists them all.  Exit code 0 if every survey has a dependable result, else 1; 70 if one met
-    a fault of the program; 2 where a person must put something right.
+    One table lists all surveys.  Exit code 0 if every survey has a dependable result, 1 if not, 70 if a
+    survey failed by an error of the program, 2 if the input must be corrected.
     """
     if cluster is not None and jobs is not None:
-        raise KolinearError("--jobs is for processes on this computer, --cluster brings its workers")
+        raise KolinearError("--jobs counts processes on this computer; --cluster has its own workers")
     with loading():
         from rich.console import Console
 
@@ -95,7 +95,7 @@ def batch(
             files,
             out,
             engine,
-            Comparers(_others_of_worker, colmap_writer),
+            Comparers(_programs_of_worker, colmap_writer),
             table,
             resume=resume,
             allow_outside=allow_outside,
@@ -108,8 +108,8 @@ def batch(
         raise SystemExit(FAILED)
 
 
-def _others_of_worker(survey: Survey) -> OtherPrograms:
-    """Return what a survey is compared with in a worker of a batch, one of as many as there are cores."""
+def _programs_of_worker(survey: Survey) -> OtherPrograms:
+    """Return the programs to compare a survey with, on one thread each, as every core has a worker."""
     from sfm.api import programs_of
 
     return programs_of(survey.compare.backend, survey.compare.baseline, threads=1)
@@ -121,13 +121,13 @@ def batch_engine(
     """Return the engine of a batch.
 
     Args:
-        busy: returns how many calls can run at a time at most; more workers would wait for nothing.
-        jobs: workers on this computer; as many as its cores and memory allow if not given.
-        cluster: address of a Dask scheduler in place of them.
-        send: receives one line where surveys run one after the other, and why.
+        busy: returns the largest number of calls that can run at a time; more workers would be idle.
+        jobs: number of workers on this computer; if None, as many as its cores and memory allow.
+        cluster: address of a Dask scheduler to use instead.
+        send: receives one line with the reason if surveys run one after the other.
 
     Raises:
-        MissingLibraryError: a scheduler is asked for, and Dask is not installed.
+        MissingLibraryError: `cluster` is given but Dask is not installed.
         BackendError: no scheduler answers at the address.
     """
     dask = _dask_cluster()
@@ -145,7 +145,7 @@ def batch_engine(
 
 
 def _dask_cluster() -> ModuleType | None:
-    """Return the module that uses Dask, None where Dask is not installed."""
+    """Return the adapter of Dask, or None if Dask is not installed."""
     try:
         from adapters import dask_cluster
     except ModuleNotFoundError as error:
@@ -156,27 +156,31 @@ def _dask_cluster() -> ModuleType | None:
 
 
 class InProcess:
-    """Runs one piece of work after the other in this process, see sfm.kernels.threads.Engine.
+    """Engine that runs one piece of work after the other in this process (`sfm.runtime.executor.Engine`).
 
-    Messages of a call are passed on when it has returned.
+    Messages of a call are passed on after it has returned.
     """
 
     workers = 1
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield what happens; one call at a time, whatever is asked for.
+        """Run all work one call at a time, regardless of `at_a_time`, and yield events.
+
+        Args:
+            works: pieces of work, in order.
+            at_a_time: ignored.
 
         Raises:
-            KolinearError: what a called function raised.
+            KolinearError: raised by a called function.
         """
         for work in works:
             try:
                 parts = []
                 for part in work.parts:
-                    value, said = _called(part)
+                    value, said = _run_call(part)
                     yield from (Sent(work.key, message) for message in said)
                     parts.append(value)
-                value, said = _called(work.whole, parts)
+                value, said = _run_call(work.whole, parts)
             except KolinearError:
                 raise
             except Exception as error:
@@ -186,10 +190,10 @@ class InProcess:
             yield Done(work.key, value)
 
 
-def _called(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:
-    """Return what a call returns and what it has reported.
+def _run_call(call: Call, *more: Any) -> tuple[Any, list[dict[str, Any]]]:
+    """Return the value of a call and the messages that it sent.
 
-    BLAS is held to one thread as in a worker: sums of several threads differ in the last bit.
+    BLAS is limited to one thread, as in a worker: sums over several threads differ in the last bit.
     """
     said: list[dict[str, Any]] = []
     with threadpool_limits(limits=1):

@@ -1,4 +1,4 @@
-"""Commands on finished results: inspect, accept and view."""
+"""Commands for finished results: measure, accept and view."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from sfm.conventions import BoolArray, FloatArray
     from sfm.solution import Solution
 
-PICTURES = "pictures"  # folder of the photographs in that of a result
-NOT_KEPT = 1  # exit code where a limit is proven not to be kept
-MAX_PRINTED = 40  # distances, angles and heights; all of them are in quantities.csv
+PICTURES = "pictures"  # folder of photographs in a result folder
+NOT_KEPT = 1  # exit code if the error limit is exceeded
+MAX_PRINTED = 40  # distances, angles and heights on the terminal; quantities.csv lists all
 if TYPE_CHECKING:
     from sfm.inspection.measure import Measurement
 
@@ -28,27 +28,25 @@ if TYPE_CHECKING:
 def measure(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="RESULT", help="Result folder, COLMAP model, or another format that is known."
-        ),
+        typer.Argument(metavar="RESULT", help="Result folder, COLMAP model, or another known format."),
     ],
     features: Annotated[
         Path | None,
         typer.Option("--features", metavar="FILE.toml", help="Shapes, alignment, distances and tolerances."),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of tables and page.")] = Path(
-        "out/measurement"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the tables and the page.")
+    ] = Path("out/measurement"),
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format of RESULT; by default from its content.")
+        str | None, typer.Option("--from", metavar="F", help="Format of RESULT.  [default: by its content]")
     ] = None,
     outside: Annotated[
-        bool, typer.Option("--allow-outside", help="Let the features file name files outside its folder.")
+        bool, typer.Option("--allow-outside", help="Let the features file refer to files outside its folder.")
     ] = False,
 ) -> None:
     """Measure shapes, distances and tolerances in a result.
 
-    Every value with the standard deviation that follows from the covariance of all points.
+    Every value has a standard deviation, propagated from the covariance of all points.
     """
     with loading():
         from adapters.formats.mesh import read_mesh
@@ -91,30 +89,38 @@ def accept(
     lengths: Annotated[
         Path, typer.Argument(metavar="LENGTHS.csv", help="Calibrated lengths: line,from,to,length[,sigma].")
     ],
-    a: Annotated[float, typer.Option("--limit-a", metavar="A", help="A of the limit A + K L, object unit.")],
-    k: Annotated[float, typer.Option("--limit-k", metavar="K", help="K of the limit, such as 2e-5.")] = 0.0,
+    a: Annotated[
+        float, typer.Option("--limit-a", metavar="A", help="A of the error limit A + K L, object unit.")
+    ],
+    k: Annotated[
+        float, typer.Option("--limit-k", metavar="K", help="K of the error limit, such as 2e-5.")
+    ] = 0.0,
     b: Annotated[
-        float | None, typer.Option("--limit-b", metavar="B", help="Largest value of the limit, object unit.")
+        float | None, typer.Option("--limit-b", metavar="B", help="Largest error limit, object unit.")
     ] = None,
     coverage: Annotated[
-        float, typer.Option("--coverage", metavar="k", min=1.0, help="k of U = k sigma of the calibration.")
+        float,
+        typer.Option(
+            "--coverage", metavar="k", min=1.0, help="Coverage factor k of U = k sigma of the calibration."
+        ),
     ] = 2.0,
     diagonal: Annotated[
         float | None,
         typer.Option(
             "--diagonal",
             metavar="D",
-            help="Body diagonal of the measuring volume, object unit; else of the box around all points.",
+            help="Body diagonal of the measuring volume, object unit.  [default: of the box around all "
+            "points]",
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table and page.")] = Path(
-        "out/acceptance"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the table and the page.")
+    ] = Path("out/acceptance"),
 ) -> None:
     """Test a result against calibrated lengths (VDI/VDE 2634 part 1).
 
-    The scale must come from other bars than those tested. Exit code 1 if the limit is proven not to be kept,
-    or an error without a standard deviation of the calibration exceeds it.
+    The scale must come from other bars than the tested ones. Exit code 1 if an error of a length provably
+    exceeds the limit, or simply exceeds it where the calibration has no standard deviation.
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources
@@ -147,7 +153,7 @@ def accept(
 
 
 def _write_drawings(found: Measurement, folder: Path) -> None:
-    """Write what goes with a measurement for other programs: covariance, point cloud and drawing."""
+    """Write the files of a measurement for other programs: covariance, point cloud and drawing."""
     import numpy as np
 
     from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
@@ -177,16 +183,14 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
 def view(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="FOLDER", help="Result folder, COLMAP model, or another format that is known."
-        ),
+        typer.Argument(metavar="FOLDER", help="Result folder, COLMAP model, or another known format."),
     ],
     images: Annotated[
         Path | None,
         typer.Option(
             "--images",
             metavar="DIR",
-            help="Folder of the photographs.  [default: pictures of a result folder]",
+            help="Folder of the photographs.  [default: the pictures of a result folder]",
         ),
     ] = None,
     out: Annotated[
@@ -194,20 +198,22 @@ def view(
         typer.Option(
             "--out",
             metavar="FILE.html",
-            help="Page to write; an earlier one is replaced.  [default: FOLDER.html]",
+            help="Page to write; an earlier page is replaced.  [default: FOLDER.html]",
         ),
     ] = None,
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format of FOLDER; by default from its content.")
+        str | None, typer.Option("--from", metavar="F", help="Format of FOLDER.  [default: by its content]")
     ] = None,
     budget: Annotated[
-        float, typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest size of the pictures.")
+        float,
+        typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest total size of the pictures."),
     ] = 15.0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
 ) -> None:
-    """Write one page with a result to explore, and open it.
+    """Write a result as one page to explore, and open it.
 
-    A 3D scene, photographs, crops of the targets and tables, in one file without a server.
+    The page is a single file that needs no server. It has a 3D scene, photographs, crops of the targets and
+    tables.
     """
     with loading():
         import webbrowser
@@ -221,7 +227,7 @@ def view(
         from sfm.report.viewer.embedded import scene_of_stored
         from sfm.runtime.progress_bar import drawn_progress
 
-    place = Path(os.path.abspath(source))  # through no link, as pages are written
+    place = Path(os.path.abspath(source))  # links are not followed, as when pages are written
     page = place.with_name(f"{place.name}.html") if out is None else out
     refuse_foreign_page(page)
     if images is not None and not images.is_dir():
@@ -230,7 +236,7 @@ def view(
         stored = read_comparable(source, from_format)
         rejected = w = seen = None
         if (from_format or format_of(source).name) == "tables":
-            stored, rejected, w = _with_rejected(source, stored)
+            stored, rejected, w = _read_rejected(source, stored)
             seen = read_targets(source, stored.network)
         scene = scene_of_stored(stored, w=w, rejected=rejected, seen_targets=seen)
     if images is not None:
@@ -256,11 +262,11 @@ def view(
         print(note)
     print(f"Page: {page}")
     if browser and not webbrowser.open(page.resolve().as_uri()):
-        print("No browser could be opened here: open the page by hand.")
+        print("No browser could be opened; open the page yourself.")
 
 
-def _with_rejected(folder: Path, stored: Solution) -> tuple[Solution, BoolArray, FloatArray]:
-    """Return a result with its rejected image points, which these are, and w of all."""
+def _read_rejected(folder: Path, stored: Solution) -> tuple[Solution, BoolArray, FloatArray]:
+    """Return a result with its rejected image points, the mask of these, and w of all image points."""
     from dataclasses import replace
 
     from adapters.formats.result_tables import read_image_points

@@ -1,6 +1,7 @@
-"""The body of `kolinear match`: two photographs and points in, a table, JSON and a picture out.
+"""The work of `kolinear match`, and the input files of `kolinear resect`.
 
-The points of one photograph and its interior orientation, read from files for `kolinear resect`.
+`match_command` reads two photographs and points, matches the points, and writes a table, JSON and a picture.
+`read_task` reads the points of one photograph and its interior orientation.
 """
 
 from __future__ import annotations
@@ -48,27 +49,28 @@ def match_command(
     """Match points of two photograph files.
 
     Args:
-        left_path: the photograph in which points are given.
-        right_path: the photograph in which they are found.
-        point: "COL,ROW" in the left photograph, px; either this or `points`.
+        left_path: photograph in which the points are given.
+        right_path: photograph in which the points are searched for.
+        point: "COL,ROW" in the left photograph, px; give either this or `points`.
         points: table of points, see `read_points_to_match`.
         template_px: width of the template, px.
-        min_correlation: least correlation coefficient.
-        as_json: JSON in place of the table.
-        out: file .csv or .json that gets the table, in place of the terminal.
-        picture: PNG file that gets template, matched patch and their difference.
-        how: more of what `sfm.matching.conjugate.match_points` takes.
+        min_correlation: smallest correlation coefficient of a match.
+        as_json: whether to return JSON instead of the table.
+        out: file .csv or .json for the table, which is then not printed.
+        picture: PNG file for the template, the matched patch and their difference.
+        how: further options of `sfm.matching.conjugate.match_points`.
 
     Returns:
-        The text that the command line prints, and whether any point was matched.
+        The text to print, and whether any point was matched.
 
     Raises:
-        KolinearError: unreadable photographs, points or table, even windows, or files that cannot be written.
+        KolinearError: unreadable photographs, points or table, windows of even width, or files that cannot be
+            written.
     """
     if (point is None) == (points is None):
         raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
     if not 0.0 <= min_correlation <= 1.0:
-        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, needed 0 to 1")
+        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, expected 0 to 1")
     inputs = (left_path, right_path, *(() if points is None else (points,)))
     refuse_outputs(out, picture, inputs, as_json)
     if points is not None:
@@ -100,13 +102,17 @@ def match_command(
 
 
 def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
-    """Read point,x_px,y_px[,x_right_px,y_right_px]; the last two are centres of the search windows.
+    """Read a table point,x_px,y_px[,x_right_px,y_right_px].
+
+    Args:
+        path: CSV file; the last two columns are the centres of the search windows.
 
     Returns:
-        Names, left points (k, 2) and centres (k, 2) or None, px.
+        Names, points in the left photograph (k, 2), and centres (k, 2) or None, px.
 
     Raises:
-        SurveyFileError: unreadable, wrong columns, no rows, a name twice, or not a finite number.
+        SurveyFileError: the file is unreadable or empty, has wrong columns, repeats a name, or has a value
+            that is not a finite number.
     """
     table = read_table(path, NAMES[:1], NAMES[1:3], NAMES[3:5])
     values = table.values
@@ -114,9 +120,9 @@ def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, Float
 
 
 def _photograph(which: str, path: Path) -> AnyArray:
-    """Read a photograph; a folder has no name to be called by, so the argument is named."""
+    """Read a photograph. The message on a folder names the argument, as the path alone may be just a dot."""
     if path.is_dir():
-        raise PhotographError(f"{which} {path}: a folder, a photograph is needed")
+        raise PhotographError(f"{which} {path}: is a folder, expected a photograph")
     return read_photograph(path)
 
 
@@ -126,7 +132,7 @@ def _parse_point(text: str) -> FloatArray:
     except ValueError:
         xy = np.zeros((1, 0))
     if xy.shape != (1, 2) or not np.isfinite(xy).all():
-        raise SurveyFileError(f"match: --point {text!r}, needed COL,ROW such as 812.5,403")
+        raise SurveyFileError(f"match: --point {text!r}, expected COL,ROW such as 812.5,403")
     return xy
 
 
@@ -139,20 +145,20 @@ def read_task(
     tolerance_mm: float | None = None,
     opposite_signs: bool = False,
 ) -> Task:
-    """Return the points of a photograph from files.
+    """Read the points of one photograph and its interior orientation from files.
 
     Args:
         points_file: CSV with point,X,Y,Z,x_mm,y_mm.
         c_mm: principal distance, mm; not needed if the camera file has it.
-        camera_file: CSV with parameter,value[,...] for c, x0, y0, K1-K3, P1, P2, b1, b2 of `brown`
+        camera_file: CSV with parameter,value[,...] for c, x0, y0, K1-K3, P1, P2, b1, b2 of model `brown`
             (corrections of the measured point, mm).
-        start: "X,Y,Z" or "X,Y,Z,omega,phi,kappa" with angles in deg.
-        tolerance_mm: largest residual that `robust` takes for right, mm; from the data if not given.
-        opposite_signs: whether distortion is subtracted from measured coordinates, as some programs do.
+        start: start values "X,Y,Z" or "X,Y,Z,omega,phi,kappa" with angles in deg.
+        tolerance_mm: largest residual that `robust` accepts as correct, mm; if None, from the data.
+        opposite_signs: whether distortion is subtracted from measured coordinates, as in some programs.
 
     Raises:
-        SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or there
-            is no c.
+        SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or c is not
+            given.
     """
     names, points, xy = _read_points(points_file)
     values = _read_camera(camera_file) if camera_file is not None else {}
@@ -163,8 +169,8 @@ def read_task(
     if "c" not in values:
         raise SurveyFileError("resect: the principal distance is missing, give --c or a camera file with c")
     if not values["c"] > 0:
-        raise SurveyFileError(f"resect: the principal distance is {values['c']:g} mm, it must be positive")
-    # a camera of 1 mm pixels, whose pixel frame serves as the image frame
+        raise SurveyFileError(f"resect: the principal distance is {values['c']:g} mm, expected more than 0")
+    # a camera with pixels of 1 mm, so image coordinates in mm can be converted to its pixel coordinates
     camera = camera_from_values(
         "resect", "brown", (1, 1), (1.0, 1.0), c_mm=values["c"], values=tuple(values.items())
     )
@@ -185,7 +191,7 @@ def _read_camera(path: Path) -> dict[str, float]:
     for line, name in zip(table.line, parameters, strict=True):
         if name not in _CAMERA:
             raise SurveyFileError(
-                f"{path}, line {line}: no parameter '{name}', known are {', '.join(_CAMERA)}"
+                f"{path}, line {line}: unknown parameter '{name}', expected one of {', '.join(_CAMERA)}"
             )
     return dict(zip(parameters, table.values[:, 0].tolist(), strict=True))
 
@@ -198,6 +204,6 @@ def _parse_start(text: str | None) -> FloatArray | None:
     except ValueError:
         values = np.empty(0)
     if len(values) not in (3, 6) or not np.isfinite(values).all():
-        raise SurveyFileError(f"--start '{text}': X,Y,Z or X,Y,Z,omega,phi,kappa (deg) is needed")
+        raise SurveyFileError(f"--start '{text}': expected X,Y,Z or X,Y,Z,omega,phi,kappa (deg)")
     values[3:] = np.radians(values[3:])
     return values

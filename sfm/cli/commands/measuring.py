@@ -1,4 +1,4 @@
-"""Commands about single photographs: match, resect and targets."""
+"""Commands for single photographs: match, resect and targets."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from sfm.textbook.resection import METHODS
 if TYPE_CHECKING:
     from sfm.conventions import IntArray
 NONE_MATCHED = 1  # exit code
-MAX_TARGETS = 10_000  # on one sheet; no family has more codes
+MAX_TARGETS = 10_000  # per sheet; no family has more codes
 
 
 def match(
     left: Annotated[Path, typer.Argument(metavar="LEFT", help="Photograph in which the points are given.")],
-    right: Annotated[Path, typer.Argument(metavar="RIGHT", help="Photograph in which they are looked for.")],
+    right: Annotated[
+        Path, typer.Argument(metavar="RIGHT", help="Photograph in which they are searched for.")
+    ],
     point: Annotated[
         str | None, typer.Option("--point", metavar="COL,ROW", help="One point of LEFT, px.")
     ] = None,
@@ -30,12 +32,17 @@ def match(
         typer.Option("--points", metavar="FILE", help="Table point,x_px,y_px[,x_right_px,y_right_px]."),
     ] = None,
     method: Annotated[
-        str, typer.Option("--method", help="ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift.")
+        str,
+        typer.Option(
+            "--method", help="Method: ncc, lsm (6 affine + 2 radiometric parameters), lsm8 or shift."
+        ),
     ] = "lsm",
     template: Annotated[
-        int, typer.Option("--template", metavar="N", help="Side of the patch, odd, px.")
+        int, typer.Option("--template", metavar="N", help="Width of the template, odd, px.")
     ] = 21,
-    search: Annotated[int, typer.Option("--search", metavar="N", help="Side of the window, px.")] = 121,
+    search: Annotated[
+        int, typer.Option("--search", metavar="N", help="Width of the search window, px.")
+    ] = 121,
     equalise: Annotated[
         bool, typer.Option("--equalise", help="Equalise the histograms before least squares matching.")
     ] = False,
@@ -43,42 +50,54 @@ def match(
         str,
         typer.Option(
             "--interpolation",
-            help="six_tap; bicubic or bilinear where a photograph was itself shifted by interpolation.",
+            help="Interpolation: six_tap, or bicubic or bilinear if a photograph was itself shifted by "
+            "interpolation.",
         ),
     ] = "six_tap",
     min_correlation: Annotated[
-        float, typer.Option("--min-correlation", metavar="R", help="Smallest r of a match, 0 to 1.")
+        float,
+        typer.Option(
+            "--min-correlation", metavar="R", help="Smallest correlation coefficient r of a match, 0 to 1."
+        ),
     ] = 0.7,
     back: Annotated[
         bool,
         typer.Option(
-            "--back/--no-back", help="Whether a match must lead back to within 1 px of where it came from."
+            "--back/--no-back",
+            help="Whether matching from RIGHT to LEFT must lead back to within 1 px of the point.",
         ),
     ] = True,
     wide: Annotated[
         bool,
         typer.Option(
             "--wide/--no-wide",
-            help="Whether points not found are looked for again where key points around them lead, or turned "
-            "by up to 30 degrees and scaled by up to 1.3.",
+            help="Whether points not found are searched for again: at positions predicted by key points "
+            "around them, or rotated by up to 30 degrees and scaled by up to 1.3.",
         ),
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write the table: .csv or .json.")
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Write the table to this file, .csv or .json, instead of printing it.",
+        ),
     ] = None,
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", metavar="FILE.png", help="Picture of template, match and difference."),
+        typer.Option(
+            "--picture", metavar="FILE.png", help="Write a picture of template, match and difference."
+        ),
     ] = None,
 ) -> None:
     """Find conjugate points of two photographs.
 
-    By cross correlation, then least squares matching. A match is ambiguous if the second-best place of the
-    search window has an r that is not lower by more than chance (5 %, by Fisher's z). Without centres of
-    search windows in the table, key points may lead anywhere in RIGHT.
-    Files given with --out and --picture may replace earlier ones of this command, and nothing else. Exit
-    code 1 if no point was matched.
+    Points are matched by cross correlation, then by least squares matching. A match is ambiguous if r at the
+    second-best position of the search window is not significantly lower (5 %, by Fisher's z). If the table
+    has no centres of search windows, key points may lead anywhere in RIGHT.
+
+    --out and --picture replace only files that this command wrote. Exit code 1 if no point was matched.
     """
     with loading():
         from sfm.cli.commands.matching import match_command
@@ -111,11 +130,16 @@ def resect(
     points: Annotated[Path, typer.Argument(metavar="POINTS.csv", help="Table point,X,Y,Z,x_mm,y_mm.")],
     c: Annotated[float | None, typer.Option("--c", metavar="MM", help="Principal distance, mm.")] = None,
     method: Annotated[
-        str, typer.Option("--method", help=f"{', '.join(METHODS)}, or all for a table of them.")
+        str,
+        typer.Option("--method", help=f"Method: {', '.join(METHODS)}, or all for a table of all methods."),
     ] = "robust",
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", metavar="CAMERA.csv", help="Table parameter,value of model brown, mm."),
+        typer.Option(
+            "--camera",
+            metavar="CAMERA.csv",
+            help="Table parameter,value of the interior orientation, model brown, mm.",
+        ),
     ] = None,
     start: Annotated[
         str | None,
@@ -126,18 +150,21 @@ def resect(
         typer.Option(
             "--tolerance",
             metavar="MM",
-            help="Largest residual of a good point for robust, mm; from the data if not given.",
+            help="Largest residual of a correct point for method robust, mm.  [default: from the data]",
         ),
     ] = None,
     opposite_signs: Annotated[
         bool,
-        typer.Option("--opposite-signs", help="Distortion is subtracted from what was measured, not added."),
+        typer.Option(
+            "--opposite-signs",
+            help="Distortion of the camera file is subtracted from measured coordinates, not added.",
+        ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON in place of a table.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Orient one photograph on known points.
+    """Orient one photograph from known points (space resection).
 
-    By any of the methods, or all of them for a comparison.
+    Uses one method, or all methods for a comparison.
     """
     with loading():
         from sfm.cli.commands.matching import read_task
@@ -172,51 +199,57 @@ def resect(
 def targets(
     out: Annotated[
         Path,
-        typer.Option("--out", metavar="FILE", help="Sheet to write: .pdf or .svg; replaces only a sheet."),
+        typer.Option(
+            "--out", metavar="FILE", help="Sheet to write, .pdf or .svg; only another sheet is replaced."
+        ),
     ],
     family: Annotated[
         str,
         typer.Option(
             "--family",
-            help="ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 ...), cctag3, "
-            "cctag4, or a code table file.",
+            help="Code family: ring12, ring14, ring20, arcs, a family of tags (apriltag36h11, aruco4x4_50 "
+            "...), cctag3, cctag4, or a code table file.",
         ),
     ] = "ring14",
     ids: Annotated[
         str | None,
-        typer.Option("--ids", metavar="A-B,C", help="Code numbers, each once; the first 100 of the family."),
+        typer.Option(
+            "--ids",
+            metavar="A-B,C",
+            help="Code numbers, each once.  [default: the first 100 of the family]",
+        ),
     ] = None,
     diameter: Annotated[
         float,
         typer.Option(
             "--diameter-mm",
             metavar="MM",
-            help="Diameter of the dot, at least 1 mm; of cctag3 and cctag4 "
-            "that of the outer edge; of square tags the side.",
+            help="Diameter of the dot, at least 1 mm. For cctag3 and cctag4, diameter of the outer edge; for "
+            "square tags, length of a side.",
         ),
     ] = 10.0,
-    page: Annotated[str, typer.Option("--page", help="a4, a3, letter ...")] = "a4",
-    bright: Annotated[bool, typer.Option("--bright", help="White targets on dark squares.")] = False,
+    page: Annotated[str, typer.Option("--page", help="Page size: a4, a3, letter ...")] = "a4",
+    bright: Annotated[bool, typer.Option("--bright", help="Print white targets on dark squares.")] = False,
     ring_radii: Annotated[
         str | None,
         typer.Option(
             "--ring-radii",
             metavar="R1,R2",
-            help="Inner and outer radius of rings (not tags), in radii of the dot.",
+            help="Inner and outer radius of the code ring (not for tags), in radii of the dot.",
         ),
     ] = None,
 ) -> None:
     """Write a sheet of coded targets for printing.
 
-    It is in true scale and has a ruler to check the print.
+    The sheet is drawn to scale and has a ruler to check the print.
     """
     with loading():
         from sfm.printing.sheet import lay_out_sheet, write_sheet
 
-    radii = None if ring_radii is None else _two(ring_radii)
+    radii = None if ring_radii is None else _parse_two_numbers(ring_radii)
     sheet = lay_out_sheet(
         family,
-        None if ids is None else _numbers(ids),
+        None if ids is None else _parse_ids(ids),
         diameter_mm=diameter,
         page=page,
         dark=not bright,
@@ -226,17 +259,17 @@ def targets(
         print(path)
 
 
-def _two(text: str) -> tuple[float, float]:
-    """Return the two numbers of `2,3`."""
+def _parse_two_numbers(text: str) -> tuple[float, float]:
+    """Return the two numbers in a text such as `2,3`."""
     try:
         first, second = (float(part) for part in text.split(","))
     except ValueError as error:
-        raise SurveyFileError(f"--ring-radii {text}: needed two numbers such as 2,3") from error
+        raise SurveyFileError(f"--ring-radii {text}: expected two numbers such as 2,3") from error
     return first, second
 
 
-def _numbers(text: str) -> IntArray:
-    """Return the code numbers that `1-100,205` names."""
+def _parse_ids(text: str) -> IntArray:
+    """Return the code numbers in a text such as `1-100,205`."""
     import numpy as np
 
     numbers: list[int] = []
@@ -247,7 +280,7 @@ def _numbers(text: str) -> IntArray:
         begin, end = int(first), int(last if dash else first)
         if end < begin or end - begin >= MAX_TARGETS or len(numbers) + end - begin >= MAX_TARGETS:
             raise SurveyFileError(
-                f"--ids {text}: '{part}' must run upwards, a sheet has at most {MAX_TARGETS} targets"
+                f"--ids {text}: '{part}' must ascend, and a sheet has at most {MAX_TARGETS} targets"
             )
         numbers += range(begin, end + 1)
     return np.array(numbers, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Commands around a survey: plan, targets of a plan, simulate, and photographs to add."""
+"""Commands that plan a survey: target size, network, simulation, and photographs to add."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from sfm.cli.commands.planning_inputs import (
     PlannedSetup,
     bars_of,
     camera_of,
-    numbers,
     object_of,
+    parse_numbers,
     stations_of,
     survey_plan,
 )
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sfm.conventions import FloatArray
     from sfm.planning.visibility import DepthOfField
 
-MAX_WEAK = 5  # points that the terminal names
+MAX_WEAK = 5  # weak points listed on the terminal
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
 
@@ -42,20 +42,21 @@ def target_size_command(
     distance: Annotated[
         float,
         typer.Option(
-            "--distance", metavar="D", help="Farthest distance of the camera, in the unit of --unit."
+            "--distance", metavar="D", help="Largest distance from the camera, in the unit of --unit."
         ),
     ],
     c: Annotated[float, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")],
     width: Annotated[float, typer.Option("--sensor-width-mm", metavar="MM", help="Width of the sensor, mm.")],
     columns: Annotated[int, typer.Option("--width-px", metavar="N", help="Width of the photographs, px.")],
     pixels: Annotated[
-        float, typer.Option("--pixels", metavar="P", help="Pixels across a target, at least.")
+        float, typer.Option("--pixels", metavar="P", help="Smallest number of pixels across a target.")
     ] = MIN_PIXELS,
     tilt: Annotated[
-        float, typer.Option("--tilt-deg", metavar="DEG", help="Largest tilt of a target to its ray, deg.")
+        float,
+        typer.Option("--tilt-deg", metavar="DEG", help="Largest tilt of a target from its ray, degrees."),
     ] = 0.0,
     family: Annotated[
-        str, typer.Option("--family", help="Rings around the dots: ring12, ring14, ring20 or arcs.")
+        str, typer.Option("--family", help="Code family: ring12, ring14, ring20 or arcs.")
     ] = "ring14",
     unit: Annotated[
         str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, nm, in or ft.")
@@ -63,13 +64,15 @@ def target_size_command(
     diagram: Annotated[
         Path | None,
         typer.Option(
-            "--diagram", metavar="FILE.svg", help="Diameter over the distance as a diagram, up to --distance."
+            "--diagram",
+            metavar="FILE.svg",
+            help="Write a diagram of the diameter against the distance, up to --distance.",
         ),
     ] = None,
 ) -> None:
     """Compute how large targets must be for a camera and a distance.
 
-    diameter = pixels x sensor width x distance / (c x photograph width), over the cosine of the tilt.
+    diameter = pixels x sensor width x distance / (c x photograph width x cosine of the tilt)
     """
     with loading():
         from sfm.conventions import METRES
@@ -86,12 +89,12 @@ def target_size_command(
         raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
     if METRES[unit] * distance <= c / 1000:
         raise SurveyFileError(
-            f"--distance {distance:g} {unit}: not farther than the principal distance of {c:g} mm; expected "
-            "that of the object, in another unit with --unit"
+            f"--distance {distance:g} {unit}: not larger than the principal distance of {c:g} mm; expected "
+            "the distance of the object; --unit sets its unit"
         )
     codes = code_family(family)
     if not isinstance(codes, CodeFamily):
-        raise SurveyFileError(f"--family {family}: needed rings, such as ring14")
+        raise SurveyFileError(f"--family {family}: expected a family of rings, such as ring14")
     size = compute_target_size(
         p=pixels, w_mm=width, d=distance, c_mm=c, n=columns, tilt_deg=tilt, ring_per_dot=codes.outer
     )
@@ -125,7 +128,7 @@ def network_command(
         typer.Option(
             "--camera",
             metavar="CAMERA",
-            help="Survey file, result folder, or a camera of the list, such as full-frame-24.",
+            help="Survey file, result folder, or a listed camera, such as full-frame-24.",
         ),
     ] = None,
     survey: Annotated[
@@ -133,28 +136,32 @@ def network_command(
         typer.Option(
             "--survey",
             metavar="FILE.toml",
-            help="Planned survey: its cameras, rig, scale bars and survey observations, in place of "
-            "--camera. Values of its tables are not used.",
+            help="Planned survey with cameras, rig, scale bars and survey observations, instead of --camera. "
+            "The observed values in its tables are not used.",
         ),
     ] = None,
     free_mounts: Annotated[
-        bool, typer.Option("--free-mounts", help="Mounts of the rig are to be found, not given.")
+        bool, typer.Option("--free-mounts", help="Estimate the mounts of the rig; they are not given.")
     ] = False,
     c: Annotated[
         float | None, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")
     ] = None,
     camera_name: Annotated[
-        str | None, typer.Option("--camera-name", metavar="NAME", help="Which of several cameras.")
+        str | None,
+        typer.Option("--camera-name", metavar="NAME", help="Which camera, if --camera has several."),
     ] = None,
     free: Annotated[
         str | None,
-        typer.Option("--free", metavar="P,Q,...", help="Camera parameters to be adjusted, or none."),
+        typer.Option("--free", metavar="P,Q,...", help="Camera parameters to adjust, or none."),
     ] = None,
     unit: Annotated[
         str, typer.Option("--unit", help="Unit of lengths: km, m, dm, cm, mm, um, nm, in or ft.")
     ] = "mm",
     points: Annotated[
-        int, typer.Option("--points", metavar="N", min=3, max=20000, help="Points on a mesh or a shape.")
+        int,
+        typer.Option(
+            "--points", metavar="N", min=3, max=20000, help="Number of points on a mesh or a shape."
+        ),
     ] = 200,
     open_mesh: Annotated[
         bool, typer.Option("--open-mesh", help="The mesh is an open surface, seen from outside.")
@@ -165,67 +172,95 @@ def network_command(
             "--stations",
             metavar="STATIONS",
             help="CSV (image,X,Y,Z,omega_deg,phi_deg,kappa_deg) or ring:N, two-rings:N, hemisphere:N, "
-            "strips:NxM, four-stations, left-right, front-back.  [default: designed for what is wanted]",
+            "strips:NxM, four-stations, left-right, front-back.  [default: designed for the wanted "
+            "precision]",
         ),
     ] = None,
     sigma: Annotated[
-        float | None, typer.Option("--sigma", metavar="S", help="Wanted: sigma of every point.")
+        float | None, typer.Option("--sigma", metavar="S", help="Wanted sigma of every point.")
     ] = None,
     length_sigma: Annotated[
-        float | None, typer.Option("--length-sigma", metavar="S", help="Wanted: sigma of every length.")
+        float | None, typer.Option("--length-sigma", metavar="S", help="Wanted sigma of every length.")
     ] = None,
     displacement: Annotated[
         float | None,
-        typer.Option("--displacement", metavar="D", help="Wanted: displacement found between two surveys."),
+        typer.Option(
+            "--displacement", metavar="D", help="Smallest displacement to be detected between two surveys."
+        ),
     ] = None,
     sigma_px: Annotated[
         float | None,
-        typer.Option("--sigma-px", metavar="PX", help="Of an image coordinate.  [default: from the targets]"),
+        typer.Option(
+            "--sigma-px",
+            metavar="PX",
+            help="Standard deviation of an image coordinate, px.  [default: from the targets]",
+        ),
     ] = None,
     diameter: Annotated[
-        float | None, typer.Option("--target-diameter", metavar="D", help="Of the targets.")
+        float | None, typer.Option("--target-diameter", metavar="D", help="Diameter of the targets.")
     ] = None,
     contrast: Annotated[
-        float, typer.Option("--contrast", help="Grey values between target and surroundings.")
+        float, typer.Option("--contrast", help="Difference of grey values between target and surroundings.")
     ] = 120.0,
     noise: Annotated[float, typer.Option("--noise", help="Standard deviation of a grey value.")] = 2.0,
-    blur: Annotated[float, typer.Option("--blur-px", help="Standard deviation of an edge, px.")] = 0.8,
+    blur: Annotated[
+        float, typer.Option("--blur-px", help="Blur of an edge, as a standard deviation, px.")
+    ] = 0.8,
     incidence: Annotated[
-        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the normal.")
+        float,
+        typer.Option(
+            "--max-incidence-deg",
+            metavar="DEG",
+            help="Largest angle between a ray and the normal of a point, degrees.",
+        ),
     ] = 60.0,
     f_number: Annotated[
-        float | None, typer.Option("--f-number", metavar="N", help="For the depth of field; needs --focus.")
+        float | None,
+        typer.Option("--f-number", metavar="N", help="F-number for the depth of field; needs --focus."),
     ] = None,
     focus: Annotated[
         float | None, typer.Option("--focus", metavar="D", help="Focus distance, in the unit of --unit.")
     ] = None,
     confusion: Annotated[
         float | None,
-        typer.Option("--confusion-um", metavar="UM", help="Circle of confusion.  [default: two pixels]"),
+        typer.Option(
+            "--confusion-um",
+            metavar="UM",
+            help="Diameter of the circle of confusion, um.  [default: two pixels]",
+        ),
     ] = None,
     distance: Annotated[
-        str | None, typer.Option("--distance", metavar="MIN,MAX", help="Range of stations from points.")
+        str | None,
+        typer.Option("--distance", metavar="MIN,MAX", help="Allowed distances of stations from points."),
     ] = None,
     space: Annotated[
-        str | None, typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Region of stations.")
+        str | None,
+        typer.Option("--space", metavar="X0,X1,Y0,Y1,Z0,Z1", help="Region in which stations may lie."),
     ] = None,
-    floor: Annotated[float | None, typer.Option("--floor", metavar="Z", help="Lowest station.")] = None,
+    floor: Annotated[
+        float | None, typer.Option("--floor", metavar="Z", help="Smallest Z of a station.")
+    ] = None,
     photographs: Annotated[
-        int, typer.Option("--photographs", metavar="N", min=4, max=1000, help="Photographs at most.")
+        int,
+        typer.Option("--photographs", metavar="N", min=4, max=1000, help="Largest number of photographs."),
     ] = 60,
     scale_bar: Annotated[
         list[str] | None,
-        typer.Option("--scale-bar", metavar="FROM,TO,SIGMA", help="Scale bar between two points."),
+        typer.Option(
+            "--scale-bar",
+            metavar="FROM,TO,SIGMA",
+            help="Scale bar between two points and its sigma; may be given several times.",
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of page and tables.")] = Path(
-        "out/plan"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")
+    ] = Path("out/plan"),
 ) -> None:
     """Predict the precision of a network, or design a network.
 
-    Predicted standard deviations of points, weak points with the reason, whether the camera can be
-    calibrated, a page with the stations in space, and a list of photographs to take along. Lengths in the
-    unit of --unit.
+    Reports predicted standard deviations of the points, weak points with the reason, and whether the camera
+    can be calibrated. Writes a page that shows the stations in space, and a list of the photographs to take.
+    Lengths are in the unit of --unit.
     """
     with loading():
         from sfm.cli.console import print_verdict
@@ -246,17 +281,16 @@ def network_command(
     wanted = WantedPrecision(sigma, length_sigma, displacement)
     if stations is None and not wanted.anything:
         raise SurveyFileError(
-            "plan: neither --stations nor what is wanted; needed one of --stations, --sigma, "
-            "--length-sigma and --displacement"
+            "plan: expected --stations, or a wanted precision by --sigma, --length-sigma or --displacement"
         )
     if sigma_px is None and diameter is None:
         raise SurveyFileError(
-            "plan: needed --sigma-px or --target-diameter, which state how precise image points are"
+            "plan: expected --sigma-px or --target-diameter, which determine the precision of image points"
         )
     if (camera is None) == (survey is None):
-        raise SurveyFileError("plan: needed --camera or --survey, one of them")
+        raise SurveyFileError("plan: expected either --camera or --survey")
     if survey is not None and any(one is not None for one in (c, camera_name, free)):
-        raise SurveyFileError(f"--survey {survey}: --c-mm, --camera-name and --free are for --camera")
+        raise SurveyFileError(f"--survey {survey}: --c-mm, --camera-name and --free belong to --camera")
     to_mm = METRES[unit] * 1000
     with working_on(planned), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
         object_ = object_of(planned, points, open_mesh=open_mesh)
@@ -265,7 +299,7 @@ def network_command(
         else:
             taken = PlannedSetup((camera_of(str(camera), camera_name, c, free),))
         one = taken.reference
-        depth = _depth(one, f_number, focus, confusion, to_mm)
+        depth = _depth_of_field(one, f_number, focus, confusion, to_mm)
         seeing = Seeing(
             max_incidence_deg=incidence,
             diameter=diameter,
@@ -286,8 +320,8 @@ def network_command(
         else:
             taken.refuse_to_design()
             allowed = StationLimits(
-                None if distance is None else _two(numbers("--distance", distance, 2)),
-                None if space is None else _space(space),
+                None if distance is None else _pair(parse_numbers("--distance", distance, 2)),
+                None if space is None else _parse_space(space),
                 floor,
             )
             design = design_network(
@@ -304,18 +338,18 @@ def network_command(
     for weak in found.weak[:MAX_WEAK]:
         print(f"  weak: point {weak.name}: {weak.reason}")
     if len(found.weak) > MAX_WEAK:
-        print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, in the page")
+        print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, listed in the page")
     print(f"Report: {page}")
 
 
-def _depth(
+def _depth_of_field(
     camera: Camera, f_number: float | None, focus: float | None, confusion_um: float | None, to_mm: float
 ) -> DepthOfField | None:
-    """Return the depth of field in the object unit; None where no aperture is given."""
+    """Return the depth of field in the object unit, or None if no f-number is given."""
     from sfm.planning.visibility import DepthOfField, Lens, depth_of_field
 
     if (f_number is None) != (focus is None):
-        raise SurveyFileError("plan: --f-number and --focus are needed together for the depth of field")
+        raise SurveyFileError("plan: the depth of field needs both --f-number and --focus")
     if f_number is None or focus is None:
         return None
     pixel = float(camera.pixel_mm.mean())
@@ -324,31 +358,32 @@ def _depth(
     return DepthOfField(found.near / to_mm, found.far / to_mm, focus)
 
 
-def _two(values: tuple[float, ...]) -> tuple[float, float]:
+def _pair(values: tuple[float, ...]) -> tuple[float, float]:
     return values[0], values[1]
 
 
-def _space(text: str) -> FloatArray:
+def _parse_space(text: str) -> FloatArray:
     import numpy as np
 
-    return np.array(numbers("--space", text, 6)).reshape(3, 2).T
+    return np.array(parse_numbers("--space", text, 6)).reshape(3, 2).T
 
 
 def simulate_command(
-    folder: Annotated[Path, typer.Argument(metavar="PLAN", help="Folder that `plan network` has written.")],
-    codes: Annotated[str, typer.Option("--family", help="Rings of the coded targets.")] = "ring14",
+    folder: Annotated[Path, typer.Argument(metavar="PLAN", help="Folder written by `plan network`.")],
+    codes: Annotated[str, typer.Option("--family", help="Code family of the targets.")] = "ring14",
     image_points: Annotated[
-        bool, typer.Option("--image-points", help="Simulate image points in place of photographs.")
+        bool, typer.Option("--image-points", help="Simulate image points instead of photographs.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the noise.")] = 0,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of photographs, survey file and result.")
+        Path,
+        typer.Option("--out", metavar="DIR", help="Folder for the photographs, survey file and result."),
     ] = Path("out/simulation"),
 ) -> None:
-    """Photograph a plan by rendering, run the survey, and compare it.
+    """Render the photographs of a plan, run the survey, and compare it with the prediction.
 
-    Its points become targets, its rig, scale bars and observations have errors as planned; predicted standard
-    deviations are beside those achieved and the true errors.
+    The points become targets; the rig, scale bars and observations have errors as planned. Predicted standard
+    deviations are compared with the achieved ones and with the true errors.
     """
     with loading():
         from sfm.api import run_survey
@@ -382,18 +417,24 @@ def simulate_command(
 def more_command(
     result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
     count: Annotated[
-        int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new ones.")
+        int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new photographs.")
     ] = 3,
     incidence: Annotated[
-        float, typer.Option("--max-incidence-deg", metavar="DEG", help="Largest angle to the mean ray.")
+        float,
+        typer.Option(
+            "--max-incidence-deg",
+            metavar="DEG",
+            help="Largest angle between a new ray and the mean ray of a point, degrees.",
+        ),
     ] = 60.0,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of page and tables.")] = Path(
-        "out/more"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")
+    ] = Path("out/more"),
 ) -> None:
-    """Propose further photographs that help the weakest points.
+    """Propose further photographs that improve the weakest points.
 
-    They are taken from about as far as those of the survey; what hides points there is not known.
+    The proposed stations are about as far from the object as those of the survey. Obstacles that hide points
+    from there are not known.
     """
     with loading():
         import numpy as np

@@ -1,6 +1,6 @@
-"""Input of the commands of planning: object, cameras, stations, and lists of numbers.
+"""Inputs of the planning commands: object, cameras, stations, scale bars, and a planned survey.
 
-Source: sizes of sensors and photographs as the makers state them; Nikon D60 as in document 000, sec. 2.5.1.
+Source: sizes of sensors and photographs as stated by the makers; Nikon D60 as in document 000, sec. 2.5.1.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ SENSORS = {
     "machine-vision-12": ((4096, 3000), (14.131, 10.35)),
     "nikon-d60": ((3872, 2592), (23.6, 15.8)),
 }
-"""width and height of the photographs, px, and of the sensor, mm"""
+"""Width and height of the photographs, px, and of the sensor, mm."""
 NORMALS = ("nX", "nY", "nZ")
 
 
 def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
-    """Return the object of a plan: a CSV of points, a mesh, or a shape with its sizes.
+    """Return the object of a plan: points of a CSV file, a mesh, or a shape with given sizes.
 
     Args:
-        text: path, or such as box:2,1,0.5.
-        count: points on a mesh or a shape.
-        open_mesh: whether a mesh may have edges of one triangle only.
+        text: path, or a shape such as box:2,1,0.5.
+        count: number of points on a mesh or a shape.
+        open_mesh: whether a mesh may have edges that belong to one triangle only.
 
     Raises:
-        KolinearError: what was found, and what was expected.
+        KolinearError: the message states what was found and what was expected.
     """
     from adapters.formats.mesh import read_mesh
     from sfm.geometry.tolerance import Mesh
@@ -56,7 +56,7 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
 
     kind, colon, sizes = text.partition(":")
     if colon and kind in SHAPES:
-        return shape_object(kind, numbers("OBJECT", sizes), count)
+        return shape_object(kind, parse_numbers("OBJECT", sizes), count)
     path = Path(text)
     if path.suffix.lower() in (".stl", ".ply"):
         vertices, triangles = read_mesh(path)
@@ -74,16 +74,16 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
 
 
 def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None) -> Camera:
-    """Return the camera of a plan: one of the list, of a survey file, or as a result calibrated it.
+    """Return the camera of a plan: a listed camera, a camera of a survey file, or a calibrated camera.
 
     Args:
-        text: name in the list, survey file, or result folder.
-        name: of one of several cameras.
-        c_mm: principal distance, in place of what is there, mm.
-        free: parameters to adjust, separated by commas, or none; as the camera has them if not given.
+        text: name of a listed camera, survey file, or result folder.
+        name: camera name, if there are several cameras.
+        c_mm: principal distance that replaces the stored one, mm.
+        free: parameters to adjust, separated by commas, or "none"; if None, those of the camera.
 
     Raises:
-        KolinearError: what was found, and what was expected.
+        KolinearError: the message states what was found and what was expected.
     """
     import numpy as np
 
@@ -91,9 +91,9 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
     if path.is_dir():
         from adapters.formats.result_tables import read_result
 
-        camera = _one_of(text, read_result(path).estimate.cameras, name)
+        camera = _choose_camera(text, read_result(path).estimate.cameras, name)
     elif path.suffix.lower() == ".toml":
-        camera = _of_survey(path, name, c_mm)
+        camera = _camera_of_survey(path, name, c_mm)
     else:
         camera = listed_camera(text, c_mm)
     if c_mm is not None:
@@ -102,7 +102,7 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
                 f"--c-mm {c_mm:g}: camera {camera.name} ({camera.model}) has its principal distance in px"
             )
         if not (math.isfinite(c_mm) and c_mm > 0):
-            raise SurveyFileError(f"--c-mm {c_mm:g}: needed more than 0")
+            raise SurveyFileError(f"--c-mm {c_mm:g}: expected more than 0")
         parameters = camera.parameters.copy()
         parameters[0] = c_mm
         camera = camera.with_parameters(parameters)
@@ -118,10 +118,15 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
 
 
 def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
-    """Return given stations: a CSV of exterior orientation, or an arrangement such as ring:12.
+    """Return the given stations: exterior orientations of a CSV file, or an arrangement such as ring:12.
+
+    Args:
+        text: path, or name of an arrangement.
+        planned: the object.
+        camera: camera of the arrangement.
 
     Raises:
-        KolinearError: what was found, and what was expected.
+        KolinearError: the message states what was found and what was expected.
     """
     import numpy as np
 
@@ -139,7 +144,7 @@ def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
 
 
 def bars_of(texts: list[str] | None) -> tuple[ScaleBarPlan, ...]:
-    """Return scale bars given as FROM,TO,SIGMA."""
+    """Return the scale bars of texts FROM,TO,SIGMA."""
     from sfm.planning.prediction import ScaleBarPlan
 
     found = []
@@ -147,20 +152,20 @@ def bars_of(texts: list[str] | None) -> tuple[ScaleBarPlan, ...]:
         parts = [part.strip() for part in text.split(",")]
         if len(parts) != 3:
             raise SurveyFileError(f"--scale-bar {text:.60}: expected FROM,TO,SIGMA")
-        found.append(ScaleBarPlan(parts[0], parts[1], numbers("--scale-bar", parts[2], 1)[0]))
+        found.append(ScaleBarPlan(parts[0], parts[1], parse_numbers("--scale-bar", parts[2], 1)[0]))
     return tuple(found)
 
 
-def numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]:
-    """Return numbers separated by commas.
+def parse_numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]:
+    """Return the numbers of a text, which are separated by commas.
 
     Args:
-        what: they are given as, for messages.
+        what: name of the option or argument, for messages.
         text: the numbers.
-        count: how many are expected; any if None.
+        count: expected count; None for any.
 
     Raises:
-        SurveyFileError: another number of them, or no finite numbers.
+        SurveyFileError: there are more or fewer numbers than expected, or a value is not a finite number.
     """
     try:
         found = tuple(float(part) for part in text.split(","))
@@ -172,11 +177,11 @@ def numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]
     return found
 
 
-def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera:
+def _choose_camera(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera:
     names = [camera.name for camera in cameras]
     if name is None and len(cameras) > 1:
         raise SurveyFileError(
-            f"{where}: {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
+            f"{where}: has {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
             "--camera-name"
         )
     found = [camera for camera in cameras if name in (None, camera.name)]
@@ -185,30 +190,30 @@ def _one_of(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera
     return found[0]
 
 
-def _of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
+def _camera_of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
     from sfm.survey.inputs.survey import read_survey
 
     setups = read_survey(path).cameras
     found = [one for one in setups if name in (None, one.name)]
     if len(found) != 1:
         names = ", ".join(one.name for one in setups)
-        raise SurveyFileError(f"{path}: cameras {names:.80}, choose one of them with --camera-name")
-    return _of_settings(path, found[0], c_mm)
+        raise SurveyFileError(f"{path}: has cameras {names:.80}, choose one with --camera-name")
+    return _camera_of_settings(path, found[0], c_mm)
 
 
-def _of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> Camera:
+def _camera_of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> Camera:
     from sfm.camera import camera_from_values
 
     c = c_mm if c_mm is not None else one.c_mm
     if c is None:
-        raise SurveyFileError(f"{path}: camera {one.name} has no focal length, needed c_mm there or --c-mm")
+        raise SurveyFileError(f"{path}: camera {one.name} has no focal length, expected c_mm or --c-mm")
     pixel = one.pixel_mm
     if pixel is None and one.sensor_mm is not None and one.size_px is not None:
         pixel = (one.sensor_mm[0] / one.size_px[0], one.sensor_mm[1] / one.size_px[1])
     if one.size_px is None or pixel is None:
         raise SurveyFileError(
-            f"{path}: camera {one.name} has no size_px or no pixel_mm; a plan has no photographs to "
-            "take them from"
+            f"{path}: camera {one.name} needs size_px and pixel_mm, as a plan has no photographs that "
+            "state them"
         )
     return camera_from_values(
         one.name, one.model, one.size_px, pixel, c_mm=c, free=one.may_be_free, values=(*one.fixed, *one.start)
@@ -217,7 +222,7 @@ def _of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> 
 
 @dataclass(frozen=True)
 class PlannedSetup:
-    """Cameras of a plan, and what is observed beside image points."""
+    """Cameras and rig of a plan, and the observations in addition to image points."""
 
     cameras: tuple[Camera, ...]
     rig: Mounts | None = None
@@ -227,14 +232,14 @@ class PlannedSetup:
 
     @property
     def reference(self) -> Camera:
-        """The camera, of a rig the one that stations are of."""
+        """The only camera, or the reference camera of a rig, to which stations refer."""
         return self.cameras[0 if self.rig is None else int(self.rig.at_reference.argmax())]
 
     def photographs(self, stations: Stations) -> Stations:
-        """Return the photographs of all cameras at stations.
+        """Return the photographs that all cameras take at the stations.
 
         Raises:
-            SurveyFileError: an observation of a photograph that is not among them.
+            SurveyFileError: an observation refers to a photograph that is not among them.
         """
         if self.rig is not None:
             stations = stations.with_rig(self.rig, self.cameras)
@@ -248,10 +253,10 @@ class PlannedSetup:
         return stations
 
     def refuse_to_design(self) -> None:
-        """Refuse what needs stations that are given.
+        """Refuse to design stations where they must be given.
 
         Raises:
-            SurveyFileError: a rig, or observations of photographs.
+            SurveyFileError: the plan has a rig or observations of photographs.
         """
         if self.rig is not None or self._tables_of_photographs():
             raise SurveyFileError("plan: a rig or observations of photographs need --stations")
@@ -264,17 +269,17 @@ class PlannedSetup:
 
 
 def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: bool) -> PlannedSetup:
-    """Return cameras, rig, scale bars and observations of a planned survey.
+    """Return the cameras, rig, scale bars and observations of a planned survey.
 
     Args:
         path: survey file.
         planned: the object.
-        unit: of lengths, of the plan.
-        free_mounts: whether mounts are to be found, so that those given are only where they are planned.
+        unit: unit of lengths of the plan.
+        free_mounts: whether mounts are estimated; the given mounts then only state where they are planned.
 
     Raises:
-        SurveyFileError: another unit of lengths, no rig of all cameras, or an observation of points that the
-            object has not.
+        SurveyFileError: the survey has another unit of lengths, not all cameras form one rig, or an
+            observation refers to points that the object does not have.
     """
     import numpy as np
 
@@ -286,8 +291,8 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
 
     survey = read_survey(path)
     if survey.unit != unit:
-        raise SurveyFileError(f"{path}: unit '{survey.unit}', the plan is in '{unit}'; see --unit")
-    cameras = tuple(_of_settings(path, one) for one in survey.cameras)
+        raise SurveyFileError(f"{path}: has unit '{survey.unit}', but the plan has '{unit}'; see --unit")
+    cameras = tuple(_camera_of_settings(path, one) for one in survey.cameras)
     rig = None if len(cameras) == 1 and not survey.rigs else planned_mounts(survey)
     if rig is not None and free_mounts:
         rig = replace(rig, free=np.tile(~rig.at_reference[:, None], (1, 6)))
@@ -307,18 +312,18 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
 
 
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2")
-"""what a self-calibrating adjustment usually determines"""
+"""Parameters that a self-calibrating adjustment usually determines."""
 
 
 def listed_camera(name: str, c_mm: float | None) -> Camera:
-    """Return a camera of the list with a lens without distortion, its interior orientation to be adjusted.
+    """Return a listed camera with a distortion-free lens, whose interior orientation is adjusted.
 
     Args:
-        name: in SENSORS.
+        name: key of SENSORS.
         c_mm: principal distance, mm.
 
     Raises:
-        GeometryError: another name, or no principal distance.
+        GeometryError: the name is not listed, or there is no principal distance.
     """
     from sfm.camera import camera_from_values
 
@@ -327,7 +332,7 @@ def listed_camera(name: str, c_mm: float | None) -> Camera:
             f"camera '{name:.60}': expected a survey file, a result folder or one of {', '.join(SENSORS)}"
         )
     if c_mm is None:
-        raise GeometryError(f"camera {name}: no focal length, needed --c-mm")
+        raise GeometryError(f"camera {name}: no focal length, expected --c-mm")
     size, sensor = SENSORS[name]
     pixel = (sensor[0] / size[0], sensor[1] / size[1])
     return camera_from_values(name, "brown", size, pixel, c_mm=c_mm, free=FREE)

@@ -1,7 +1,4 @@
-"""Commands about solutions: validate, compare, epochs and convert.
-
-The command refine: key points of a COLMAP model measured anew.
-"""
+"""Commands for solutions: validate, compare, convert, epochs and refine."""
 
 from __future__ import annotations
 
@@ -19,20 +16,24 @@ from sfm.runtime.faults import working_on
 if TYPE_CHECKING:
     from sfm.epochs.differences import Epoch
 
-WORSE = 1  # exit code where the in-house adjuster was ever the worse one
+WORSE = 1  # exit code if Kolinear's adjuster was the worse one on any network
 
 
 def validate(
-    networks: Annotated[int, typer.Option("--networks", metavar="N", min=1, help="Random networks.")] = 50,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Of the random numbers.")] = 1,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
-        "out/validation"
-    ),
-    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Networks at a time.")] = 2,
+    networks: Annotated[
+        int, typer.Option("--networks", metavar="N", min=1, help="Number of random networks.")
+    ] = 50,
+    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the random numbers.")] = 1,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
+    ] = Path("out/validation"),
+    jobs: Annotated[
+        int, typer.Option("--jobs", metavar="N", min=1, help="Number of networks processed at a time.")
+    ] = 2,
 ) -> None:
     """Compare the adjuster with COLMAP's on random networks.
 
-    Exit code 1 if the in-house adjuster was ever the worse one.
+    Exit code 1 if Kolinear's adjuster was worse on any network.
     """
     with loading():
         from adapters.colmap.adjuster import ColmapBackend, load_pycolmap
@@ -42,7 +43,7 @@ def validate(
         from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress_bar import drawn_progress
 
-    load_pycolmap()  # without it there is nothing to compare, which is no verdict on a network
+    load_pycolmap()  # a missing library is reported here and not as a verdict on a network
     refuse_foreign_folder(out)
     with drawn_progress() as progress:
         found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
@@ -57,24 +58,26 @@ def validate(
 
 def compare(
     a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare it with.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare with A.")],
     align: Annotated[
-        str, typer.Option("--align", help="B is aligned to A by points, cameras, control or none.")
+        str, typer.Option("--align", help="Align B to A by points, cameras, control or none.")
     ] = "points",
     control: Annotated[
         str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
     ] = "",
     a_format: Annotated[
-        str | None, typer.Option("--from-a", metavar="F", help="Format of A; by default from its content.")
+        str | None, typer.Option("--from-a", metavar="F", help="Format of A.  [default: by its content]")
     ] = None,
-    b_format: Annotated[str | None, typer.Option("--from-b", metavar="F", help="Format of B.")] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of table, JSON and page.")] = Path(
-        "out/comparison"
-    ),
+    b_format: Annotated[
+        str | None, typer.Option("--from-b", metavar="F", help="Format of B.  [default: by its content]")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
+    ] = Path("out/comparison"),
 ) -> None:
     """Compare two results.
 
-    Differences, their standard deviations, and which of them are significant.
+    Reports differences, their standard deviations, and which differences are significant.
     """
     with loading():
         from adapters.formats.registry import read_comparable
@@ -115,26 +118,32 @@ def convert(
         typer.Option(
             "--to",
             metavar="F",
-            help="Format to write; else by the ending of OUT: .xml metashape, .ply ply, .db colmap-database, "
-            "none tables.",
+            help="Format to write.  [default: by the ending of OUT: .xml metashape, .ply ply, .db "
+            "colmap-database, none tables]",
         ),
     ] = None,
     from_format: Annotated[
-        str | None, typer.Option("--from", metavar="F", help="Format to read; by default from its content.")
+        str | None,
+        typer.Option("--from", metavar="F", help="Format to read.  [default: by the content of IN]"),
     ] = None,
     straighten: Annotated[
-        bool, typer.Option("--undistort", help="Correct image points for distortion, for formats without it.")
+        bool,
+        typer.Option(
+            "--undistort", help="Correct image points for distortion, for formats without distortion."
+        ),
     ] = False,
     control: Annotated[
         Path | None,
-        typer.Option("--control", metavar="FILE", help="Control of a PhotoModeler export, id,label,X,Y,Z..."),
+        typer.Option(
+            "--control", metavar="FILE", help="Control points of a PhotoModeler export: id,label,X,Y,Z..."
+        ),
     ] = None,
 ) -> None:
     """Convert a survey from one program's format to another's.
 
-    A camera is converted where the format lacks its model. Formats: colmap, colmap-text, colmap-database,
-    tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig (calibration files of rigs
-    for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
+    A camera whose model the format lacks is converted to one that it has. Formats: colmap, colmap-text,
+    colmap-database, tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig (calibration
+    files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
     """
     with loading():
         from adapters.formats.content import with_cameras
@@ -182,7 +191,7 @@ def convert(
         print(f"{source}: {note}")
     print(f"{target}: {written(form.name, network, estimate)} as {form.name}")
     for loss in losses_in_words(form.name, content, gone):
-        print(f"{target}: {loss} left out, format {form.name} has no place for them")
+        print(f"{target}: {loss} left out, format {form.name} cannot store them")
 
 
 def epochs(
@@ -190,7 +199,8 @@ def epochs(
         list[Path],
         typer.Argument(
             metavar="FIRST SECOND ...",
-            help="Result folders in their order; a survey file is run first, its result goes to out/NAME.",
+            help="Result folders in chronological order. A survey file is run first, with its result in "
+            "out/NAME.",
         ),
     ],
     reference: Annotated[
@@ -198,7 +208,7 @@ def epochs(
         typer.Option(
             "--reference",
             metavar="P,Q,...",
-            help="Points taken as stable until a test shows otherwise: names, patterns such as R*, ranges "
+            help="Points assumed stable until a test shows otherwise: names, patterns such as R*, ranges "
             "such as 501-520.  [default: all]",
         ),
     ] = "",
@@ -207,33 +217,33 @@ def epochs(
         typer.Option(
             "--group",
             metavar="NAME=P,Q,...",
-            help="Points whose motion as a block is asked for; may be given several times.",
+            help="Points whose motion as one block is estimated; may be given several times.",
         ),
     ] = None,
     model: Annotated[
-        str, typer.Option("--model", help="How groups move: rigid, similarity or affine.")
+        str, typer.Option("--model", help="Motion of a group: rigid, similarity or affine.")
     ] = "rigid",
     alpha: Annotated[
         float,
         typer.Option(
-            "--alpha", min=1e-6, max=0.5, help="Probability of reporting a movement where nothing moved."
+            "--alpha", min=1e-6, max=0.5, help="Probability of reporting a motion where nothing moved."
         ),
     ] = 0.05,
     together: Annotated[
         bool,
         typer.Option(
             "--together",
-            help="Adjust all epochs as one, with one interior orientation of each camera that took several "
-            "of them; one that changed is refused.",
+            help="Adjust all epochs together, with one interior orientation for each camera that took "
+            "several of them; a camera that changed between epochs is refused.",
         ),
     ] = False,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder of tables, JSON and page.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the tables, JSON and page.")
     ] = Path("out/epochs"),
 ) -> None:
     """Find what moved between surveys of one object.
 
-    Congruency test, the points that are stable, displacements with their tests, and motion of groups.
+    Reports the congruency test, the stable points, displacements with their tests, and motions of groups.
     """
     with loading():
         from sfm.cli.console import print_verdict
@@ -246,19 +256,24 @@ def epochs(
     if len(results) < 2:
         raise SurveyFileError(f"epochs: {len(results)} given, expected 2 or more")
     groups: dict[str, list[str]] = {}
-    for name, points in map(_named, group or ()):
+    for name, points in map(_parse_group, group or ()):
         if name in groups:
             raise SurveyFileError(f"--group {name} is given twice")
-        groups[name] = _listed(points)
+        groups[name] = _split_names(points)
     for k, path in enumerate(results):
         if path.resolve() in [one.resolve() for one in results[:k]]:
             raise SurveyFileError(f"epochs: {path} is given twice")
-    given = [_epoch(path) for path in results]
-    if len({epoch.name for epoch in given}) < len(given):  # folders of one name in different places
+    given = [_read_epoch(path) for path in results]
+    if len({epoch.name for epoch in given}) < len(given):  # folders of the same name in different folders
         given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
     with working_on(" ".join(map(str, results))):
         found = analyse_epochs(
-            given, reference=_listed(reference), groups=groups, model=model, alpha=alpha, together=together
+            given,
+            reference=_split_names(reference),
+            groups=groups,
+            model=model,
+            alpha=alpha,
+            together=together,
         )
     page = write_page(found, out)
     print_verdict(verdict_of_epochs(found))
@@ -270,8 +285,8 @@ def epochs(
     print(f"Report: {page}")
 
 
-def _epoch(path: Path) -> Epoch:
-    """Return an epoch of a result folder, or of a survey file, which is run."""
+def _read_epoch(path: Path) -> Epoch:
+    """Return the epoch of a result folder, or of a survey file, which is run first."""
     from adapters.formats.given_table import read_given
     from adapters.formats.result_tables import read_result
     from sfm.cli.commands.surveying import run_file
@@ -285,14 +300,14 @@ def _epoch(path: Path) -> Epoch:
     return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0, given.sigma0_px)
 
 
-def _named(text: str) -> tuple[str, str]:
+def _parse_group(text: str) -> tuple[str, str]:
     name, equals, points = text.partition("=")
     if not (name.strip() and equals and points.strip()):
         raise SurveyFileError(f"--group {text}: expected a name and its points, such as pier=P*,17")
     return name.strip(), points
 
 
-def _listed(text: str) -> list[str]:
+def _split_names(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
@@ -302,7 +317,7 @@ def refine(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="DIR", help="New folder for the refined model; beside the model if not given."
+            "--out", metavar="DIR", help="New folder for the refined model.  [default: beside the model]"
         ),
     ] = None,
     window: Annotated[
@@ -310,39 +325,47 @@ def refine(
         typer.Option(
             "--window",
             metavar="N",
-            help="Side of the windows, odd, 3 to 101 px; by default 15 or 11, whichever measure better.",
+            help="Width of the windows, odd, 3 to 101 px.  [default: 15 or 11, whichever measures better]",
         ),
     ] = None,
     min_correlation: Annotated[
         float,
         typer.Option(
-            "--min-correlation", metavar="R", help="Smallest r of a window and its template, 0 to 1."
+            "--min-correlation",
+            metavar="R",
+            help="Smallest correlation coefficient r between a window and its template, 0 to 1.",
         ),
     ] = 0.7,
     fix: Annotated[
-        str, typer.Option("--fix", metavar="NAMES", help="Interior parameters to hold, as f,fx,fy,cx,cy,k1.")
+        str,
+        typer.Option(
+            "--fix", metavar="NAMES", help="Interior parameters to hold fixed, such as f,fx,fy,cx,cy,k1."
+        ),
     ] = "",
     masks: Annotated[
         Path | None,
-        typer.Option("--masks", metavar="DIR", help="Folder of masks: NAME.png beside a photograph's NAME."),
+        typer.Option(
+            "--masks", metavar="DIR", help="Folder of masks, NAME.png for photograph NAME; black is ignored."
+        ),
     ] = None,
     survey: Annotated[
         Path | None,
         typer.Option(
             "--survey",
             metavar="FILE",
-            help="Survey file: coded targets, control and scale bars join the model.",
+            help="Survey file with coded targets, control and scale bars to add to the model.",
         ),
     ] = None,
 ) -> None:
     """Remeasure the key points of a COLMAP model.
 
-    By least squares matching; then the model is adjusted again. The new model keeps numbers,
-    colours, camera models, rigs and the points of two photographs, and has a page, refinement.html, and the
-    standard deviations of points, photographs and cameras beside it (sigma_*.csv). The principal point is
-    estimated, too, where four photographs or more have been taken with a camera; hold it with --fix cx,cy.
-    Of masks, black is left out. With a survey file the coded targets that it describes are measured and
-    adjusted with the key points; its control and scale bars give the model its frame and scale.
+    Key points are measured by least squares matching, then the model is adjusted again. The new model keeps
+    identifiers, colours, camera models, rigs and points with two rays. Its folder has a page,
+    refinement.html, and the standard deviations of points, photographs and cameras (sigma_*.csv).
+
+    The principal point is also estimated if a camera took four or more photographs; hold it fixed with
+    --fix cx,cy. With a survey file, the coded targets that it describes are measured and adjusted with the
+    key points; its control and scale bars define the frame and scale of the model.
     """
     with loading():
         from adapters.colmap.camera_models import write_scene

@@ -1,6 +1,6 @@
-"""Starting the program: the first compilation, Ctrl-C, and `doctor`, which checks an installation.
+"""Start of the program: the first compilation, Ctrl-C, and `doctor`, which checks an installation.
 
-Printing is guarded, too: a code page may lack characters, a disk be full, a reader end early.
+Printing is guarded too: a code page may lack characters, a disk may be full, and a reader may exit early.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sfm.adjustment.result import Adjustment
     from sfm.network import Estimate
 
-READER_GONE = 141  # exit code; 128 + SIGPIPE, as a shell reports it of other programs
+READER_GONE = 141  # exit code 128 + SIGPIPE, as a shell reports it for other programs
 LIBRARIES = (
     "kolinear",
     "numpy",
@@ -39,25 +39,24 @@ LIBRARIES = (
 )
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "msedge")
 MIN_FREE_GB = 1.0
-CENTRE_PX = 0.1  # largest error of a drawn dot
-FAILED = 1  # exit code where a result is not dependable, or a check fails
+CENTRE_PX = 0.1  # largest accepted error of the centre of a drawn dot
+FAILED = 1  # exit code if a result is not dependable or a check fails
 INTERRUPTED = 130  # exit code after Ctrl-C, as a shell expects it
-INTERRUPTED_TEXT = "kolinear: interrupted, nothing half-done is left (batch --resume goes on)"
-AT_ONCE_TEXT = "kolinear: ended at once; the next run into the same folder clears what is half-done"
+INTERRUPTED_TEXT = "kolinear: interrupted, no partial output is left (batch --resume continues)"
+AT_ONCE_TEXT = "kolinear: stopped at once; the next run into the same folder removes partial output"
 SAME_PRESS_SECONDS = 1.0  # `timeout` sends the signal of one Ctrl-C twice
 _running = ExitStack()
-"""what lasts as long as the command"""
+"""Contexts that last as long as the command."""
 _listening: list[bool] = []
-"""not empty once somebody listens for compiling"""
+"""Not empty once compiling is announced."""
 
 
 @contextmanager
 def loading() -> Iterator[None]:
-    """Import what a command needs, which takes a second.
+    """Run the imports of a command, which take a second, so that Ctrl-C ends the program at once.
 
-    Ctrl-C ends the program right there, since nothing is begun that could be left half-done: an exception
-    would be swallowed by the machinery of imports, or leave it as an ImportError. From here on the
-    compiling of kernels is announced.
+    No output is begun yet that could be left incomplete. An exception would be swallowed by Python's import
+    system, or would leave it as an ImportError. After the imports, compiling of kernels is announced.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:
@@ -71,12 +70,12 @@ def loading() -> Iterator[None]:
 
 @contextmanager
 def stopped_once() -> Iterator[None]:
-    """Let the first Ctrl-C be a KeyboardInterrupt, and none break the tidying up that follows.
+    """Turn the first Ctrl-C into a KeyboardInterrupt, and protect the clean-up that follows from others.
 
-    Who presses again, a second later or more, ends the program at once.
+    A second Ctrl-C, more than a second later, ends the program at once.
     """
     before = signal.getsignal(signal.SIGINT)
-    if before is not signal.SIG_IGN:  # as of jobs in the background
+    if before is not signal.SIG_IGN:  # background jobs ignore it
         signal.signal(signal.SIGINT, _stop)
     try:
         with _running:
@@ -85,7 +84,7 @@ def stopped_once() -> Iterator[None]:
         _listening.clear()
         if signal.getsignal(signal.SIGINT) is _stop:
             signal.signal(signal.SIGINT, before)
-        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # what is done is done
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # the work is finished
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -100,13 +99,13 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) -> None:
-    """End without looking back: no threads are waited for, nothing is cleared away."""
+    """Exit at once, without waiting for threads or cleaning up."""
     os.write(2, f"{text}\n".encode())
     os._exit(INTERRUPTED)
 
 
 def _announce_compiling() -> None:
-    """Say on stderr when kernels are compiled, for as long as the command runs; numba is loaded."""
+    """Report compiling of kernels on stderr while the command runs, if numba is loaded."""
     if "numba" in sys.modules and not _listening:
         from sfm.kernels.compiling import COMPILING, when_compiling
 
@@ -117,7 +116,7 @@ def _announce_compiling() -> None:
 
 
 def compile_first() -> None:
-    """Compile the kernels of a survey unless it was done for these sources, and report it on stderr."""
+    """Compile the kernels of a survey unless they are compiled for these sources, and report it on stderr."""
     from sfm.kernels.warmed import is_warm
 
     if is_warm():
@@ -131,9 +130,9 @@ def compile_first() -> None:
 
 
 def doctor() -> None:
-    """Check this installation by a short measurement and adjustment.
+    """Check this installation with a short measurement and adjustment.
 
-    Prints versions, cores and folders, too. Exit code 1 if a check fails; the line states what to do.
+    Also prints versions, cores and folders. Exit code 1 if a check fails; its line states the remedy.
     """
     with loading():
         from rich.console import Console
@@ -151,7 +150,9 @@ def doctor() -> None:
         table.add_row(name, _version(name))
     table.add_row("cores", str(cores()))
     table.add_row("memory", _memory())
-    table.add_row("browser", next((name for name in BROWSERS if shutil.which(name)), "none found by name"))
+    table.add_row(
+        "browser", next((name for name in BROWSERS if shutil.which(name)), "none found by its name")
+    )
     table.add_row("kernels", f"{KEPT}, {'compiled' if is_warm() else 'not yet compiled'}")
     store = user_folder("measured", "measured points")
     size = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
@@ -159,13 +160,13 @@ def doctor() -> None:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
     table.add_row("free space", f"{free:.1f} GB in {Path.cwd()}")
     console.print(table)
-    failed = [] if free > MIN_FREE_GB else [f"only {free:.1f} GB are free here, results need room"]
+    failed = [] if free > MIN_FREE_GB else [f"only {free:.1f} GB are free here; results need more space"]
     compile_first()
     begun = time.perf_counter()
     for name, check in CHECKS:
         try:
             console.print(f"{name}: {check()}")
-        except MissingLibraryError as error:  # of an extra, which a sound installation need not have
+        except MissingLibraryError as error:  # a library of an extra, which is optional
             console.print(f"{name}: no comparison, {error}", markup=False)
         except KolinearError as error:
             failed.append(f"{name}: {error}")
@@ -178,7 +179,7 @@ def doctor() -> None:
 
 
 def _check_targets() -> str:
-    """Measure four drawn dots of known places."""
+    """Measure four drawn dots of known positions."""
     import numpy as np
 
     from sfm.targets.detect import find_targets
@@ -196,7 +197,7 @@ def _check_targets() -> str:
 
 @cache
 def _tested_network() -> tuple[Adjustment, Estimate]:
-    """Adjust a made-up network; with its truth, for both checks of it."""
+    """Return the adjustment of a synthetic network, and its true values."""
     from sfm.adjustment.datum import Datum
     from sfm.adjustment.solve import adjust
     from sfm.warm_up import made_up_network
@@ -206,7 +207,7 @@ def _tested_network() -> tuple[Adjustment, Estimate]:
 
 
 def _check_adjustment() -> str:
-    """Compare the adjustment of a made-up network with the truth."""
+    """Compare the adjustment of a synthetic network with the true values."""
     import numpy as np
 
     from sfm.remarks.kind import WRONG_SIGMAS
@@ -223,14 +224,14 @@ def _check_adjustment() -> str:
 
 
 def _check_colmap() -> str:
-    """Adjust the same network by COLMAP and compare."""
+    """Adjust the same network with COLMAP and compare."""
     from sfm.api import programs_of
     from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 
     adjuster = programs_of("colmap", "none").adjuster
     assert adjuster is not None
     if not compare_adjusters(_tested_network()[0], adjuster).agree:
-        raise KolinearError("its adjustment of a made-up network differs from Kolinear's")
+        raise KolinearError("its adjustment of a synthetic network differs from Kolinear's")
     return f"version {_version('pycolmap')} agrees on the same network"
 
 
@@ -257,21 +258,21 @@ def _memory() -> str:
 
 
 def guard_streams() -> None:
-    """Make stdout and stderr tolerate readers that end and names that they cannot encode.
+    """Make stdout and stderr tolerate readers that exit and names that they cannot encode.
 
-    A reader of stdout that ends, as `head` does, ends the program quietly; one of stderr ends nothing. Lines
-    of both have their order where both go to one file or pipe.
+    If the reader of stdout exits, as `head` does, the program exits quietly. If the reader of stderr exits,
+    the program goes on. Where both streams go to one file or pipe, their lines keep their order.
     """
-    if isinstance(sys.stdout, io.TextIOWrapper):  # of a code page that lacks a name's letters
+    if isinstance(sys.stdout, io.TextIOWrapper):  # its code page may lack letters of a name
         sys.stdout.reconfigure(errors="backslashreplace")
     if sys.stdout is sys.__stdout__:
-        sys.stdout = _guarded(sys.stdout, ends_program=True)
+        sys.stdout = _guard_stream(sys.stdout, ends_program=True)
     if sys.stderr is sys.__stderr__:
-        sys.stderr = _guarded(sys.stderr, ends_program=False)
+        sys.stderr = _guard_stream(sys.stderr, ends_program=False)
 
 
-def _guarded(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
-    """Return what writes to the same file, pipe or socket; terminals and absent streams stay as they are."""
+def _guard_stream(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
+    """Return a guarded stream to the same file, pipe or socket; terminals and absent streams are returned."""
     if not isinstance(outlet, io.TextIOWrapper) or outlet.isatty():
         return outlet
     outlet.flush()
@@ -284,9 +285,9 @@ def _guarded(outlet: TextIO | None, *, ends_program: bool) -> TextIO | None:
 
 
 class _Outlet(io.FileIO):
-    """An open file that is tried no more once it could not be written.
+    """An open file to which nothing more is written after the first failure.
 
-    Python would try again at its end, and typer and rich take a reader that has ended for exit code 1.
+    Python would try again at exit, and typer and rich exit with code 1 if the reader has exited.
     """
 
     def __init__(self, number: int, *, ends_program: bool) -> None:
@@ -295,7 +296,7 @@ class _Outlet(io.FileIO):
 
     def write(self, data: Any) -> int:
         if not self._ends_program and sys.stdout is not None and not sys.stdout.closed:
-            sys.stdout.flush()  # what was printed before
+            sys.stdout.flush()  # lines printed earlier
         try:
             return super().write(data) or 0
         except OSError as error:

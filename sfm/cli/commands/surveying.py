@@ -1,4 +1,4 @@
-"""Commands about a survey: run, init and adjust."""
+"""Commands for one survey: run, adjust and init."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ if TYPE_CHECKING:
     from sfm.survey.drafting.draft import Draft
     from sfm.survey.inputs.survey import Survey
 
-PHOTOGRAPHS = "# Photographs: "  # the comment that states their folder, from that of the file, as in JSON
+PHOTOGRAPHS = "# Photographs: "  # comment with their folder, relative to the survey file, as a JSON string
 Pitch = Annotated[
     float | None,
     typer.Option(
         "--pitch",
         metavar="MM",
         min=1e-6,
-        help="Squares of a board, or distance of the dots of a plate, mm, for a drafted survey file.  "
-        "[default: assumed]",
+        help="Side of the squares of a board, or distance between the dots of a plate, mm, for a drafted "
+        "survey file.  [default: assumed]",
     ),
 ]
-SURVEY_FILE = "survey.toml"  # in a folder of photographs
+SURVEY_FILE = "survey.toml"  # name in a folder of photographs
 SurveyFile = Annotated[
-    Path, typer.Argument(metavar="SURVEY.toml", help="The survey file; its paths are relative to it.")
+    Path, typer.Argument(metavar="SURVEY.toml", help="Survey file; its paths are relative to its folder.")
 ]
 SurveyOrPhotographs = Annotated[
     Path,
     typer.Argument(
         metavar="SURVEY.toml|PHOTOS",
-        help="The survey file, whose paths are relative to it, or a folder of photographs, for which one is "
-        "drafted.",
+        help="Survey file, whose paths are relative to its folder, or a folder of photographs, for which a "
+        "survey file is drafted.",
     ),
 ]
 Out = Annotated[
@@ -51,21 +51,26 @@ Out = Annotated[
     typer.Option(
         "--out",
         metavar="DIR",
-        help="Folder of the result, written whole or not at all; an earlier result of the survey is "
-        "replaced.  [default: out/NAME OF THE SURVEY]",
+        help="Folder of the result, written completely or not at all; an earlier result of the same survey "
+        "is replaced.  [default: out/NAME OF THE SURVEY]",
     ),
 ]
 Overwrite = Annotated[
     bool,
     typer.Option(
         "--overwrite",
-        help="Replace the folder of a result of another survey file or of other photographs; survey files "
-        "are never replaced.",
+        help="Replace a result folder of another survey file or of other photographs; survey files are never "
+        "replaced.",
     ),
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option("--jobs", metavar="N", min=1, help="Photographs worked on at a time.  [default: all cores]"),
+    typer.Option(
+        "--jobs",
+        metavar="N",
+        min=1,
+        help="Number of photographs processed at a time.  [default: one per core]",
+    ),
 ]
 PicturesMb = Annotated[
     float,
@@ -73,15 +78,17 @@ PicturesMb = Annotated[
         "--pictures-mb",
         metavar="MB",
         min=0.0,
-        help="Largest size of photographs and crops inside report.html; the rest is in pictures/.",
+        help="Largest total size of photographs and crops inside report.html; the others are in pictures/.",
     ),
 ]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Print more: every photograph and warning.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Also print every photograph and every warning.")
+]
 AllowOutside = Annotated[
     bool,
     typer.Option(
         "--allow-outside",
-        help="Let the survey file name files outside its folder; only for survey files that you trust.",
+        help="Let the survey file refer to files outside its folder; only for survey files that you trust.",
     ),
 ]
 Calibration = Annotated[
@@ -89,14 +96,15 @@ Calibration = Annotated[
     typer.Option(
         "--camera",
         metavar="RESULT",
-        help="Hold the interior orientation at that of an earlier result; cameras are matched by name.",
+        help="Hold the interior orientation fixed at that of an earlier result; cameras are matched by name.",
     ),
 ]
 Weighted = Annotated[
     bool,
     typer.Option(
         "--camera-weighted",
-        help="Adjust the parameters that --camera adjusted, observed with their values and full covariance.",
+        help="Do not hold the parameters fixed that were adjusted in the result of --camera: adjust them "
+        "again, observed with their full covariance.",
     ),
 ]
 
@@ -106,7 +114,9 @@ def run(
     images: Annotated[
         Path | None,
         typer.Option(
-            "--images", metavar="DIR", help="Folder of the photographs, in place of that of the survey file."
+            "--images",
+            metavar="DIR",
+            help="Folder of the photographs, instead of the folder that the survey file states.",
         ),
     ] = None,
     pitch: Pitch = None,
@@ -121,11 +131,11 @@ def run(
 ) -> None:
     """Run a survey from its photographs to the report.
 
-    With a folder, its survey.toml is run, or a survey file is drafted from the photographs, written beside
-    the result and run; change it there and run it again with --images PHOTOS.
+    If a folder is given, its survey.toml is run. If it has none, a survey file is drafted from the
+    photographs, written beside the result and run; edit it there and run it again with --images PHOTOS.
 
-    Exit code 0 with a result, remarks or none; 1 if the result cannot be depended on, the report says
-    why; 2 where a person must put something right.
+    Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
+    reasons in the report; 2 if the input must be corrected.
     """
     if survey_file.is_dir():
         if images is not None:
@@ -165,9 +175,10 @@ def adjust(
 ) -> None:
     """Run a survey from measured image points to the report.
 
-    They are those of [observations] in the survey file, in place of photographs.  Exit code 0 with a
-    result, remarks or none; 1 if the result cannot be depended on, the report states why; 2 where a person
-    must put something right.
+    [observations] in the survey file states the image points, which replace photographs.
+
+    Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
+    reasons in the report; 2 if the input must be corrected.
     """
     _run_survey(
         survey_file,
@@ -182,7 +193,11 @@ def adjust(
 
 
 def run_file(survey_file: Path) -> Path:
-    """Run a survey file, with photographs or without, and return the folder of its result, out/NAME."""
+    """Run a survey file, with photographs or without, and return its result folder, out/NAME.
+
+    Args:
+        survey_file: the survey file.
+    """
     return _run_survey(survey_file, pictures_mb=15.0)
 
 
@@ -200,7 +215,10 @@ def _run_survey(
     overwrite: bool = False,
     pictures_mb: float = 0.0,
 ) -> Path:
-    """Run a survey, write and print its result, return its folder; the command is for photographs or not."""
+    """Run a survey, write and print its result, and return the result folder.
+
+    `from_photographs` is False for surveys with [observations]; if None, the survey file decides.
+    """
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
@@ -225,15 +243,15 @@ def _run_survey(
         raise KolinearError(f"{survey_file}: is a photograph, not a survey file; give its folder")
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
-    if from_photographs is None:  # whichever it is
+    if from_photographs is None:
         from_photographs = described.observations is None
     if from_photographs and described.observations is not None:
         raise KolinearError(
-            f"{survey_file}: it has [observations] in place of photographs: kolinear adjust {survey_file}"
+            f"{survey_file}: has [observations] instead of photographs; run kolinear adjust {survey_file}"
         )
     if not from_photographs and described.observations is None:
         raise KolinearError(
-            f"{survey_file}: it has no [observations]; with photographs: kolinear run {survey_file}"
+            f"{survey_file}: has no [observations]; with photographs, run kolinear run {survey_file}"
         )
     with working_on(str(survey_file)):
         survey = survey_of_file(described)
@@ -246,9 +264,9 @@ def _run_survey(
                 calibrations = tuple(Calibration.of_camera(one) for one in cameras)
             survey = with_calibration(survey, calibrations, str(camera), weighted=weighted)
     elif weighted:
-        raise KolinearError("--camera-weighted: expected --camera RESULT with it")
+        raise KolinearError("--camera-weighted: expected --camera RESULT")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
-    folder = _folder(survey, out)
+    folder = _result_folder(survey, out)
     origin = Origin(survey_file, images or survey_file.parent)
     if not overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
@@ -265,7 +283,7 @@ def _run_survey(
         drawn_progress() as drawn,
         one_blas_thread(),
         plot_process(jobs) as plots,
-        _written(folder),
+        _lock_folder(folder),
         SurveyLog(watch=drawn) as log,
     ):
         log.start(survey.name, survey_file, **origin.written(folder))
@@ -286,8 +304,8 @@ def _run_survey(
     return folder
 
 
-def _folder(survey: Survey, out: Path | None) -> Path:
-    """Return the folder of the result, before any work is done for one that cannot be used."""
+def _result_folder(survey: Survey, out: Path | None) -> Path:
+    """Return the result folder; a folder that cannot be used is refused before any work is done."""
     from sfm.files.open_folders import refuse_foreign_folder
     from sfm.report.output import folder_name
 
@@ -297,8 +315,8 @@ def _folder(survey: Survey, out: Path | None) -> Path:
 
 
 @contextmanager
-def _written(folder: Path) -> Iterator[None]:
-    """Keep other runs from writing the same folder, and clear away what killed ones have left there."""
+def _lock_folder(folder: Path) -> Iterator[None]:
+    """Lock the result folder against other runs, and remove partial output of runs that were killed."""
     from sfm.files.open_folders import locked
     from sfm.files.whole_files import remove_leftovers
 
@@ -309,29 +327,29 @@ def _written(folder: Path) -> Iterator[None]:
 
 def init(
     photographs: Annotated[
-        Path, typer.Argument(metavar="PHOTOS", help="Folder of the photographs, directly in it.")
+        Path, typer.Argument(metavar="PHOTOS", help="Folder that contains the photographs directly.")
     ],
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             metavar="FILE.toml",
-            help="File to write; no other is replaced.  [default: PHOTOS/survey.toml]",
+            help="File to write; an existing file is not replaced.  [default: PHOTOS/survey.toml]",
         ),
     ] = None,
     pitch: Pitch = None,
 ) -> None:
     """Draft a survey file from a folder of photographs.
 
-    Cameras are recognised by the metadata of the files, targets by trying a few photographs; a comment
-    says where each value comes from.  Nothing is measured or adjusted: kolinear run does that.
+    Cameras are recognised by the metadata of the photographs, and targets by measuring a few photographs. A
+    comment states the source of each value. Use kolinear run to measure and adjust the survey.
     """
     from sfm.files.whole_files import refuse_existing
 
     file = photographs / "survey.toml" if out is None else out
     refuse_existing(file)
-    draft = _draft(photographs, pitch)
-    _write(draft, photographs, file)
+    draft = _draft_folder(photographs, pitch)
+    _write_draft(draft, photographs, file)
     beside = file.parent.resolve() == photographs.resolve()
     print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
 
@@ -339,20 +357,20 @@ def init(
 def drafted_beside(
     photographs: Path, out: Path | None, pitch: float | None, *, overwrite: bool = False
 ) -> tuple[Path, Path]:
-    """Draft the survey of a folder of photographs, unless a file beside the result has it already.
+    """Draft the survey file of a folder of photographs, unless it is already beside the result.
 
     Args:
-        photographs: the folder.
-        out: folder of the result, None for out/NAME OF THE FOLDER.
-        pitch: of a plate, mm; None to assume it.
+        photographs: folder of the photographs.
+        out: result folder; None for out/NAME OF THE FOLDER.
+        pitch: pitch of a board or plate, mm; None to assume it.
         overwrite: whether a result of other photographs is replaced; the survey file never is.
 
     Returns:
-        The survey file, and the folder of the result.
+        The survey file and the result folder.
 
     Raises:
-        KolinearError: no photographs, a pitch beside a file that has one, a survey file or a result of other
-            photographs, or the file cannot be written.
+        KolinearError: there are no photographs, a pitch is given though the survey file exists, the survey
+            file or the result is of other photographs, or the file cannot be written.
     """
     with loading():
         from sfm.files.open_folders import refuse_links
@@ -367,40 +385,48 @@ def drafted_beside(
         if drafted_of.resolve() != photographs.resolve():
             raise OutputError(
                 f"{file}: is the survey file of the photographs in {os.path.normpath(drafted_of)} and is "
-                "left alone; --out names another folder, or remove it to draft a new one"
+                "not replaced; choose another folder with --out, or remove the file to draft a new one"
             )
     if not overwrite:
         refuse_other_origin(out, Origin(file, photographs))
     if file.exists():
         refuse_pitch(pitch, file)
-        print(f"Running {file}, which is there already; remove it to draft a new one", file=sys.stderr)
+        print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
         return file, out
-    _write(_draft(photographs, pitch), photographs, file)
+    _write_draft(_draft_folder(photographs, pitch), photographs, file)
     return file, out
 
 
 def _photographs_of(file: Path) -> Path | None:
-    """Return the folder of photographs that a drafted survey file states; None where it states none."""
+    """Return the folder of photographs that a drafted survey file states, or None."""
     text = file.read_text(encoding="utf-8", errors="replace")
     line = next((one for one in text.splitlines() if one.startswith(PHOTOGRAPHS)), None)
     if line is None:
         return None
     try:
         return file.parent / str(json.loads(line.removeprefix(PHOTOGRAPHS)))
-    except ValueError:  # changed by hand
+    except ValueError:  # edited by hand
         return None
 
 
 def refuse_pitch(pitch: float | None, file: Path) -> None:
-    """Raise KolinearError where a pitch is given for a survey file that is there already."""
+    """Refuse a pitch for a survey file that exists.
+
+    Args:
+        pitch: value of --pitch, mm, or None.
+        file: the survey file.
+
+    Raises:
+        KolinearError: a pitch is given.
+    """
     if pitch is not None:
         raise KolinearError(
-            f"{file}: --pitch {pitch:g} is for a survey file that is drafted, this one is there already; "
-            "write targets.pitch in it, or remove it"
+            f"{file}: --pitch {pitch:g} is for drafting a survey file, but this one exists; set "
+            "targets.pitch in it, or remove it"
         )
 
 
-def _draft(photographs: Path, pitch: float | None = None) -> Draft:
+def _draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
     with loading():
         from sfm.api import one_blas_thread, sensor_widths
         from sfm.runtime.progress_bar import drawn_progress
@@ -420,8 +446,8 @@ def _draft(photographs: Path, pitch: float | None = None) -> Draft:
     return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
-def _write(draft: Draft, photographs: Path, file: Path) -> None:
-    """Write a drafted survey with the folder of its photographs, and report on stderr what was found."""
+def _write_draft(draft: Draft, photographs: Path, file: Path) -> None:
+    """Write a drafted survey file with the folder of its photographs, and report findings on stderr."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.remarks.verdict import lines_of
@@ -432,7 +458,7 @@ def _write(draft: Draft, photographs: Path, file: Path) -> None:
         try:
             part.write_text(f"{stated}\n{draft.text}", encoding="utf-8")
         except UnicodeEncodeError as error:
-            raise OutputError(f"{file}: a name in it is no text in UTF-8") from error
+            raise OutputError(f"{file}: a name in it cannot be encoded in UTF-8") from error
     for subject, finding in draft.found:
         print(as_plain(f"{subject}: {finding}"), file=sys.stderr)
     for line in lines_of(draft.remarks):

@@ -98,7 +98,7 @@ def test_a_folder_becomes_a_result(
     capsys.readouterr()
     assert kolinear("run", folder, "--out", "mine/first") == 0
     told = capsys.readouterr()
-    assert f"Running {Path('mine/first.toml')}, which is there already" in told.err
+    assert f"Running {Path('mine/first.toml')}, which exists" in told.err
     assert "minimal" in told.out, "the file that a person changed is run as it is"
     np.testing.assert_allclose(sizes(tmp_path / "mine/first"), first, atol=1e-9)
 
