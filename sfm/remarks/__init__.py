@@ -1,1 +1,1 @@
-"""Statements on a result: remarks, the catalogue of their kinds, the verdict."""
+"""Statements about a result: remarks, the catalogue of their kinds, and the verdict."""

@@ -1,15 +1,15 @@
-"""Kind: a row of the catalogue of remarks, and the sentences that it makes of a remark.
+"""Kind: a row of the catalogue of remarks, which turns a remark into sentences.
 
-Sentence, cause and remedy are texts with fields in braces, one for each part of the remark:
+Sentence, cause and remedy are texts with fields in braces. Each field shows one part of the remark:
 
     {point}                 names, listed          {distance}            number with its unit
-    {points:point}          "3 points"             {count:point}         the same of a number
-    {points:is|are}         by the count           {count:is|are}        the same of a number
-    {change:+}              with its sign          {share:%}             100 times, with %
+    {points:point}          "3 points"             {count:point}         the same for a number
+    {points:is|are}         agrees with the count  {count:is|are}        the same for a number
+    {change:+}              with its sign          {share:%}             in per cent
     {p:<}                   "p = 0.012", "p < 0.001"
-    {of:@}                  nouns by their keys    {given:@bar}          of others "bar 1 - 2"
+    {of:@}                  nouns of NOUNS         {given:@bar}          other names as "bar 1 - 2"
 
-Text in [[ ]] appears only if the remark has all parts in it.
+Text in [[ ]] appears only if the remark has all parts that it contains.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from sfm.conventions import METRES, finer_unit
 from sfm.display import agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
-# Standard deviations beyond which a value is wrong: noise makes so large an error once in a million
-# coordinates, and where it is the root mean square of all, nothing of a result is right.
+# A value that is further off than this number of standard deviations is wrong. Noise causes an error of this
+# size once in a million coordinates. If it is the root mean square of all errors, the whole result is wrong.
 WRONG_SIGMAS = 5.0
-MIN_PROBABILITY = 1e-3  # smaller ones are written as less than it
-# Below these a shifted result stays within the limits that anybody expects: 99.7 % of normally distributed
-# errors are within (Pukelsheim 1994, "The three sigma rule", The American Statistician 48(2)).
+MIN_PROBABILITY = 1e-3  # smaller probabilities are written as "p < 0.001"
+# A result that shifts by fewer standard deviations stays within the limits that users expect: they contain
+# 99.7 % of normally distributed errors (Pukelsheim 1994, "The three sigma rule", The American Statistician
+# 48(2)).
 EXPECTED_SIGMAS = 3.0
-NOUNS = {  # what a remark may be of, by the names in its data
+NOUNS = {  # subjects of remarks, by their names in the data
     "bars": "the scale bars",
     "cameras": "Interior parameters",
     "centres": "the projection centres",
@@ -59,13 +60,13 @@ OPTIONAL = re.compile(r"\[\[(.*?)\]\]", re.S)
 
 @dataclass(frozen=True)
 class Grade:
-    """Severity by a number of the remark: a note below `warning`, an error from `error` on."""
+    """Severity by a number of the remark: a note below `warning`, an error at `error` and above."""
 
     number: str
     warning: float = -np.inf
     error: float = np.inf
-    also: Grade | None = None  # of another number; the more serious of the two counts
-    at_most: Grade | None = None  # likewise; the less serious of the two counts
+    also: Grade | None = None  # grade of another number; the more serious severity counts
+    at_most: Grade | None = None  # grade of another number; the less serious severity counts
 
     def severity_of(self, one: Remark) -> Severity:
         """Return the severity of a remark."""
@@ -77,7 +78,7 @@ class Grade:
         return found
 
     def of(self, value: float) -> Severity:
-        """Return the severity of a value; a number that is not known is as bad as can be."""
+        """Return the severity of a value; NaN has the worst severity of this grade."""
         if np.isnan(value):
             return "error" if np.isfinite(self.error) else "warning"
         return "error" if value >= self.error else "warning" if value >= self.warning else "note"
@@ -89,15 +90,15 @@ class Kind:
 
     name: str
     severity: Severity | Grade
-    sentence: str  # with fields, see above
-    cause: str  # why it happens; fields as of the sentence
-    remedy: str  # what to do; likewise
-    short: str = ""  # what it is called in the sentences of others, whose subjects have its name
-    explains: tuple[str, ...] = ()  # kinds that follow from it, whose remedies would mislead beside it
+    sentence: str  # with fields, see the module docstring
+    cause: str  # why it happens, with the same fields
+    remedy: str  # advice, with the same fields
+    short: str = ""  # noun for it in sentences of other remarks that have this kind as a subject
+    explains: tuple[str, ...] = ()  # kinds that follow from it and whose remedies would mislead
 
     @property
     def fields(self) -> frozenset[str]:
-        """Names of the parts that the sentence shows."""
+        """Names of the parts in the sentence."""
         return frozenset(name for name, _ in FIELD.findall(self.sentence))
 
     def severity_of(self, one: Remark) -> Severity:
@@ -107,10 +108,14 @@ class Kind:
         return self.severity
 
     def write(self, text: str, one: Remark) -> str:
-        """Return a text of this kind, its sentence, cause or remedy, with the parts of a remark.
+        """Fill the fields of a text with the parts of a remark.
+
+        Args:
+            text: sentence, cause or remedy of this kind.
+            one: the remark.
 
         Raises:
-            KeyError: a part is missing that is not optional.
+            KeyError: a part that is not optional is missing.
         """
         stated: dict[str, tuple[str, ...] | Quantity] = {**one.subjects, **one.numbers}
         parts = {**stated, **_readable(one.numbers)}
@@ -123,13 +128,14 @@ class Kind:
 
         def field(found: re.Match[str]) -> str:
             name, spec = found.group(1), found.group(2) or ""
-            return _written(stated if spec.startswith(".") else parts, name, spec)  # decimals are of its unit
+            # decimals refer to the stored unit
+            return _written(stated if spec.startswith(".") else parts, name, spec)
 
         return FIELD.sub(field, text)
 
 
 def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
-    """Return numbers with lengths in the metric unit in which the largest reads well, or in a larger one."""
+    """Return the numbers with lengths in a finer metric unit if their largest value reads better in it."""
     largest: dict[str, float] = {}
     for one in numbers.values():
         if one.unit in METRES and np.isfinite(one.value):
@@ -144,7 +150,7 @@ def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
 
 
 def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: str) -> str:
-    """Write one part as its field asks for."""
+    """Format one part as the specification of its field asks."""
     part = parts[name]
     count = part.value if isinstance(part, Quantity) else len(part)
     if "|" in spec:
@@ -157,12 +163,12 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
 
 
 def _nouns(names: tuple[str, ...], other: str) -> list[str]:
-    """Return the nouns of names, and the names that have none behind another noun."""
+    """Return the nouns of names; a name without a noun follows the noun `other`."""
     return [NOUNS.get(name) or f"{other} {name}".lstrip() for name in names]
 
 
 def _number(one: Quantity, spec: str) -> str:
-    """Write a number with three significant digits, or as the format asks, and its unit."""
+    """Format a number and its unit, to three significant digits unless the field asks otherwise."""
     if not np.isfinite(one.value):
         return "not known"
     if spec == "<":
@@ -181,7 +187,12 @@ def _number(one: Quantity, spec: str) -> str:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """Write a number with so many significant digits and no exponent where that is short."""
+    """Format a number with significant digits, with an exponent only if it is very large or small.
+
+    Args:
+        value: the number.
+        digits: number of significant digits.
+    """
     value = float(value)
     if not np.isfinite(value):
         return "not known"
@@ -194,5 +205,5 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def probability(value: float) -> str:
-    """Write a probability with "p" before it and three decimals, smaller ones as such."""
+    """Format a probability as "p = 0.012", with three decimals, or as "p < 0.001" if it is smaller."""
     return f"p < {MIN_PROBABILITY:g}" if value < MIN_PROBABILITY else f"p = {value:.3f}"

@@ -1,7 +1,8 @@
-"""Remark: one finding about a result, as data. The catalogue makes its sentence, cause and remedy.
+"""Remark: one finding about a result, as data.
 
-A kind is a row of the catalogue (`sfm.remarks.catalogue`). Code that finds something returns a remark of that
-kind with its subjects and numbers; it contains no English.
+Each kind of remark is a row of the catalogue (`sfm.remarks.catalogue`). Code that finds something returns a
+remark of that kind with its subjects and numbers, and contains no English. The catalogue supplies the
+sentence, the cause and the remedy.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most seri
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its unit; the unit of a pure number is empty."""
+    """A number with its unit; a dimensionless number has an empty unit."""
 
     value: float
     unit: str = ""
@@ -42,51 +43,51 @@ class Remark:
         default_factory=dict
     )  # names by their role in the sentence
     numbers: Mapping[str, Quantity] = field(default_factory=dict)
-    at_least: Severity = "note"  # severity of what it explains
+    at_least: Severity = "note"  # worst severity of the remarks that it explains
 
     @property
     def row(self) -> Kind:
-        """Its row of the catalogue."""
+        """Row of its kind in the catalogue."""
         from sfm.remarks.catalogue import KINDS
 
         return KINDS[self.kind]
 
     @property
     def severity(self) -> Severity:
-        """How much it matters, by the catalogue and by what it explains: note, warning or error."""
+        """Severity, from the catalogue and from the remarks that it explains: note, warning or error."""
         return min(self.row.severity_of(self), self.at_least, key=SEVERITIES.index)
 
     @property
     def text(self) -> str:
-        """Its sentence, by the catalogue."""
+        """Sentence of the catalogue."""
         return self._write(self.row.sentence)
 
     @property
     def cause(self) -> str:
-        """Why it happens, by the catalogue."""
+        """Cause, as the catalogue states it."""
         return self._write(self.row.cause)
 
     @property
     def remedy(self) -> str:
-        """The remedy, by the catalogue."""
+        """Remedy of the catalogue."""
         return self._write(self.row.remedy)
 
     def _write(self, text: str) -> str:
         from sfm.remarks.catalogue import KINDS
 
-        subjects = {  # other kinds have their short names
+        subjects = {  # kinds are replaced by their short names
             role: tuple(KINDS[name].short or name if name in KINDS else name for name in names)
             for role, names in self.subjects.items()
         }
         return self.row.write(text, replace(self, subjects=subjects))
 
     def number(self, name: str) -> float:
-        """Return the value of a number; NaN where the remark has none of that name."""
+        """Return the value of a number, or NaN if the remark has no number of that name."""
         found = self.numbers.get(name)
         return math.nan if found is None else found.value
 
     def names(self, role: str) -> tuple[str, ...]:
-        """Return the names of the subjects of a role; none where the remark has none of that role."""
+        """Return the names of the subjects of a role; an empty tuple if the remark has no such role."""
         return self.subjects.get(role, ())
 
     def as_dict(self) -> dict[str, Any]:
@@ -110,15 +111,15 @@ def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] |
 
     Args:
         kind: row of the catalogue.
-        parts: by the names of the sentence: names (subjects), a number, or a number with its unit.
-            None leaves the part out.
+        parts: parts of the sentence by name: names of subjects, a number, or a number with its unit. A part
+            that is None is left out.
 
     Raises:
         KeyError: the catalogue has no such kind.
     """
     from sfm.remarks.catalogue import KINDS
 
-    KINDS[kind]  # a misspelt kind fails where it is made
+    KINDS[kind]  # a misspelt kind fails where the remark is made
     subjects: dict[str, tuple[str, ...]] = {}
     numbers: dict[str, Quantity] = {}
     for name, part in parts.items():
@@ -138,15 +139,15 @@ def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] |
 
 
 def unless_note(one: Remark) -> tuple[Remark, ...]:
-    """Return a remark only if it is more than a note: by a kind with a grade, the number is conspicuous."""
+    """Return the remark in a tuple if it is more serious than a note, else an empty tuple."""
     return () if one.severity == "note" else (one,)
 
 
 def of_kind(remarks: Iterable[Remark], *kinds: str) -> tuple[Remark, ...]:
-    """Return the remarks of some kinds, in order."""
+    """Return the remarks of the given kinds, in their order."""
     return tuple(one for one in remarks if one.kind in kinds)
 
 
 def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
-    """Return the kinds of remarks, in order."""
+    """Return the kind of each remark, in their order."""
     return tuple(one.kind for one in remarks)

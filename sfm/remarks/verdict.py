@@ -1,6 +1,7 @@
-"""The verdict: what a person reads first. One function judges every kind of result by its remarks.
+"""The verdict on a result: a level and a headline that summarise its remarks.
 
-The most serious remark decides: an error makes a result bad, a warning fair, notes leave it good.
+`judge` serves every kind of result. The most serious remark decides: an error makes the result bad, a warning
+makes it fair, and with notes alone it is good.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ class Line:
 
     severity: Severity
     text: str
-    remedy: str = ""  # with the first of a kind
-    lost: bool = False  # whether a photograph or a point is lost that the remedy brings back
+    remedy: str = ""  # only with the first remark of a kind
+    lost: bool = False  # whether the remedy recovers a lost photograph or point
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The lines that a person reads first."""
+    """The summary of all remarks, which the user reads first."""
 
     level: Level
     headline: str
@@ -37,7 +38,7 @@ class Verdict:
 
     @property
     def lines(self) -> tuple[Line, ...]:
-        """The remarks as printed: the first ones of each kind, and how many more there are."""
+        """The remarks as they are printed: the first ones of each kind, and the number of the others."""
         return lines_of(self.remarks)
 
     def as_dict(self) -> dict[str, Any]:
@@ -47,13 +48,14 @@ class Verdict:
 
 
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
-    """Return the verdict on a result; what others of its remarks explain is left out.
+    """Return the verdict on a result, without the remarks that other remarks explain.
 
-    A warning that explains an error takes its severity: the result is as bad, and the reason is stated.
+    A warning that explains an error takes over its severity: the result is just as bad, and the reason is
+    stated instead.
 
     Args:
-        remarks: all that was found, in the order in which it is to be read within a severity.
-        headlines: what each level means for this kind of result.
+        remarks: all remarks on the result, in reading order within a severity.
+        headlines: headline of each level for this kind of result.
     """
     every = tuple(remarks)
     every = tuple(
@@ -67,21 +69,21 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
 
 
 def _explains(cause: Remark, one: Remark) -> bool:
-    """Return whether a remark follows from another one; from a note with a grade only what is one as well."""
+    """Return whether `cause` explains a remark; a note with a grade explains only other notes."""
     graded = isinstance(cause.row.severity, Grade)
     serious = cause.severity != "note" or one.severity == "note"
     return one.kind in cause.row.explains and (serious or not graded)
 
 
 def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
-    """Return the worst severity of what a remark with a grade explains."""
+    """Return the worst severity of the remarks that a remark with a grade explains."""
     graded = isinstance(cause.row.severity, Grade)
     explained = [one.severity for one in every if graded and _explains(cause, one)]
     return min((cause.at_least, *explained), key=SEVERITIES.index)
 
 
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
-    """Return the lines that are printed: the first ones of a kind and severity, and how many more."""
+    """Return the printed lines: the first remarks of each kind and severity, and the number of the others."""
     groups: dict[tuple[Severity, str], list[Remark]] = {}
     for one in remarks:
         groups.setdefault((one.severity, one.kind), []).append(one)

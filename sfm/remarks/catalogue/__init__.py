@@ -1,6 +1,6 @@
-"""The catalogue of remarks: a row for each kind, in one module for each subject.
+"""The catalogue of remarks: one row for each kind, and one module for each subject.
 
-A new kind is one row. `docs/symptoms.md` has its table from here.
+To add a kind, add a row. The tables in `docs/symptoms.md` are generated from these rows.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""Cameras: which parameters were adjusted, and values that lenses do not have."""
+"""Remarks on cameras: adjusted parameters, and parameter values that no lens has."""
 
 from __future__ import annotations
 
 from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
-# a warning where the 95 % value reaches a pixel, which no one takes for the error of a calibrated
-# camera; an error where the standard deviation does, and image points measured as precisely as those
-# of the calibration would contradict the camera: imprecise ones from all sides are a weak calibration
+# A warning if the 95 % value reaches one pixel, which nobody expects of a calibrated camera. An error if the
+# standard deviation reaches one pixel and is large compared with the image points of the calibration, so that
+# points of that precision would contradict the camera. If these points are imprecise, it is only a weak
+# calibration.
 NOT_CALIBRATED = Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", error=WRONG_SIGMAS))
 
 ROWS = (
@@ -95,7 +96,8 @@ ROWS = (
     ),
     Kind(
         "c_far_from_given",
-        Grade("share", warning=5e-4),  # below it the network is not weak, as in the search of other solutions
+        # Below it the network is not weak, as in the search for other solutions.
+        Grade("share", warning=5e-4),
         "c of camera {camera} was adjusted from {given} to {found}, by {change:+} (standard deviation "
         "{share:%}).",
         "a wrong start value, or a network that does not determine c",
@@ -147,8 +149,8 @@ ROWS = (
     ),
     Kind(
         "c_hardly_determined",
-        # a warning where EXIF data and the size of a sensor give c as well; an error where three standard
-        # deviations reach c = 0
+        # A warning if EXIF data and the sensor size give c equally well; an error if 3 standard deviations
+        # reach c = 0.
         Grade("share", warning=0.05, error=1 / 3),
         "{parameter} of camera {camera} is known only to {share:%}[[, strongly correlated with {partners}]].",
         "a long lens, few photographs, or small angles between them",
@@ -173,7 +175,7 @@ ROWS = (
     ),
     Kind(
         "pixels_distorted",
-        # pixels of sensors are square to 1e-4, scans and pictures that were scaled to a percent
+        # Pixels of sensors are square to 1e-4, those of scans and of scaled photographs to one per cent.
         Grade("share", warning=0.01, error=0.05),
         "The adjusted {parameter} of camera {camera} is {share:%}: no sensor has such pixels.",
         "the network hardly determines it, or wrong matches that it fits",

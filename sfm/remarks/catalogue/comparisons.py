@@ -1,4 +1,4 @@
-"""Remarks on comparisons, epochs, refined models and other programs."""
+"""Remarks on other programs, refined models, comparisons and epochs."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ REFINING = (
     ),
     Kind(
         "key_points_not_measured",
-        Grade("missing", warning=0.5),  # more than half: photographs or windows are wrong
+        Grade("missing", warning=0.5),  # if half or more are missing, photographs or windows are wrong
         "Only {measured} of {total} key points {measured:was|were} re-measured.",
         "photographs of another size or state than those of the model, or little texture",
         "Give the photographs of the model; see the reasons beside the key points.",

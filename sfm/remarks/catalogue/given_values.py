@@ -1,4 +1,4 @@
-"""Remarks on given values, datum and scale."""
+"""Remarks on datum and scale, and on given values: scale bars, control and observed orientation."""
 
 from __future__ import annotations
 
@@ -98,10 +98,9 @@ DATUM = (
 )
 CHECK_THE_LIST = "a number mistyped, the wrong ends or name, another unit, or a point that moved"
 WRONG_SIZE = "pitch is mistyped or nominal, or a plate was printed to another scale"
-# A value that a test rejects is worth a warning, and is an error where it shifts the result beyond what is
-# right.
+# A value that a test rejects deserves a warning. It is an error if it makes the result wrong.
 DETECTED = Grade("shift", error=WRONG_SIGMAS)
-# Held or weighted coordinates of a wrong shape pull image points, points and photographs away.
+# Kinds that follow if fixed or weighted coordinates with a wrong shape distort the network.
 PULLED = (
     *("image_points_rejected", "rays_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
     *("points_with_large_residuals", "photographs_uneven"),
@@ -265,7 +264,7 @@ ROWS = (
     ),
     Kind(
         "given_not_exact",
-        # the test is of the differences: a result that they hardly shift has lost nothing
+        # The test is on the differences; a result that they hardly shift is not harmed.
         Grade("shift", warning=EXPECTED_SIGMAS, error=WRONG_SIGMAS),
         "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points, more "
         "than by chance. This shifts the result by up to {shift} of its standard deviations, which do "

@@ -1,15 +1,15 @@
-"""Remarks on the adjustment, and on alternative hypotheses that win over its assumptions."""
+"""Remarks on the adjustment, and on alternative hypotheses that are preferred to its assumptions."""
 
 from __future__ import annotations
 
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
-# sigma_px is a rough guess, so the global test alone says little. Twice the guess is worth a look; five
-# times is no precision that anybody expected, but a wrong model, wrong names or wrong control.
+# sigma_px is a rough guess, so the global test alone says little. A ratio of 2 deserves a warning. A ratio of
+# 5 is not explained by the guess, but by a wrong model, wrong names or wrong control.
 SIGMA0 = Grade("ratio", warning=2.0, error=5.0)
-# Data snooping leaves nothing beyond 4 or 5 sigma; ten is an outlier, thirty is a mistake that was kept.
+# Data snooping removes residuals beyond 4 or 5 sigma. Ten sigma is an outlier, thirty a mistake left in.
 RESIDUAL = Grade("over_sigma", warning=10.0, error=30.0)
-REJECTED = Grade("share", warning=0.05)  # of the image points; gross errors are one in a hundred
+REJECTED = Grade("share", warning=0.05)  # of the image points; usually 1 % are gross errors
 SOLUTION = Grade("moved", error=WRONG_SIGMAS)  # the result is wrong if the other solution is the true one
 ADJUSTMENT = (
     Kind(
@@ -145,12 +145,12 @@ ADJUSTMENT = (
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),
 )
-# Standard deviations by which a result shifts with the alternative, and by how much it is wrong: the root
-# mean square of coordinates, the largest shift of the few parameters of a camera.
+# `shift`: standard deviations by which the result shifts with the alternative. `wrong`: how wrong it is, as
+# the root mean square shift of coordinates, or the largest shift of the few parameters of a camera.
 SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("wrong", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
 SHIFTED = "{of:@} shift by up to {shift} standard deviations[[, {rms} RMS]]."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
-# what given values contradict where a camera that changed, or a plate that slipped, bends the network
+# Kinds that follow if a camera that changed, or a plate that slipped, bends the network.
 OF_GIVEN = ("given_contradicted", "given_strained", "plate_sizes_contradict", "shape_of_control")
 ROWS = (
     Kind(
@@ -270,7 +270,7 @@ ROWS = (
     ),
     Kind(
         "points_moved",
-        SHIFT,  # a few points leave the RMS of all small
+        SHIFT,  # not the RMS of all points, which a few points hardly change
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
         f"{INSTEAD}",
         "targets or parts of the object moved during the survey",

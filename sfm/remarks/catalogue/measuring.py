@@ -143,7 +143,8 @@ POINTS = (
     ),
     Kind(
         "second_motion",
-        # of rendered scenes none without a motion; a twentieth may be the object, hidden by what moves
+        # No rendered scene without motion has this remark. One twentieth of the points may be the object
+        # itself, mostly hidden by things that move.
         Grade("share", warning=0.01, error=0.05),
         "{points:tie point}, {share:%} of all, in {photographs} {points:fits|fit} one another but not "
         "the others: the photographs show two things that moved relative to each other.",
@@ -153,8 +154,8 @@ POINTS = (
     ),
     Kind(
         "windows_disagree",
-        # 0.04 to 0.09 on stone and rendered surfaces; of windows at random within 3 px of where they are
-        # looked for 0.33 agree by chance (ten photographs of a telephone)
+        # The share is 0.04 to 0.09 on stone and rendered surfaces. Of windows placed at random within 3 px of
+        # the predicted positions, 0.33 agree by chance (ten photographs of a telephone).
         Grade("share", warning=0.3, error=0.6),
         "{share:%} of the matched windows disagree with each other, and some of the others agree only by "
         "chance.",

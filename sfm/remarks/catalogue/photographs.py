@@ -1,4 +1,4 @@
-"""Remarks on photographs, on input, and on drafts of survey files."""
+"""Remarks on photographs, on the input, and on drafts of survey files."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ INPUT = (
 ROWS = (
     Kind(
         "photographs_missing",
-        Grade("share", error=0.5),  # half of them or more: the rest may be the wrong half
+        Grade("share", error=0.5),  # if half or more are missing, the others may be the wrong half
         "{missing} of {total} photographs {missing:is|are} not in the result.",
         "damaged files, too few common points, or start values that do not fit",
         "The report states the reason of each.",
@@ -247,7 +247,7 @@ ROWS = (
         "the photographs do not decide which of the two is true",
         "Add points off the plane, or a third photograph.",
     ),
-    # reasons of single photographs that are not in the result
+    # reasons why single photographs are not in the result
     Kind(
         "copy_of_file",
         "note",
