@@ -66,7 +66,7 @@ def reduce_network(
     )
 
 
-def supported(
+def select_supported(
     network: Network,
     estimate: Estimate,
     accepted: BoolArray,
@@ -101,7 +101,7 @@ def supported(
         images, points = still_images, still_points
 
 
-def determined(
+def select_determined(
     network: Network,
     estimate: Estimate,
     accepted: BoolArray,
@@ -120,7 +120,7 @@ def determined(
     Raises:
         GeometryError: fewer than two photographs remain.
     """
-    images, points = supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
+    images, points = select_supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
         raise GeometryError(
             f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "

@@ -22,7 +22,7 @@ from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
 from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution
-from sfm.targets.outlines import LIKEST_FIRST, Flag, count_flags
+from sfm.targets.outlines import LIKELIEST_FIRST, Flag, count_flags
 
 COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
 
@@ -310,12 +310,12 @@ def _reason(flag: int) -> str:
     return ", ".join(names) or "no reason kept"
 
 
-def likest_first(reasons: Iterable[str]) -> list[str]:
+def sort_likeliest_first(reasons: Iterable[str]) -> list[str]:
     """Sort reasons for rejection so that reasons for the most target-like candidates come first.
 
     Reasons that do not concern a candidate, such as a target measured but not used, precede them all.
     """
-    rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKEST_FIRST)}
+    rank = {in_words(str(flag.name).lower()): k for k, flag in enumerate(LIKELIEST_FIRST)}
     return sorted(reasons, key=lambda reason: (rank.get(reason, -1), reason))
 
 

@@ -56,7 +56,7 @@ from sfm.report.phrases import (
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.tables.csv_files import left_out_rows, table_stems
 from sfm.report.viewer.embedded import Viewer
-from sfm.result import likest_first
+from sfm.result import sort_likeliest_first
 
 MAX_LISTED = 60  # rejected points and thumbnails on the page
 MAX_OPEN = 60  # object points that are shown without a click
@@ -318,7 +318,7 @@ def _candidates(f: Findings) -> FoldedParts:
     used = dict(zip(f.result.adjustment.network.images, f.geometry.image_points.tolist(), strict=True))
     counts = {one.image: Counter(dict(one.reasons())) for one in result.photographs}
     every = sum(counts.values(), Counter[str]())
-    reasons = likest_first(every)
+    reasons = sort_likeliest_first(every)
     rows = [
         (one.image, len(one.xy), used.get(one.image, 0), *(counts[one.image][why] or "" for why in reasons))
         for one in result.photographs

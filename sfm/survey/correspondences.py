@@ -20,7 +20,7 @@ from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
-from sfm.reduced_network import MIN_IMAGE_POINTS, determined, merge_estimate, reduce_network
+from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark
 from sfm.result import Eccentricity, PhotographTargets
 from sfm.runtime.progress import reported
@@ -193,7 +193,7 @@ def _match_and_adjust(
         naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
         network = build_network(survey, photographs, naming)
         everything = np.ones(len(network.image_points), dtype=bool)
-        images, points = determined(network, estimate, everything, min_rays(naming))
+        images, points = select_determined(network, estimate, everything, min_rays(naming))
         part, values = reduce_network(without_given(network), estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
         estimate = restore_strayed(estimate, adjusted, images, points, tolerance_px=tolerance_px)

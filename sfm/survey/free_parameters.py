@@ -24,7 +24,7 @@ from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, without_given
-from sfm.reduced_network import reduce_network, supported
+from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
@@ -74,7 +74,7 @@ def choose_free_parameters(
     names: Chosen = [set(one.may_be_free) if a in silent else None for a, one in enumerate(survey.cameras)]
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
-    images, points = supported(
+    images, points = select_supported(
         network, estimate, everything, min_points=MIN_IMAGE_POINTS,
         min_rays=np.full(len(network.points), MIN_RAYS),
     )  # fmt: skip

@@ -49,9 +49,16 @@ from sfm.report.phrases import (
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.result import ControlCheck, FailedImage, PhotographTargets, StageTime, SurveyResult, likest_first
+from sfm.result import (
+    ControlCheck,
+    FailedImage,
+    PhotographTargets,
+    StageTime,
+    SurveyResult,
+    sort_likeliest_first,
+)
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
-from sfm.targets.outlines import LIKEST_FIRST, Flag
+from sfm.targets.outlines import LIKELIEST_FIRST, Flag
 from tests.browser import Tab
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT
@@ -447,9 +454,9 @@ def test_reasons_are_reported_from_what_is_most_like_a_target(result: SurveyResu
     found = findings_of(replace(result, photographs=(replace(first, rejected_flag=flag),)))
     page = html_of(found)
     assert page.index(">poor fit<") < page.index(">too small<")  # and not the most frequent first
-    assert set(likest_first(["too small", "measured", "poor fit"])[:1]) == {"measured"}
+    assert set(sort_likeliest_first(["too small", "measured", "poor fit"])[:1]) == {"measured"}
     rejections = {flag for flag in Flag if Flag.CUT_BY_BORDER <= flag < Flag.DAMAGED}
-    assert set(LIKEST_FIRST) == rejections
+    assert set(LIKELIEST_FIRST) == rejections
 
 
 def test_fixed_coordinates_have_neither_unknown_precision_nor_residuals() -> None:

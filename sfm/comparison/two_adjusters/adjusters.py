@@ -38,7 +38,7 @@ from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
-from sfm.reduced_network import reduce_network, supported
+from sfm.reduced_network import reduce_network, select_supported
 from sfm.runtime.progress import report_step
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph
@@ -272,7 +272,7 @@ def common_problem(
         if (now.free & ~camera.free).any()
     )
     accepted = ~adjustment.rejected
-    images, points = supported(
+    images, points = select_supported(
         adjustment.network, estimate, accepted, min_points=MIN_POINTS, min_rays=MIN_RAYS
     )
     if images.sum() < 2:

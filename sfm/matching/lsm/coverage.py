@@ -158,7 +158,7 @@ def _keep_apart(
             before[k], latest[at] = latest[at], k
 
 
-def pictures_of(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
+def project_points(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the image of one object point per row, px, NaN behind the photograph, (k, 2)."""
     UVW = _in_image_axes(estimate, image, points)
     out = np.full((len(image), 2), np.nan)
@@ -200,7 +200,7 @@ def plane_warps(
         uv = tangents_from_pixel(lens, xy + np.array(offset))
         d = ray_directions(uv, R)
         on_plane = X0 + d * (height / np.einsum("kc,kc->k", normal, d))[:, None]
-        return pictures_of(estimate, camera, other, on_plane)
+        return project_points(estimate, camera, other, on_plane)
 
     h = reach_px
     middle = seen((0.0, 0.0))

@@ -47,7 +47,7 @@ from sfm.report.viewer.pictures import (
     cut_pictures,
     distance_sigmas,
 )
-from sfm.result import likest_first
+from sfm.result import sort_likeliest_first
 from sfm.solution import SeenTargets, Solution
 
 if TYPE_CHECKING:
@@ -342,7 +342,7 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     kept = np.flatnonzero(left)
     kept = kept[np.argsort(seen.image[kept], kind="stable")]
     words = [seen.reason[k] or UNUSED for k in kept.tolist()]
-    reasons = {word: number for number, word in enumerate(likest_first(set(words)))}
+    reasons = {word: number for number, word in enumerate(sort_likeliest_first(set(words)))}
     number = np.array([reasons[word] for word in words], dtype=np.int64)
     return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
 

@@ -35,7 +35,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed
 from sfm.orientation.image_rays import ray_angles
-from sfm.reduced_network import determined, merge_estimate, reduce_network
+from sfm.reduced_network import merge_estimate, reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import reverse_depth
 from sfm.survey.diagnosis.photograph_cameras import PhotographCameras, find_photograph_cameras
@@ -141,7 +141,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
     everything = np.ones(len(network.image_points), dtype=bool)
     accepted = everything if accepted is None else accepted
     wrong: BoolArray | None = None
-    images, points = determined(network, estimate, everything, task.needed, task.least)
+    images, points = select_determined(network, estimate, everything, task.needed, task.least)
     while True:
         part, start = reduce_network(network, estimate, images, points, np.ones_like(accepted))
         refuse_too_few_observations(part, start, task.datum.kind)
@@ -161,7 +161,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         accepted &= ~wrong[network.image_points.point]
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))
         rays = np.where(points, now, rays)
-        left_images, left_points = determined(network, estimate, accepted, task.needed, task.least)
+        left_images, left_points = select_determined(network, estimate, accepted, task.needed, task.least)
         if (left_images == images).all() and (left_points == points).all():
             return StableAdjustment(
                 task, adjustment, images, points, accepted, iterations, rays, start_sigma0, held

@@ -45,7 +45,7 @@ from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
-from sfm.reduced_network import reduce_network, supported
+from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.similarity import mean_distance, nearest_rotation
 from sfm.solution import Solution
@@ -412,7 +412,9 @@ def find_second_objects(
 def _adjust_fitting(network: Network, found: Orientation) -> Solution | None:
     """Adjust the image points that fit an orientation by themselves; None without a solution."""
     alone = Network(network.images, network.camera, network.points, network.image_points)
-    images, points = supported(alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS)
+    images, points = select_supported(
+        alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS
+    )
     part, start = reduce_network(alone, found.estimate, images, points, found.fits)
     a = adjust(part, start, datum=Datum("free"), reject="tau")
     if not a.converged or a.undetermined:

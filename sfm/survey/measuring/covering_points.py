@@ -18,7 +18,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.threads import in_threads
-from sfm.matching.lsm.coverage import CoveredPixels, Windows, pictures_of, plane_warps
+from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
@@ -163,7 +163,7 @@ def _visible(
     visible = np.zeros((len(covered.shapes), len(squares)), dtype=bool)
     free = visible.copy()
     for j in np.flatnonzero(estimate.oriented).tolist():
-        at = pictures_of(estimate, camera, np.full(len(squares.xy), j), squares.points)
+        at = project_points(estimate, camera, np.full(len(squares.xy), j), squares.points)
         size = np.array(covered.shapes[j][::-1])
         ray = estimate.position[j] - squares.points
         cosine = np.sum(ray * squares.normal, axis=1) / np.linalg.norm(ray, axis=1)
@@ -205,7 +205,7 @@ def _match_squares(
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
 
     def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
-        at = pictures_of(estimate, camera, np.full(len(rows), j), points[rows])
+        at = project_points(estimate, camera, np.full(len(rows), j), points[rows])
         warp = plane_warps(
             estimate, camera, i, j, squares.xy[rows], points[rows], squares.normal[rows], windows.side_px / 2
         )

@@ -19,7 +19,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import Windows, first_alike, pictures_of
+from sfm.matching.lsm.coverage import Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
@@ -173,7 +173,7 @@ def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     """Return which rays of the tie points fit and belong to points that keep enough rays, (k,)."""
     seen = network.image_points
     off = np.hypot(
-        *(pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy).T
+        *(project_points(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy).T
     )
     known = np.isfinite(off)
     if not known.any():

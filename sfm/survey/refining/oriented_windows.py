@@ -21,7 +21,7 @@ from sfm.matching.correlation import LsmFlag, in_words
 from sfm.matching.lsm.coverage import points_apart
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.reduced_network import determined, merge_estimate, reduce_network
+from sfm.reduced_network import merge_estimate, reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
@@ -214,7 +214,7 @@ def part_of(
         accepted: accepted image points, (k,).
         rays: rays that each point needs, (n,).
     """
-    images, points = determined(network, estimate, accepted, rays)
+    images, points = select_determined(network, estimate, accepted, rays)
     part, start = reduce_network(network, estimate, images, points, accepted)
     return part, start, images, points
 

@@ -23,7 +23,7 @@ from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import MAX_COST_RATIO, pictures_of
+from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark, unless_note
@@ -226,7 +226,7 @@ def refine_model(
     if not len(seen):
         raise GeometryError("refine: no key point of the model has a point, nothing to refine")
     estimate = replace(estimate, cameras=free_cameras(network, estimate, settings.fixed))
-    residuals = pictures_of(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
+    residuals = project_points(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy
     depth, distance = _lengths(network, estimate)
     within = depth > np.cos(np.radians(MAX_OFF_AXIS_DEG)) * distance
     usable = np.isfinite(residuals).all(axis=1) & within
@@ -326,7 +326,7 @@ def _residual_px(network: Network, whole: Estimate, windows: Windows) -> FloatAr
     seen = network.image_points
     measured = np.isfinite(windows.xy).all(axis=1)
     rays = np.bincount(seen.point[measured], minlength=len(network.points))
-    v = pictures_of(whole, network.camera, seen.image, whole.points[seen.point]) - windows.xy
+    v = project_points(whole, network.camera, seen.image, whole.points[seen.point]) - windows.xy
     return np.where(rays[seen.point] >= MIN_RAYS, np.abs(v).max(axis=1), np.nan)
 
 
