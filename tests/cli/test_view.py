@@ -234,7 +234,7 @@ def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -
         match_command(*photographs, point="80,80", method="sift")
     with pytest.raises(GeometryError, match="expected one of bilinear, bicubic, six_tap"):
         match_command(*photographs, point="80,80", interpolation="nearest")
-    with pytest.raises(PhotographError, match=r"LEFT \.: a folder"):
+    with pytest.raises(PhotographError, match=r"LEFT \.: is a folder"):
         match_command(Path(), photographs[1], point="80,80")
     blocked = tmp_path / "blocked"
     blocked.touch()

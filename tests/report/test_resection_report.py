@@ -129,7 +129,7 @@ def test_bad_files(tmp_path, four):
             read_task(options.pop("path", four), **options)
 
     refused("principal distance is missing")
-    refused("it must be positive", c_mm=-1)
+    refused("expected more than 0", c_mm=-1)
     refused("the table cannot be read: No such file", path=tmp_path / "none.csv", c_mm=24)
     refused(r"--start '1,2': expected X,Y,Z or X,Y,Z,omega,phi,kappa", c_mm=24, start="1,2")
     (tmp_path / "a.csv").write_text("point,X,Y,x_mm,y_mm\n1,2,3,4,5\n")
