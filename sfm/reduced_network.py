@@ -122,9 +122,10 @@ def select_determined(
     """
     images, points = select_supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
+        needed = " or ".join(str(one) for one in np.unique(min_points))
         raise GeometryError(
-            f"{images.sum()} of {len(images)} photographs see at least {MIN_IMAGE_POINTS} points of the "
-            "network, at least 2 photographs are needed"
+            f"{images.sum()} of {len(images)} photographs see enough points of the network (at least "
+            f"{needed}), at least 2 photographs are needed"
         )
     return images, points
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.conventions import FloatArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, KolinearError
 from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.reduced_network import reduce_network
+from sfm.reduced_network import reduce_network, select_determined
 from tests.synthetic import make_network, seed_of
 
 
@@ -56,6 +56,15 @@ def test_reduced_network_keeps_measurements_of_what_is_left() -> None:
         )
     }
     assert new == old
+
+
+@pytest.mark.parametrize(("min_points", "said"), [(13, "13"), (np.array([14, 13, 14]), "13 or 14")])
+def test_reason_states_the_points_that_photographs_need(min_points: int | IntArray, said: str) -> None:
+    network, truth = make_network(seed_of("needed points"), images=3, points=12)
+    every = np.ones(len(network.image_points), dtype=bool)
+    rays = np.ones(12, dtype=np.int64)
+    with pytest.raises(GeometryError, match=rf"^0 of 3 photographs see .* \(at least {said}\)"):
+        select_determined(network, truth, every, rays, min_points)
 
 
 def test_rays_count_the_photographs_of_a_point() -> None:
