@@ -1,18 +1,23 @@
-"""Adjustment timed against COLMAP's Ceres adjuster on the same networks: problem set-up plus solve, warm.
+"""Times the adjustment against COLMAP's Ceres adjuster on the same networks: set-up plus solution, warm.
 
     python -m benchmarks.adjustment [--networks small|all|block] [--no-covariance] [--repeat N] [--cpu]
     python -m benchmarks.adjustment --growth [--photographs N] [--ceres] [--ceres-limit S] [--cpu]
 
-Both start from the same values and adjust the same 8 shared parameters of an `opencv` camera. "default" is
-what a user of pycolmap gets; "best" is pycolmap tuned: DENSE_SCHUR or SPARSE_SCHUR, whichever wins,
-function_tolerance 1e-6, start radius 1e8, 1 or 2 threads, whichever wins. Both stop at the same relative
-decrease of the cost, 1e-6 = (|A dx| / |v|)^2; how near to the optimum each ends is printed against an
-adjustment to the last digit. pycolmap's scene is built from arrays before the clock starts, as the network
-is. --growth adjusts blocks of 100 to 10,000 photographs and a dense convergent network of 1,000 x 1,000
-without the covariance, each adjuster in a separate process; the limit for Ceres is of wall time and
-includes building its scene. Only ratios within one run mean anything; run it on a machine that does nothing
-else. With --cpu everything gets one thread and CPU time is compared, which other programs disturb less.
-Memory is the peak of a separate process while it adjusts, network or scene included.
+Both adjusters start from the same values and adjust the same 8 shared parameters of an `opencv` camera.
+"default" is pycolmap with its default settings. "best" is pycolmap tuned: the faster of DENSE_SCHUR and
+SPARSE_SCHUR, function_tolerance 1e-6, start radius 1e8, and the faster of 1 and 2 threads.
+
+Both adjusters stop at the same relative decrease of the cost, 1e-6 = (|A dx| / |v|)^2. The distance of each
+cost from the optimum is printed; the optimum is an adjustment to the last digit. The network and pycolmap's
+scene are built from arrays before the clock starts.
+
+--growth adjusts blocks of 100 to 10,000 photographs and a dense convergent network of 1,000 x 1,000 without
+the covariance, each adjuster in a separate process. The time limit of Ceres is wall time and includes
+building its scene.
+
+Only ratios within one run are meaningful; use an otherwise idle machine. With --cpu, both adjusters have one
+thread and CPU time is compared, which other programs disturb less. Memory is the peak of a separate process
+while it adjusts, including the network or scene.
 """
 
 from __future__ import annotations
@@ -37,9 +42,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, Network
 
-SLOW_S = 20.0  # a run that takes longer is not repeated
-COST_TOLERANCE = 1e-6  # relative decrease of the cost at which both stop
-LAST_DIGIT = 1e-9  # |A dx| / |v| of the adjustment that the costs are compared with
+SLOW_S = 20.0  # longer runs are not repeated
+COST_TOLERANCE = 1e-6  # relative decrease of the cost at which both adjusters stop
+LAST_DIGIT = 1e-9  # |A dx| / |v| of the adjustment that defines the optimum
 SOLVERS = ("DENSE_SCHUR", "SPARSE_SCHUR")
 
 
@@ -60,12 +65,10 @@ CASES = (
     Case("convergent 400 / 5000", "all", lambda: convergent(400, 5000, 0.26)),
     Case("block 1000 / 99000", "block", lambda: block(25, 40)),
 )
-# strips and photographs in each, of the blocks of --growth
+# number of strips and of photographs per strip, for the blocks of --growth
 GROWTH = ((10, 10), (15, 20), (25, 40), (50, 60), (100, 100))
-DENSE = (
-    1000  # photographs and points of the dense convergent network of --growth, each point in three of four
-)
-MEMORY_BLOCK = (25, 40)  # whose peak memory is compared
+DENSE = 1000  # photographs and points of the dense network of --growth; three of four photographs see a point
+MEMORY_BLOCK = (25, 40)  # strips and photographs per strip of the block whose peak memory is compared
 
 
 def main() -> None:
@@ -75,17 +78,17 @@ def main() -> None:
     parser.add_argument("--no-covariance", action="store_true")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--cpu", action="store_true")
-    parser.add_argument("--growth", action="store_true", help="how time and memory grow with a block")
-    parser.add_argument("--photographs", type=int, default=1000, help="of the largest block of --growth")
-    parser.add_argument("--ceres", action="store_true", help="COLMAP's adjuster beside it in --growth")
+    parser.add_argument("--growth", action="store_true", help="print how time and memory grow with a block")
+    parser.add_argument("--photographs", type=int, default=1000, help="number in the largest block")
+    parser.add_argument("--ceres", action="store_true", help="also run COLMAP's adjuster in --growth")
     parser.add_argument(
-        "--ceres-limit", type=float, default=600.0, help="s for each network, building included"
+        "--ceres-limit", type=float, default=600.0, help="limit per network including building, s"
     )
     parser.add_argument(
-        "--grown", choices=("adjust", "ceres"), help="one network of --growth, and its --size"
+        "--grown", choices=("adjust", "ceres"), help="run one network of --growth of a --size"
     )
-    parser.add_argument("--size", default="10,10", help="strips, photographs in each; or dense")
-    parser.add_argument("--peak", choices=("adjust", "best"), help="peak memory, block only")
+    parser.add_argument("--size", default="10,10", help="strips,photographs per strip; or dense")
+    parser.add_argument("--peak", choices=("adjust", "best"), help="print the peak memory for the block")
     options = parser.parse_args()
     clock = time.process_time if options.cpu else time.perf_counter
     if options.cpu:
@@ -152,7 +155,7 @@ def ms(seconds: float, width: int = 10) -> str:
 
 
 def timed(run: Callable[[], Any], repeat: int, clock: Callable[[], float]) -> tuple[float, Any]:
-    """Return the shortest of some runs after a warm one, and its result."""
+    """Return the shortest time of several runs after a warm-up run, and the result."""
     times = []
     for _ in range(repeat + 1):
         started = clock()
@@ -229,7 +232,7 @@ def run_ceres(scene: Any, tuned: tuple[str, int] | None, *, covariance: bool = F
 
 
 def reconstruction(network: Network, start: Estimate) -> Any:
-    """Build pycolmap's scene; half a pixel makes no difference to the time and is left out."""
+    """Build pycolmap's scene, without the shift by half a pixel, which does not affect the time."""
     import pycolmap
 
     scene = pycolmap.Reconstruction()
@@ -263,13 +266,13 @@ def reconstruction(network: Network, start: Estimate) -> Any:
 
 
 def growth(repeat: int, most: int, ceres_limit: float, *, cpu: bool) -> None:
-    """Print how time and peak memory grow with the photographs of a block, and those of a dense network.
+    """Print how time and peak memory grow with the photographs of a block, and both for a dense network.
 
     Args:
-        repeat: runs after a warm one, at most; one that takes long is not repeated.
+        repeat: largest number of runs after a warm-up run; slow runs are not repeated.
         most: photographs of the largest network.
-        ceres_limit: s, after which COLMAP's adjuster is stopped; 0: it is left out.
-        cpu: whether CPU time of one thread is meant.
+        ceres_limit: time after which COLMAP's adjuster is stopped, s; 0 to leave it out.
+        cpu: whether to measure CPU time of one thread.
     """
     print(f"{'network':>20}{'image points':>14}{'adjust':>10}{'us/point':>10}{'peak':>9}{'grows':>8}", end="")
     print(f"{'Ceres':>12}{'peak':>9}{'faster':>8}" if ceres_limit else "")
@@ -301,7 +304,7 @@ def growth(repeat: int, most: int, ceres_limit: float, *, cpu: bool) -> None:
 def grown(
     what: str, size: str, repeat: int, cpu: bool, limit: float | None = None
 ) -> tuple[float, float, float]:
-    """Return image points, s and peak memory, MB, of a network that is adjusted in a separate process."""
+    """Adjust a network in a separate process; return number of image points, time, s, peak memory, MB."""
     command = [
         sys.executable,
         "-m",
@@ -320,7 +323,7 @@ def grown(
 
 
 def grown_here(what: str, size: str, repeat: int, clock: Callable[[], float], threads: int) -> str:
-    """Return what `grown` reads: image points, s and MB, of an adjustment in this process."""
+    """Adjust a network in this process; return the line that `grown` reads: image points, s and MB."""
     if size == "dense":
         network, start = convergent(DENSE, DENSE, 0.75)
     else:
@@ -342,7 +345,7 @@ def grown_here(what: str, size: str, repeat: int, clock: Callable[[], float], th
 
 
 def peak_of(what: str) -> float:
-    """Adjust the block in one way and return the peak memory of this process meanwhile, MB."""
+    """Adjust the block with one adjuster and return the peak memory of this process meanwhile, MB."""
     network, start = block(*MEMORY_BLOCK)
     if what == "adjust":
         run_adjust(*block(9, 8))  # kernels are there, as they are in any second adjustment
@@ -358,7 +361,7 @@ def peak_of(what: str) -> float:
 
 
 def forget_peak() -> None:
-    """Give back free memory, and begin the peak memory of this process anew."""
+    """Return free memory to the system, and reset the peak memory of this process."""
     ctypes.CDLL("libc.so.6").malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")
 
@@ -370,7 +373,7 @@ def peak_mb() -> float:
 
 
 def peak_in_own_process(what: str) -> float:
-    """Return what `peak_of` finds in a separate process, MB."""
+    """Return the peak memory that `peak_of` measures in a separate process, MB."""
     command = [sys.executable, "-m", "benchmarks.adjustment", "--peak", what]
     return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 

@@ -1,20 +1,23 @@
-"""A result from either half of its object points: do the two agree as well as their covariances say?
+"""Tests the covariance of a result: do adjustments of two halves of its object points agree as predicted?
 
     python -m benchmarks.halves build/fountain/result
     python -m benchmarks.halves build/fountain/result build/fountain/colmap --ways checker stripes --draws 4
 
-Object points are halved in four ways: by chance, as a checkerboard and in stripes over the object, and into
-near and far ones; each several times, with other chance, boards and stripes that are turned and shifted, and
-near and far as other photographs see it. Neighbours share errors that are smooth over a photograph; by chance
-both halves have them in common, in the other ways they do not. Each half of the accepted image points is
-adjusted anew with what is free in the result, and the projection centres of both are compared after a
-similarity. What is predicted for their difference has the correlation of errors that the residuals of the
-whole show, between the halves, too. Points are halved by their rays: two intersections of each point from
-alternate photographs with the orientation of the whole.
+Object points are halved in four ways: at random, as a checkerboard over the object, in stripes over the
+object, and into near and far points. Each way is drawn several times: with other random numbers, with rotated
+and shifted boards and stripes, and with near and far as other photographs see them. Neighbouring points share
+errors that are smooth over a photograph. Random halves have these errors in common; the other halves do not.
 
-A ratio of 1 says that differences are what their standard deviations say: the root of the mean over the draws
-of squared differences over what is predicted of each. Draws of one way have image points and few deciding
-directions in common: the standard deviation of the ratio beside it is that of all draws together.
+Each half of the accepted image points is adjusted again with the free parameters of the result. The
+projection centres of both halves are compared after a similarity. The predicted difference takes into account
+the correlation of errors that the residuals of the whole result show, also between the halves.
+
+Points are tested by halving their rays: each point is intersected twice, from alternate photographs, with the
+orientation of the whole result.
+
+The ratio is the root mean square, over the draws, of the difference over the predicted difference. A ratio of
+1 means that the standard deviations are right. Draws of one way have image points and a few decisive
+directions in common; the standard deviation of the ratio is for all draws together.
 """
 
 from __future__ import annotations
@@ -42,19 +45,19 @@ from sfm.similarity import fit_similarity
 
 WAYS = ("random", "checker", "stripes", "near-far")
 STEPS = np.eye(2)  # px
-DRAWS = 8  # of halves of each way
-CELLS = 8  # of the checkerboard along the longer side of the object
+DRAWS = 8  # pairs of halves for each way
+CELLS = 8  # cells of the checkerboard along the longer side of the object
 STRIPES = 4
-MIN_RAYS = 2  # of a point in each half of its rays
+MIN_RAYS = 2  # fewest rays of a point in each half
 HEAD = "result            way        points       ppm  predicted   ratio  sigma"
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
-    parser.add_argument("results", type=Path, nargs="+", help="folders of results, or models of COLMAP")
+    parser.add_argument("results", type=Path, nargs="+", help="result folders or COLMAP models")
     parser.add_argument("--ways", nargs="+", default=WAYS, choices=WAYS)
-    parser.add_argument("--draws", type=int, default=DRAWS, help="pairs of halves of each way")
+    parser.add_argument("--draws", type=int, default=DRAWS, help="pairs of halves for each way")
     parser.add_argument("--equal", action="store_true", help="weight all image points alike")
     arguments = parser.parse_args()
     print(HEAD)
@@ -88,10 +91,10 @@ def _print(
 def _of_centres(
     whole: Adjustment, correlation: ErrorCorrelation | None, way: str, draws: int
 ) -> tuple[int, float, float, float, float]:
-    """Return number of points, RMS difference of the centres, what is predicted, the ratio and its sigma.
+    """Return number of points, RMS difference of the centres, predicted difference, ratio and its sigma.
 
-    Differences are relative to the mean distance of the centres from the middle of the object. The ratio
-    takes all draws alike.
+    Differences are relative to the mean distance of the centres from the middle of the object. All draws have
+    the same weight in the ratio.
     """
     network, estimate, seen = whole.network, whole.estimate, whole.network.image_points
     m = len(network.images)
@@ -112,13 +115,13 @@ def _of_centres(
         covariance += correlated_sum(seen.image, seen.xy, relative, Z, correlation)
     predicted = np.diagonal(covariance).reshape(draws, -1).sum(axis=1)
     size = np.repeat(np.sqrt(predicted), 3 * m)
-    sigma = np.sqrt(((covariance / np.outer(size, size)) ** 2).sum() / 2) / draws  # of a root with mean 1
+    sigma = np.sqrt(((covariance / np.outer(size, size)) ** 2).sum() / 2) / draws  # of a root near 1
     rms, expected = (float(np.sqrt(one.mean() / m)) for one in (found, predicted))
     return len(network.points), rms, expected, float(np.sqrt((found / predicted).mean())), float(sigma)
 
 
 def _influence(adjustment: Adjustment) -> FloatArray:
-    """Return d centres / d errors of one standard deviation in the datum on the centres, (k, 2, 3 m)."""
+    """Return the derivatives of the centres by standardised errors, datum on the centres, (k, 2, 3 m)."""
     marginal, m = marginal_of(adjustment, cross=False), len(adjustment.estimate.position)
     Z = marginal.influence.of(np.arange(6 * m), np.zeros(0, dtype=np.int64)) @ onto_centres(adjustment).T
     Z = Z.reshape(len(Z), 2, m, 6)[..., :3].reshape(len(Z), 2, 3 * m)
@@ -126,7 +129,7 @@ def _influence(adjustment: Adjustment) -> FloatArray:
 
 
 def _adjusted(network: Network, estimate: Estimate, points: BoolArray) -> Adjustment:
-    """Return the adjustment of some of the points, all photographs in it."""
+    """Return the adjustment of some of the points and all photographs."""
     everything = np.ones(len(network.image_points), dtype=bool)
     images = np.ones(len(network.images), dtype=bool)
     part, start = reduce_network(network, estimate, images, points, everything)
@@ -134,7 +137,7 @@ def _adjusted(network: Network, estimate: Estimate, points: BoolArray) -> Adjust
 
 
 def _halves(xyz: FloatArray, centres: FloatArray, way: str, draws: int) -> Iterator[BoolArray]:
-    """Yield halves of points: which are in the first."""
+    """Yield masks of the points in the first half."""
     rng = np.random.default_rng(0)
     middle = np.median(xyz, axis=0)
     axes = np.linalg.svd(xyz - middle, full_matrices=False)[2]
@@ -148,7 +151,7 @@ def _halves(xyz: FloatArray, centres: FloatArray, way: str, draws: int) -> Itera
             yield rng.random(len(xyz)) < 0.5
         elif way == "checker":
             yield np.floor(at * CELLS / extent + shift).sum(axis=1) % 2 == 0
-        elif way == "stripes":  # of as many points each
+        elif way == "stripes":  # with the same number of points each
             rank = np.argsort(np.argsort(at[:, 0])) / len(at)
             yield np.floor(rank * STRIPES + shift[0]) % 2 == 0
         else:
@@ -157,7 +160,7 @@ def _halves(xyz: FloatArray, centres: FloatArray, way: str, draws: int) -> Itera
 
 
 def _of_points(network: Network, estimate: Estimate, sigma0: float) -> tuple[int, float, float, float]:
-    """Return the same of points that are intersected from alternate rays, each with its covariance."""
+    """Return the same figures, without sigma, for points intersected from alternate rays."""
     seen = network.image_points
     rank = np.zeros(len(seen), dtype=np.int64)
     order = np.lexsort([seen.image, seen.point])
@@ -182,7 +185,7 @@ def _of_points(network: Network, estimate: Estimate, sigma0: float) -> tuple[int
     (a, of_a), (b, of_b) = found
     scale = np.linalg.norm(estimate.position[:, None] - np.nanmean(a, axis=0), axis=2).mean()
     trace = np.einsum("nii->n", of_a + of_b)
-    usual = trace < np.quantile(trace, 0.99)  # a few along their rays would decide it
+    usual = trace < np.quantile(trace, 0.99)  # a few points, uncertain along their rays, would dominate
     square = ((a - b) ** 2).sum(axis=1)[usual].mean()
     predicted = sigma0**2 * trace[usual].mean()
     rms, expected = (float(np.sqrt(one) / scale) for one in (square, predicted))

@@ -1,7 +1,7 @@
-"""Matching timed against cv2: LSM and a loop over findTransformECC, NCC and a loop over matchTemplate.
+"""Times matching against cv2: LSM against a loop of findTransformECC, NCC against a loop of matchTemplate.
 
-python -m benchmarks.matching            # ten thousand patches, a thousand templates
-python -m benchmarks.matching --quick    # a tenth of it
+python -m benchmarks.matching            # 10,000 patches, 1,000 templates
+python -m benchmarks.matching --quick    # a tenth of that
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from sfm.matching.lsm.two_photo import match_lsm
 from tests.textures import REACH, Pairs, affine_pairs, random_texture, with_noise
 
 SIGMA = 2.0
-TEXTURES = 500  # different patches; they come again with other noise
+TEXTURES = 500  # different patches, which are repeated with other noise
 HALF = 10
-ECC_STEPS, ECC_EPS = 50, 1e-4  # tighter, ECC is slower and no more precise
-REPEATS = 3  # the fastest of them counts
+ECC_STEPS, ECC_EPS = 50, 1e-4  # with tighter limits, ECC is slower and no more precise
+REPEATS = 3  # the fastest run counts
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def compare_lsm(patches: int) -> None:
-    """LSM with 6 + 2 parameters against ECC with 6 on the same patches of 21 x 21 px."""
+    """Compare LSM with 6 + 2 parameters and ECC with 6 parameters on the same patches of 21 x 21 px."""
     pairs = affine_pairs(1, min(TEXTURES, patches))
     rounds = [
         (with_noise(pairs.left, SIGMA, 2 * i), with_noise(pairs.right, SIGMA, 2 * i + 1))
@@ -43,7 +43,7 @@ def compare_lsm(patches: int) -> None:
     count = len(rounds) * len(pairs.centre)
     ours: list[FloatArray] = []
     theirs: list[FloatArray] = []
-    match_lsm(*rounds[0], pairs.centre[:2], pairs.centre[:2])  # compiled before the clock runs
+    match_lsm(*rounds[0], pairs.centre[:2], pairs.centre[:2])  # compiled before the clock starts
     alone = _fastest(lambda: _all_lsm(rounds, pairs, ours, 1))
     both = _fastest(lambda: _all_lsm(rounds, pairs, ours, 2), clock=time.perf_counter)
     ecc = _fastest(lambda: _all_ecc(rounds, pairs, theirs))
@@ -51,7 +51,7 @@ def compare_lsm(patches: int) -> None:
     bound = SIGMA * np.sqrt(np.trace(pairs.bound, axis1=1, axis2=2).mean() / 2)
     print(f"LSM, {count} patches of 21 x 21 px, noise {SIGMA:g} of 256 in both photographs")
     print(f"  match_lsm, 1 thread    {alone / count * 1e6:7.1f} us a patch   RMS {rms[0]:.5f} px")
-    print(f"  match_lsm, 2 threads   {both / count * 1e6:7.1f} us a patch, by the clock on the wall")
+    print(f"  match_lsm, 2 threads   {both / count * 1e6:7.1f} us a patch, wall time")
     print(f"  cv2.findTransformECC   {ecc / count * 1e6:7.1f} us a patch   RMS {rms[1]:.5f} px")
     print(f"  Cramer-Rao bound                             RMS {bound:.5f} px")
     print(f"  faster {ecc / alone:.1f} times, one thread each")
@@ -59,7 +59,7 @@ def compare_lsm(patches: int) -> None:
 
 
 def compare_ncc(templates: int) -> None:
-    """Correlation of 21 x 21 templates in 121 x 121 windows against the bare loop."""
+    """Compare correlation of 21 x 21 templates in 121 x 121 windows with a bare loop of matchTemplate."""
     y, x = np.mgrid[0:700, 0:700].astype(float)
     texture = random_texture(np.random.default_rng(1), 2.0)
     value = np.vstack([texture.value(x[rows], y[rows]) for rows in np.array_split(np.arange(700), 20)])
@@ -109,7 +109,7 @@ def _rms(found: FloatArray, pairs: Pairs) -> float:
 
 
 def _fastest(work: Callable[[], object], *, clock: Callable[[], float] = time.process_time) -> float:
-    """Return the seconds of the fastest run, of processor time unless another clock is given."""
+    """Return the time of the fastest run, s, by processor time unless another clock is given."""
     best = np.inf
     for _ in range(REPEATS):
         begun = clock()

@@ -1,4 +1,4 @@
-"""Made-up networks that the adjustment is timed on."""
+"""Synthetic networks on which the adjustment is timed."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from sfm.network import Estimate, ImagePoints, Network
 
 NOISE_PX = 0.1
 SIZE_PX = (2000, 1500)
-HEIGHT = 100.0  # of a block over ground
-FOOTPRINT = (100.0, 75.0)  # of a photograph on the ground
+HEIGHT = 100.0  # flying height of a block above the ground
+FOOTPRINT = (100.0, 75.0)  # size of a photograph on the ground
 
 
 def shared_camera() -> Camera:
-    """Return the camera of all networks: distortion, principal distances and principal point are free."""
+    """Return the camera of all networks, with free distortion, principal distances and principal point."""
     return camera_from_values(
         "A",
         "opencv",
@@ -51,12 +51,12 @@ def convergent(images: int, points: int, visibility: float) -> tuple[Network, Es
 
 
 def block(strips: int, per_strip: int, *, rays: float = 6.9) -> tuple[Network, Estimate]:
-    """Return a block of near-nadir photographs over hilly ground, and start values a little off.
+    """Return a block of near-nadir photographs over hilly ground, and start values with small errors.
 
     Args:
-        strips: number of strips, flown to and fro.
-        per_strip: photographs in each.
-        rays: mean number of photographs that see a point inside the block; 99 points a photograph.
+        strips: number of strips, flown in alternate directions.
+        per_strip: photographs per strip.
+        rays: mean number of photographs that see a point inside the block; each photograph has 99 points.
     """
     rng = np.random.default_rng(strips * per_strip)
     m = strips * per_strip
@@ -110,7 +110,7 @@ def photographed(truth: Estimate, seen: list[IntArray], rng: np.random.Generator
 
 
 def spoiled(truth: Estimate, rng: np.random.Generator, *, shift: float) -> Estimate:
-    """Return start values: positions and points shifted, 0.3 deg, c off by 0.5 %, no distortion."""
+    """Return start values: positions and points shifted, angles off by 0.3 deg, c by 0.5 %, no distortion."""
     camera = truth.cameras[0]
 
     def noise(shape: tuple[int, ...], size: float) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How fast and how sure the resections are, against OpenCV and COLMAP in the same run."""
+"""Compares speed and reliability of the resections with OpenCV and COLMAP in the same run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.textbook.resection.zeng_wang import resect_triples_zeng_wang
 
 TRIPLES = 10_000
-RIGHT = 1e-6  # error of position and rotation up to which a solution is the true one
+RIGHT = 1e-6  # largest error of position and rotation of a correct solution
 SIZE_PX, C_PX = (3000, 3000), 2000.0
 POINTS, WRONG, SIGMA_PX, TOLERANCE_PX = 200, 0.3, 0.5, 2.0
 SCENES = 100
@@ -25,13 +25,13 @@ T = TypeVar("T")
 
 
 def main() -> None:
-    """Print the comparison of triples, then that of the robust resections."""
+    """Print the comparison of triples, then of robust resections."""
     triples()
     robust()
 
 
 def triples() -> None:
-    """Three points: compiled batches against a loop over cv2.solveP3P."""
+    """Compare compiled batches of three points with a loop of cv2.solveP3P."""
     uv, points, X0, R = random_triples(np.random.default_rng(1), TRIPLES)
     rays, vision = rays_from_tangents(uv), np.ascontiguousarray(uv * (1.0, -1.0))
 
@@ -62,7 +62,7 @@ def triples() -> None:
 
 
 def robust() -> None:
-    """Many points with gross errors: RANSAC and adjustment against COLMAP's."""
+    """Compare RANSAC and adjustment of many points with gross errors with COLMAP's."""
     rng = np.random.default_rng(2)
     scenes = [random_scene(rng) for _ in range(SCENES)]
     camera = pycolmap.Camera(
@@ -110,7 +110,7 @@ def robust() -> None:
 
 
 def best_time(function: Callable[[], T], repeats: int) -> tuple[float, T]:
-    """Shortest time of some calls in s, after one that compiles and warms up, and the last result."""
+    """Return the shortest time of several calls after a warm-up call, s, and the last result."""
     result = function()
     best = np.inf
     for _ in range(repeats):
@@ -121,7 +121,7 @@ def best_time(function: Callable[[], T], repeats: int) -> tuple[float, T]:
 
 
 def misses(position: FloatArray, rotation: FloatArray, X0: FloatArray, R: FloatArray) -> int:
-    """Number of triples without a solution within RIGHT of the truth."""
+    """Return the number of triples without a solution within RIGHT of the truth."""
     error = np.fmax(
         np.linalg.norm(position - X0[:, None], axis=2), np.abs(rotation - R[:, None]).max(axis=(2, 3))
     )
@@ -129,7 +129,7 @@ def misses(position: FloatArray, rotation: FloatArray, X0: FloatArray, R: FloatA
 
 
 def random_triples(rng: np.random.Generator, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Tangents (k, 3, 2), points (k, 3, 3), positions (k, 3) and rotations (k, 3, 3) of random triples."""
+    """Return random triples: tangents (k, 3, 2), points (k, 3, 3), positions (k, 3), rotations (k, 3, 3)."""
     uv = rng.uniform(-1, 1, (k, 3, 2))
     depth = np.exp(rng.uniform(np.log(0.1), np.log(100), (k, 3, 1)))
     R = rotation_from_vector(rng.standard_normal((k, 3)) * 2)
@@ -139,7 +139,7 @@ def random_triples(rng: np.random.Generator, k: int) -> tuple[FloatArray, FloatA
 
 
 def random_scene(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Tangents (n, 2), points (n, 3) and position of a photograph with noise and gross errors."""
+    """Return tangents (n, 2), points (n, 3) and position of a photograph with noise and gross errors."""
     R = rotation_from_vector(rng.standard_normal(3) * 2)
     X0 = rng.normal(size=3) * 5
     uv = rng.uniform(-0.6, 0.6, (POINTS, 2))

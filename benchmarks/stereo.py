@@ -1,10 +1,10 @@
-"""The base of a stereo rig by repeated calibrations: its scatter beside what is stated, and beside mrcal.
+"""Compares the scatter of the base of a stereo rig in repeated calibrations with its sigma, and with mrcal.
 
     python -m benchmarks.stereo [--draws 100] [--mrcal PYTHON]
 
-A board of 9 x 6 corners, 30 mm apart, at 14 moments before two cameras of 640 x 480 px, 100 mm apart; noise
-of 0.03 px. Both programs start from the truth and adjust the same corners in the same model (opencv, 8
-parameters). PYTHON is an interpreter with mrcal installed.
+Two cameras of 640 x 480 px, 100 mm apart, photograph a board with 9 x 6 corners, 30 mm apart, at 14 moments.
+The noise is 0.03 px. Both programs start from the truth and adjust the same corners in the same model
+(opencv, 8 parameters). PYTHON is an interpreter with mrcal installed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sfm.report.findings.calibrated_cameras import rigs_of
 
 MOMENTS, NOISE_PX, PITCH = 14, 0.03, 30.0
 ROWS, COLUMNS, BASE = 6, 9, 100.0
-FLIP = np.diag([1.0, -1.0, -1.0])  # axes of mrcal in ours
+FLIP = np.diag([1.0, -1.0, -1.0])  # mrcal's camera axes in Kolinear's
 
 MRCAL = """
 import json, sys
@@ -54,7 +54,7 @@ print(json.dumps(found))
 
 
 def cameras() -> tuple[Camera, ...]:
-    """Return two cameras with the distortion of usual lenses, all eight parameters free."""
+    """Return two cameras with the distortion of ordinary lenses and all eight parameters free."""
     free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     values = {"fx": 533.5, "fy": 533.5, "k1": -0.288, "k2": 0.097, "p1": 0.001, "p2": -0.0003}
     made = []
@@ -67,7 +67,7 @@ def cameras() -> tuple[Camera, ...]:
 
 
 def scene() -> tuple[Network, Estimate]:
-    """Return the image points without noise, and the truth."""
+    """Return the network with image points without noise, and the true values."""
     rng = np.random.default_rng(27)
     grid = np.mgrid[0:ROWS, 0:COLUMNS].reshape(2, -1)
     board = np.stack([PITCH * grid[1], PITCH * grid[0], np.zeros(ROWS * COLUMNS)], axis=1)
@@ -107,20 +107,20 @@ def scene() -> tuple[Network, Estimate]:
 
 
 def noisy(network: Network, draws: int) -> list[FloatArray]:
-    """Return image points of repeated surveys, (k, 2) each."""
+    """Return the noisy image points of repeated surveys, (k, 2) each."""
     rng, xy = np.random.default_rng(5), network.image_points.xy
     return [xy + NOISE_PX * rng.standard_normal(xy.shape) for _ in range(draws)]
 
 
 def with_mrcal(python: str, truth: Estimate, drawn: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the base of each draw by mrcal, mm, and its RMS, px."""
+    """Return the base of each draw from mrcal, mm, and the RMS residuals, px."""
 
     def seen_from(R: FloatArray, X: FloatArray) -> FloatArray:
         turn = FLIP @ R.T
         return np.concatenate([vector_of(turn), -turn @ X])
 
     assert truth.mounts is not None
-    # cameras are turned by the flip on both sides, the board is not
+    # the flip applies to the axes of both cameras, but not to those of the board
     turn = FLIP @ truth.mounts.rotation[1].T @ FLIP
     right = np.concatenate([vector_of(turn), -turn @ FLIP @ truth.mounts.position[1]])
     frames = [seen_from(R, X) for R, X in zip(truth.rotation[::2], truth.position[::2], strict=True)]

@@ -1,13 +1,13 @@
-"""COLMAP, COLMAP and refine, and Kolinear's textured survey on rendered photographs with truth.
+"""Compares COLMAP, COLMAP with `kolinear refine`, and Kolinear's textured survey on rendered photographs.
 
     python -m benchmarks.textured --photographs 20 60 --roughness smooth medium rough
     python -m benchmarks.textured --photographs 15 30 60 120 --roughness medium --methods kolinear
     python -m benchmarks.textured --photographs 25 --finer 3 --roughness medium --methods kolinear
 
-Prints for each scene the RMS errors of centres and rotations after a similarity onto the truth, what the
-result predicts for them in the same datum, the joint squared Mahalanobis distance of centres and rotations
-for a degree of freedom, and the processor time, all in one run; with several numbers of photographs also with
-which power of them the time grows. Scenes are rendered into a folder (--work) unless they are there.
+For each scene, the following is printed: the RMS errors of centres and rotations after a similarity onto the
+truth, their prediction by the result in the same datum, the joint squared Mahalanobis distance of centres and
+rotations per degree of freedom, and the processor time. With several numbers of photographs, the exponent of
+the growth of time is printed too. Scenes are rendered into a folder (--work) unless they exist there.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ METHODS = ["colmap", "kolinear"]
 
 
 def main() -> None:
-    """Run what the command line asks for."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     parser.add_argument("--photographs", type=int, nargs="+", default=[20])
-    parser.add_argument("--finer", type=int, default=1, help="pixels a side for each of 1024 x 768")
-    parser.add_argument("--jobs", type=int, default=1, help="photographs worked on at a time")
+    parser.add_argument("--finer", type=int, default=1, help="pixels along each of 1024 x 768")
+    parser.add_argument("--jobs", type=int, default=1, help="photographs processed at a time")
     parser.add_argument("--roughness", nargs="+", default=list(RIPPLES), choices=list(RIPPLES))
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--work", type=Path, default=Path("build/textured_scenes"))
@@ -86,7 +86,7 @@ def _kolinear(scene: TexturedScene, folder: Path, jobs: int) -> float:
 
 
 def _colmap(scene: TexturedScene, folder: Path) -> list[float]:
-    """Run COLMAP's pipeline, then refine on its model; print the errors and return the times of both."""
+    """Run COLMAP's pipeline and refine its model; print the errors and return the times of both."""
     begun = time.process_time()
     names = tuple(sorted(path.name for path in folder.glob("*.png")))
     mapped = map_photographs(folder, (names,))
@@ -140,14 +140,14 @@ def _print(
 
 
 def _units(covariance: FloatArray) -> FloatArray:
-    """Return the standard deviations, so that lengths and angles weigh alike where rank is judged."""
+    """Return standard deviations, which give lengths and angles the same weight when rank is determined."""
     return np.sqrt(np.diagonal(covariance))
 
 
 def covariance_on_centres(adjustment: Adjustment) -> FloatArray:
-    """Return the covariance of all X0 and small rotations together, datum on the centres, (6m, 6m).
+    """Return the joint covariance of all X0 and small rotations, datum on the centres, (6m, 6m).
 
-    The errors are those after a similarity onto the true centres; a datum on the points predicts more.
+    It refers to errors after a similarity onto the true centres; a datum on the points would predict more.
     Source: Baarda (1973), S-transformations.
     """
     m = len(adjustment.estimate.position)

@@ -1,10 +1,11 @@
-"""Photographs of a textured surface with truth: three roughnesses, any number of photographs.
+"""Renders photographs of a textured surface of three roughnesses, with the true orientation.
 
     python -m benchmarks.textured_scenes smooth 20 build/smooth20
 
-A square of 2.4 m with hills, and on it ripples: none, 4 mm over 0.15 m or 8 mm over 0.08 m. The camera goes
-round it on a dome at several elevations, every other photograph turned by 90 degrees. Every pixel is the mean
-of rays over its area, blurred and with noise, as in datasets/textured.
+The surface is a square of 2.4 m with hills and ripples. The ripples are absent, 4 mm high and 0.15 m long, or
+8 mm high and 0.08 m long. The camera moves around the surface on a dome at several elevations; every other
+photograph is rotated by 90 degrees. Every pixel is the mean of rays over its area, blurred and with noise, as
+in datasets/textured.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ PIXEL_MM = 0.006
 C_MM = 8.0
 DISTANCE_M = 1.7
 ELEVATIONS_DEG = (48.0, 58.0, 70.0)
-MARCH, BISECT = 40, 12  # steps along a ray through the slab that contains the surface, and within one of them
+MARCH, BISECT = 40, 12  # steps along a ray through the slab around the surface; bisections in a step
 SLAB_M = 0.2  # half the height of that slab
 SURVEY = """[survey]
 name = "{name}"
@@ -53,7 +54,7 @@ sigma_px = 0.02
 
 @dataclass(frozen=True)
 class TexturedScene:
-    """What is photographed, and from where."""
+    """A surface and the orientation of its photographs."""
 
     roughness: str  # smooth | medium | rough
     position: FloatArray  # projection centres, m, (m, 3)
@@ -62,7 +63,7 @@ class TexturedScene:
 
 
 def textured_scene(roughness: str, photographs: int, finer: int = 1) -> TexturedScene:
-    """Return the scene with its true orientation, its pixels so many times finer than usual."""
+    """Return the scene with its true orientation; pixels are `finer` times smaller than usual."""
     position, rotation = [], []
     for i in range(photographs):
         azimuth = 2 * np.pi * i / photographs * (1 if photographs < 40 else 2)
@@ -84,7 +85,7 @@ def textured_scene(roughness: str, photographs: int, finer: int = 1) -> Textured
 
 @compiled
 def _height(tall: float, long: float, x: float, y: float) -> float:
-    """Height of the hills of datasets/textured with ripples of a height and length, m."""
+    """Return the height of the hills of datasets/textured with ripples of a given height and length, m."""
     hills = np.sin(1.7 * x + 0.4) * np.cos(1.4 * y) + 0.2 * np.sin(2.1 * (x - y))
     k = 2 * np.pi / long
     ripples = tall * np.sin(k * x + np.sin(1.3 * k * y)) * np.cos(0.8 * k * y) if tall > 0 else 0.0
@@ -93,7 +94,7 @@ def _height(tall: float, long: float, x: float, y: float) -> float:
 
 @compiled
 def _gap(tall: float, long: float, centre: FloatArray, d: FloatArray, t: float) -> float:
-    """Height of a place on a ray above the surface, m."""
+    """Return the height of a point on a ray above the surface, m."""
     return float(centre[2] + t * d[2] - _height(tall, long, centre[0] + t * d[0], centre[1] + t * d[1]))
 
 
@@ -101,7 +102,7 @@ def _gap(tall: float, long: float, centre: FloatArray, d: FloatArray, t: float) 
 def _first_meeting(
     tall: float, long: float, centre: FloatArray, rays: FloatArray, length: FloatArray
 ) -> None:
-    """Fill how far along each ray it meets the surface first, by steps through its slab and bisection."""
+    """Fill the distance along each ray to its first intersection with the surface, by steps and bisection."""
     for k in range(len(rays)):
         d = rays[k]
         first, last = (SLAB_M - centre[2]) / d[2], (-SLAB_M - centre[2]) / d[2]
@@ -125,7 +126,7 @@ def _first_meeting(
 def _nearby_meeting(
     tall: float, long: float, centre: FloatArray, rays: FloatArray, length: FloatArray
 ) -> None:
-    """Improve how far along each ray it meets the surface, by Newton's steps from nearby."""
+    """Improve the distance along each ray to the surface by Newton's method from nearby."""
     for k in range(len(rays)):
         t = length[k]
         for _ in range(3):
@@ -137,7 +138,7 @@ def _nearby_meeting(
 
 
 def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
-    """Return one photograph as it would be without noise, float32, 0 to 255."""
+    """Return one photograph without noise, float32, 0 to 255."""
     width, rows = scene.camera.size_px
     centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
     y, x = np.mgrid[0:rows, 0:width]
@@ -161,7 +162,7 @@ def intensities(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
 
 
 def surface_at(scene: TexturedScene, index: int, xy: FloatArray) -> FloatArray:
-    """Return where the surface is at places of a photograph, px, (k, 2); shape (k, 3), m."""
+    """Return the surface points (k, 3), m, at pixel positions (k, 2) of a photograph."""
     centre, (tall, long) = scene.position[index], RIPPLES[scene.roughness]
     uv = tangents_from_pixel(scene.camera, xy)
     d = np.ascontiguousarray(np.column_stack([uv, -np.ones(len(uv))]) @ scene.rotation[index].T)

@@ -1,12 +1,12 @@
-"""A page of 1,000 photographs, 20,000 points and 300,000 rays timed in chromium with software rendering.
+"""Times a page of 1,000 photographs, 20,000 points and 300,000 rays in Chromium with software rendering.
 
     python -m benchmarks.viewer_page [--photographs M] [--points N] [--rays R] [--keep FILE.html]
 
-Printed: time to write the page, its size, time until the scene is there (wall clock, and CPU time of all
-processes of the browser, which other programs disturb less), frames per second while it turns, and how many
-points are left out of a turning scene; then the same with nothing drawn, which is what the browser itself
-takes. Both ways of software rendering are timed: the graphics library alone without a graphics card, and the
-whole browser.
+The following is printed: time to write the page, its size, time until the scene appears, frames per second
+while it rotates, and the fraction of points drawn meanwhile. The time until the scene appears is wall time
+and CPU time of all processes of the browser, which other programs disturb less. The frame rate is measured
+again with nothing drawn, which shows the share of the browser itself. Both ways of software rendering are
+timed: of the graphics library alone, without a graphics card, and of the whole browser.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sfm.report.viewer.embedded import scene_of_stored
 from sfm.solution import Solution
 
 FRAMES = 60
-WARM_UP = 20  # frames in which the pace of the scene is found
+WARM_UP = 20  # frames in which the scene finds its frame rate
 WAIT_MS = 120_000
 WAYS = (
     ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
@@ -51,7 +51,7 @@ TURN = """(frames) => new Promise((done) => {
 
 
 def flight(photographs: int, points: int, rays: int) -> Solution:
-    """Return photographs in rows above a hilly ground, with standard deviations."""
+    """Return a solution of photographs in rows above hilly ground, with standard deviations."""
     rng = np.random.default_rng(1)
     camera = camera_from_values("camera", "brown", (6000, 4000), (0.004, 0.004), c_mm=24.0)
     columns = round(np.sqrt(1.6 * photographs))
@@ -76,7 +76,7 @@ def flight(photographs: int, points: int, rays: int) -> Solution:
 
 
 def cpu_seconds() -> float:
-    """Return the CPU time of all processes that this one has started, s."""
+    """Return the CPU time of all processes that this process has started, s."""
     total = 0.0
     for process in psutil.Process().children(recursive=True):
         try:
@@ -94,7 +94,7 @@ HIDE = """() => {
 
 
 def time_page(page_file: Path, browser: Any) -> None:
-    """Print how long a page takes to open and to turn."""
+    """Print the time that a page takes to open, and its frame rate while it rotates."""
     page = browser.new_page(viewport={"width": 1400, "height": 1000})
     begun, cpu = time.perf_counter(), cpu_seconds()
     page.goto(page_file.as_uri())

@@ -1,11 +1,12 @@
-"""Conjugate points on wide baselines: matched, wrong and refused by the angle between the viewing directions.
+"""Counts right, wrong and refused matches of conjugate points at growing angles between viewing directions.
 
     python -m benchmarks.wide_matching --points 60
 
-A textured surface of three roughnesses is photographed from the left and, at growing angles, from the right;
-then turned and scaled. Points at random places are matched with nothing else known (key points lead), without
-key points from a search window that is off by up to 20 px (turned templates), and as before, upright. A match
-is wrong if it is more than 1 px, and more than 4 of its standard deviations, from the truth.
+A textured surface of three roughnesses is photographed from the left and, at growing angles, from the right,
+then with rotation and other scales. Points at random positions are matched in three ways: without further
+information (key points lead), without key points from a search window that is off by up to 20 px (rotated
+templates), and from the same window with upright templates. A match is wrong if it is more than 1 px, and
+more than 4 of its standard deviations, from the truth.
 """
 
 from __future__ import annotations
@@ -26,28 +27,28 @@ from sfm.matching import conjugate
 from sfm.matching.conjugate import affinities_around, match_points
 
 SIZE_PX = (640, 480)
-# Angle between the viewing directions and turn about the right one, degrees, and distance, times the left one
+# Angle between the viewing directions, rotation about the right one, degrees, and ratio of the distances.
 VIEWS = (
     *((10, 0, 1.0), (20, 0, 1.0), (30, 0, 1.0), (40, 0, 1.0), (50, 0, 1.0), (60, 0, 1.0)),
     *((10, 30, 1.0), (10, 15, 1.3), (10, 30, 1 / 1.3), (20, 90, 1.0)),
 )
 LEFT_DEG = 25.0  # from the vertical
 METHODS = ("key points", "turned", "upright")
-OFF_PX = 20.0  # of the search windows that are given
+OFF_PX = 20.0  # largest error of the given search windows
 WRONG_PX, WRONG_SIGMAS = 1.0, 4.0
 BORDER_PX = 30
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What became of the points of one pair."""
+    """Counts and errors of the matches of one pair of photographs."""
 
     points: int
     right: int
     wrong: int
     refused: int
-    rms_px: float  # of the right ones, along an axis
-    ratio: float  # of these errors to their standard deviations
+    rms_px: float  # error of the right matches, per axis
+    ratio: float  # ratio of these errors to their standard deviations
     seconds: float
 
     def __str__(self) -> str:
@@ -56,7 +57,7 @@ class Counts:
 
 
 def wide_scene(roughness: str, views: tuple[tuple[float, float, float], ...] = VIEWS) -> TexturedScene:
-    """Return a scene whose first photograph is the left one, and one for each view."""
+    """Return a scene with the left photograph first, then one photograph for each view."""
     position, rotation = [], []
     for angle, turn, distance in ((0.0, 0.0, 1.0), *views):
         tilt, roll = np.radians(LEFT_DEG - angle), np.radians(turn)
@@ -79,7 +80,7 @@ def photograph(scene: TexturedScene, index: int, skin: AnyArray) -> AnyArray:
 
 
 def points_and_truth(scene: TexturedScene, index: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return random points of the left photograph and where they are in another, px, (k, 2) each."""
+    """Return random points of the left photograph and their positions in another, px, (k, 2) each."""
     xy = np.random.default_rng((render.SEED, 100, index)).uniform(BORDER_PX, np.array(SIZE_PX) - BORDER_PX,
                                                                  (4 * count, 2))  # fmt: skip
     surface = surface_at(scene, 0, xy)
@@ -87,12 +88,12 @@ def points_and_truth(scene: TexturedScene, index: int, count: int) -> tuple[Floa
     seen = ((truth > BORDER_PX) & (truth < np.array(SIZE_PX) - BORDER_PX)).all(axis=1)
     same = np.zeros(len(xy), dtype=bool)
     same[seen] = np.linalg.norm(surface_at(scene, index, truth[seen]) - surface[seen], axis=1) < 1e-3
-    rows = np.flatnonzero(seen & same)[:count]  # what is hidden in the other photograph is left out
+    rows = np.flatnonzero(seen & same)[:count]  # without points hidden in the other photograph
     return xy[rows], truth[rows]
 
 
 def count_matches(left: AnyArray, right: AnyArray, xy: FloatArray, truth: FloatArray, method: str) -> Counts:
-    """Match points in one of the ways of METHODS and compare with the truth."""
+    """Match points by one of METHODS and compare them with the truth."""
     begun = time.process_time()
     if method == "key points":
         found = match_points(left, right, xy)

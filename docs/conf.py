@@ -1,4 +1,4 @@
-"""The documentation site: `make docs`."""
+"""Configuration of the documentation site, which `make docs` builds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-# the kernels of notebooks warn of unencrypted ports, which no process of another computer can reach
+# the kernels of notebooks warn of unencrypted ports, which other computers cannot reach
 profile = Path(tempfile.mkdtemp()) / "profile_default"
 profile.mkdir()
 (profile / "ipython_kernel_config.py").write_text("c.Application.log_level = 40\n", encoding="utf-8")
@@ -25,14 +25,14 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
-nb_execution_mode = "force"  # each notebook is run when the site is built, by the program as it is
+nb_execution_mode = "force"  # every notebook runs with the current program when the site is built
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 nb_execution_timeout = 600
 nb_merge_streams = True
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-# pages that stand by themselves; those of a section have its pages beside them
+# single pages have no sidebar; pages of a section list its other pages there
 ALONE = (
     "index",
     "install",

@@ -1,8 +1,8 @@
-"""Drawings of the page of conventions: frames, rotations and directions of distortion, as SVG in the page.
+"""Drawings on the page of conventions: frames, rotations and directions of distortion, as SVG in the page.
 
-What can be computed by the program is: the pinhole camera stands where `sfm.camera.project` sees the point,
-the axes turn by `sfm.conventions.rotation_from_angles`, and the vectors of distortion are the models'.
-Colours are those of the page, so that a drawing is readable on light and on dark ground.
+The program computes the drawings where possible: `sfm.camera.project` gives the image point of the pinhole
+camera, `sfm.conventions.rotation_from_angles` rotates the axes, and the distortion models give the vectors.
+Drawings use the colours of the page, so they are readable on a light and on a dark background.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ARROW = 9.0  # length of an arrow head, in the unit of the drawing
 
 
 class Drawing:
-    """Lines, dots and words on a sheet, x to the right and y down."""
+    """Lines, dots and labels on a sheet, with x to the right and y down."""
 
     def __init__(self, width: float, height: float, what: str) -> None:
         self.size = (width, height)
@@ -41,7 +41,7 @@ class Drawing:
     def arrow(
         self, a: FloatArray, b: FloatArray, kind: str = "ink", name: str = "", *, head: float = ARROW
     ) -> None:
-        """Draw an arrow from a to b, with its name behind the head."""
+        """Draw an arrow from a to b, with its name next to the head."""
         a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
         along = (b - a) / np.linalg.norm(b - a)
         across = np.array([-along[1], along[0]])
@@ -62,7 +62,7 @@ class Drawing:
         self.parts.append(f'<polygon class="{kind}" points="{text}"/>')
 
     def curve(self, points: FloatArray, kind: str = "ink") -> None:
-        """Draw an open polygon."""
+        """Draw a polyline."""
         text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
         self.parts.append(f'<polyline class="{kind} open" points="{text}"/>')
 
@@ -71,7 +71,7 @@ class Drawing:
         self.parts.append(f'<circle class="{kind} full" cx="{at[0]:.1f}" cy="{at[1]:.1f}" r="{radius}"/>')
 
     def words(self, at: FloatArray, text: str, kind: str = "ink", *, middle: bool = False) -> None:
-        """Write words, beginning at a place or with their middle there."""
+        """Write a label that starts at a position or is centred there."""
         anchor = ' text-anchor="middle" dominant-baseline="central"' if middle else ""
         self.parts.append(
             f'<text class="{kind}" x="{at[0]:.1f}" y="{at[1]:.1f}"{anchor}>{escape(text)}</text>'
@@ -87,12 +87,12 @@ class Drawing:
 
 
 def moved(place: FloatArray, *by: float) -> FloatArray:
-    """Return a place moved along its axes."""
+    """Return a position shifted along the axes."""
     return np.asarray(place) + np.array(by)
 
 
 def frames() -> Drawing:
-    """Draw pixel frame, COLMAP's pixel frame and image frame on a photograph of 8 x 5 pixels."""
+    """Draw the pixel frame, COLMAP's pixel frame and the image frame on a photograph of 8 x 5 pixels."""
     sheet = Drawing(720, 385, "Pixel frame, image frame and the pixel origin of COLMAP on a small photograph")
     size, pixel, side = (8, 5), np.array([1.0, 1.0]), 60.0
     first = np.array([110.0, 80.0])  # centre of the top-left pixel on the sheet
@@ -170,7 +170,7 @@ def pinhole() -> Drawing:
 
 
 def rotations() -> Drawing:
-    """Draw omega, phi and kappa, each as it turns the axes that the one before has turned."""
+    """Draw omega, phi and kappa, each of which rotates the axes that the previous angle has rotated."""
     sheet = Drawing(720, 260, "Rotations omega about x, phi about the turned y, kappa about the turned z")
     view = np.array([[-0.62, 0.78, 0.0], [0.36, 0.29, -0.88]])  # from the front, x towards the reader
     steps = ((0.42, 0.0, 0.0), (0.42, 0.42, 0.0), (0.42, 0.42, 0.5))
@@ -199,7 +199,7 @@ def rotations() -> Drawing:
 
 
 def distortions() -> Drawing:
-    """Draw which point carries the formula: `brown` the measured, `brown_forward` the ideal one."""
+    """Draw the point that enters the formula: the measured point in `brown`, the ideal in `brown_forward`."""
     sheet = Drawing(720, 300, "brown corrects the measured point, brown_forward distorts the ideal one")
     size, pixel = (600, 400), (0.06, 0.06)
     lens = (("K1", 5e-4),)
@@ -256,7 +256,7 @@ def axes_of_others() -> Drawing:
 
 
 def plates() -> Drawing:
-    """Draw row 0 and the numbers of points: a plate with marks, also turned, shifted rows, a board."""
+    """Draw row 0 and point numbers of a plate with marks, also rotated, of shifted rows, and of a board."""
     sheet = Drawing(
         720,
         640,
@@ -325,12 +325,12 @@ DRAWINGS: dict[str, Callable[[], Drawing]] = {
 
 
 class DrawingDirective(SphinxDirective):
-    """One of the drawings."""
+    """Directive that inserts one of the drawings."""
 
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """Return it."""
+        """Return the node of the drawing."""
         return [nodes.raw("", DRAWINGS[self.arguments[0]]().svg(), format="html")]
 
 

@@ -1,4 +1,4 @@
-"""Formulas as MathML, which browsers draw by themselves: no script, and nothing from a network."""
+"""Formulas as MathML, which browsers display without a script or a network connection."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ from sphinx.writers.html5 import HTML5Translator
 def mathml(node: nodes.math | nodes.math_block, *, block: bool) -> str:
     """Return a formula as MathML.
 
+    Args:
+        node: formula in TeX.
+        block: whether the formula is on separate lines.
+
     Raises:
-        ExtensionError: TeX that cannot be converted, with the place on the page.
+        ExtensionError: the TeX cannot be converted; the message states its position on the page.
     """
     try:
         return str(tex2mathml(node.astext(), as_block=block))

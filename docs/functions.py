@@ -1,7 +1,7 @@
-"""Names of functions on the pages: each leads to its docstring, and one that does not exist is an error.
+"""Links from names of functions on the pages to their docstrings; a name that does not exist is an error.
 
-A name in code such as `sfm.camera.project` needs no markup. The directive `functions` makes the page that
-they lead to: every name that stands on any page of docs/, by module.
+A name in code font such as `sfm.camera.project` needs no markup. The directive `functions` makes the target
+page, which documents every name on the pages of docs/, sorted by module.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
 
 
 def names_on_pages() -> tuple[str, ...]:
-    """Return every name in code on the pages of docs/, but for the public ones, which have another page."""
+    """Return every name in code font on the pages of docs/, except public names, which have another page."""
     found: set[str] = set()
     for page in DOCS.rglob("*.md"):
         prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
@@ -47,7 +47,7 @@ def module_of(name: str) -> str:
     """Return the longest part of a dotted name that is a module.
 
     Raises:
-        ModuleNotFoundError: not even its beginning is one.
+        ModuleNotFoundError: not even the first part is a module.
     """
     parts = name.split(".")
     module = parts[0]
@@ -64,13 +64,13 @@ def documented(name: str) -> tuple[str, str]:
     """Return signature and docstring of a function, class or constant of a module.
 
     Raises:
-        AttributeError: there is none of that name.
+        AttributeError: the module has no such name.
     """
     module = module_of(name)
     value: Any = importlib.import_module(module)
     for part in name.removeprefix(module).strip(".").split("."):
         value = getattr(value, part)
-    value = getattr(value, "py_func", value)  # a compiled function keeps the written one here
+    value = getattr(value, "py_func", value)  # a compiled function keeps its Python function here
     short = name.removeprefix(module + ".")
     if inspect.isfunction(value):
         return f"{short}{inspect.signature(value)}", inspect.getdoc(value) or ""
@@ -80,7 +80,7 @@ def documented(name: str) -> tuple[str, str]:
 
 
 class FunctionReference(SphinxDirective):
-    """What the pages name, by module: the docstring of the module, then its functions."""
+    """Directive that documents all names on the pages: for each module its docstring, then its functions."""
 
     def run(self) -> list[nodes.Node]:
         """Return a section for each module."""
@@ -100,12 +100,12 @@ class FunctionReference(SphinxDirective):
         return sections
 
     def _entry(self, domain: PythonDomain, name: str, kind: str, title: str, text: str) -> nodes.section:
-        """Return a section that links lead to."""
+        """Return a section that is the target of links."""
         label = name.replace(".", "-")
         section = nodes.section(ids=[label])
         section += nodes.title(title, title)
         section += nodes.literal_block("", text.strip(), language="text")
-        if name in PUBLIC:  # links lead to its page
+        if name in PUBLIC:  # links lead to the page of public names
             return section
         if kind == "module":
             domain.note_module(name, label, "", "", False)
@@ -114,12 +114,12 @@ class FunctionReference(SphinxDirective):
 
 
 class NamesAsLinks(SphinxTransform):
-    """Makes each name of the program in code a link to where it is documented."""
+    """Makes each name of the program in code font a link to its documentation."""
 
     default_priority = 400  # after the page is read, before references are resolved
 
     def apply(self, **_: Any) -> None:
-        """Wrap the names."""
+        """Wrap the names in references."""
         for literal in list(self.document.findall(nodes.literal)):
             name = literal.astext()
             inside = isinstance(literal.parent, nodes.reference | addnodes.pending_xref)

@@ -1,4 +1,4 @@
-"""Pages that are made from the program when the site is built: survey file, commands, public names."""
+"""Pages generated from the program when the site is built: survey file, commands and public names."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
 
 
 class _Made(SphinxDirective):
-    """A directive whose content is the sections that `parts` returns."""
+    """A directive whose content consists of the sections that `parts` returns."""
 
     def run(self) -> list[nodes.Node]:
         """Return one section for each part."""
@@ -47,7 +47,7 @@ class _Made(SphinxDirective):
 
 
 def label_of(title: str) -> str:
-    """Return what a link to a section ends with."""
+    """Return the fragment of a link to a section."""
     return re.sub(r"\W+", "-", title).strip("-").lower()
 
 
@@ -68,7 +68,7 @@ class SurveyFileReference(_Made):
 
 
 class CommandReference(_Made):
-    """What --help says of every command."""
+    """The --help text of every command."""
 
     HELP: ClassVar[CliRunner] = CliRunner()
 
@@ -83,7 +83,7 @@ class CommandReference(_Made):
         """Return the help of a command.
 
         Raises:
-            RuntimeError: the command has none.
+            RuntimeError: the command has no help.
         """
         said = self.HELP.invoke(app, [*words, "--help"], prog_name="kolinear", env={"COLUMNS": "100"})
         if said.exit_code:
@@ -110,7 +110,7 @@ class PythonReference(_Made):
 
 
 def command_names() -> list[tuple[str, ...]]:
-    """Return the words of every command, those of groups behind the group."""
+    """Return the words of every command; the commands of a group follow the group."""
     root: Any = typer.main.get_command(app)
     found: list[tuple[str, ...]] = []
     for name, command in root.commands.items():

@@ -1,7 +1,7 @@
-"""Check of the finished site, without a network: every link inside it leads somewhere, nothing is loaded.
+"""Check of the finished site without a network: internal links must have a target, and nothing is loaded.
 
-Links to other sites are for people to follow, and are left alone; scripts, styles, fonts and pictures of
-other sites are errors, since the site is read offline too.
+Links to other sites are for readers to follow and are not checked. Scripts, styles, fonts and pictures from
+other sites are errors, since the site is also read offline.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_TOLD = 20
 
 
 class Page(HTMLParser):
-    """What a page links to, what it loads, and which places it has."""
+    """The links, loaded files and link targets of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -31,7 +31,7 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        """Note the content of an element."""
+        """Record the links, loaded files and target of an element."""
         values = {name: value or "" for name, value in attributes}
         self.places |= {values[name] for name in ("id", "name") if values.get(name)}
         if tag == "a" and values.get("href"):
@@ -42,10 +42,10 @@ class Page(HTMLParser):
 
 
 def faults_of(site: Path) -> list[str]:
-    """Return what is wrong with the links of a site, a line each.
+    """Return the errors in the links of a site, one line each.
 
     Args:
-        site: folder of its pages.
+        site: folder of the pages.
     """
     pages = {
         path: Page(path.read_text(encoding="utf-8"))
@@ -81,10 +81,14 @@ def faults_of(site: Path) -> list[str]:
 
 
 def check(sphinx: Sphinx, failed: Exception | None) -> None:
-    """Raise if the site has a fault.
+    """Check the finished site.
+
+    Args:
+        sphinx: the application, which states the folder of the site.
+        failed: exception that ended the build, or None.
 
     Raises:
-        RuntimeError: links that lead nowhere, or something that is loaded from elsewhere.
+        RuntimeError: a link has no target, or a file is loaded from another site.
     """
     if failed is None and sphinx.builder.name == "html":
         faults = faults_of(Path(sphinx.outdir).resolve())
@@ -94,6 +98,6 @@ def check(sphinx: Sphinx, failed: Exception | None) -> None:
 
 
 def setup(sphinx: Sphinx) -> dict[str, Any]:
-    """Check when the site is built."""
+    """Register the check, which runs when the site is built."""
     sphinx.connect("build-finished", check, priority=900)
     return {"parallel_read_safe": True}

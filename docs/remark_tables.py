@@ -1,6 +1,6 @@
-"""The tables of remarks in docs/symptoms.md, written from the catalogue.
+"""Generates the tables of remarks in docs/symptoms.md from the catalogue.
 
-`python docs/remark_tables.py docs/symptoms.md` writes them between their marks.
+`python docs/remark_tables.py docs/symptoms.md` writes the tables between their marks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ VARIES = "…"
 
 
 def remark_tables() -> str:
-    """Return a table of remarks for each subject of the catalogue, in Markdown."""
+    """Return one table of remarks for each subject of the catalogue, in Markdown."""
     parts = []
     for subject, rows in SUBJECTS.items():
         parts += [f"### {subject}", "", "| remark | severity | cause | remedy |", "|---|---|---|---|"]
@@ -43,7 +43,7 @@ def _row(kind: Kind) -> str:
 
 
 def _pattern(sentence: str) -> str:
-    """Return a sentence with … for what varies, the plural for what depends on a number."""
+    """Return a sentence with … for variable parts, and plural forms where a number decides."""
 
     def field(found: re.Match[str]) -> str:
         spec = found.group(2) or ""

@@ -1,4 +1,4 @@
-"""The keys of the survey file in words, from the models that check it: type, bounds, default and meaning."""
+"""Describes the keys of the survey file, from the models that check it: type, bounds, default and meaning."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sfm.survey.inputs import settings
 from sfm.survey.inputs.settings import Section
 
 KINDS = {"bool": "true | false", "int": "integer", "float": "number", "str": "text"}
-SHAPES = {  # types of several values: what is written in the file, and of which type each value is
+SHAPES = {  # types with several values: notation in the file, and type of each value
     "TwoLengths": ("[number, number]", settings.Length),
     "TwoCounts": ("[integer, integer]", settings.Side),
     "Observed": ("table { parameter = [value, sigma] }", settings.Sigma),
@@ -28,10 +28,13 @@ SHAPES = {  # types of several values: what is written in the file, and of which
 
 
 def section_of(annotation: Any) -> type[Section]:
-    """Return the section that a field of the survey file has, one or several, there or not.
+    """Return the section class of a field of the survey file, which may be repeated or optional.
+
+    Args:
+        annotation: annotation of the field.
 
     Raises:
-        TypeError: it has none.
+        TypeError: the field is not a section.
     """
     if inspect.isclass(annotation) and issubclass(annotation, Section):
         return annotation
@@ -57,7 +60,7 @@ def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
 
 
 def comments_of(section: type[Section]) -> dict[str, str]:
-    """Return the comment on each field of a section, from the lines before it and from its own lines."""
+    """Return the comment on each field of a section, from the lines before it and at its own lines."""
     source = inspect.getsource(section)
     lines, found = source.splitlines(), {}
     body: Any = ast.parse(source).body[0]
@@ -75,7 +78,7 @@ def comments_of(section: type[Section]) -> dict[str, str]:
 
 
 def shown(value: Any) -> str:
-    """Return a default as the survey file would have it."""
+    """Return a default value as it is written in a survey file."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -87,8 +90,8 @@ def type_of(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     """Return the type of a key in words, with its bounds.
 
     Args:
-        annotation: of the field.
-        metadata: what pydantic took off the annotation of a field that is not optional.
+        annotation: annotation of the field.
+        metadata: metadata that pydantic removed from the annotation of a field that is not optional.
     """
     for name, (words, each) in SHAPES.items():
         known = getattr(settings, name)
@@ -106,10 +109,10 @@ def type_of(annotation: Any, metadata: Iterable[Any] = ()) -> str:
 
 
 def bounds_of(metadata: Iterable[Any]) -> str:
-    """Return the bounds of a number in words; empty where it has none."""
+    """Return the bounds of a number in words; an empty text if it has none."""
     found = []
     for one in metadata:
-        for part in getattr(one, "metadata", [one]):  # pydantic's Field has several
+        for part in getattr(one, "metadata", [one]):  # pydantic's Field has several parts
             if isinstance(part, Ge):
                 found.append(f"from {part.ge:g}")
             elif isinstance(part, Gt):

@@ -1,11 +1,11 @@
-"""Render a bridge deck in three epochs: 40 coded targets, 0, 0.15 and 0.4 mm of sag at mid-span.
+"""Renders a bridge deck with 40 coded targets in three epochs, with 0, 0.15 and 0.4 mm of sag at mid-span.
 
     python datasets/bridge/render.py build/bridge
     cd build/bridge && kolinear epochs first.toml second.toml third.toml
 
-A model in a hall: a deck between two abutments that stand still, and two scale bars beside it. Every target
-is on a separate plate, which moves down with the deck. The photographs of an epoch are taken anew, by hand,
-with one camera. Lengths in mm.
+The model stands in a hall. Its deck lies between two abutments that do not move, with two scale bars beside
+it. Every target is on a separate plate, which moves down with the deck. The photographs of each epoch are
+taken from new stations, hand-held, with one camera. Lengths are in mm.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from sfm.rendering.scene_file import Staging
 from sfm.targets.codes.plates import code_family
 
 EPOCHS = {"first": 0.0, "second": 0.15, "third": 0.4}  # sag at mid-span, mm
-PHOTOGRAPHS = 12  # of an epoch
+PHOTOGRAPHS = 12  # per epoch
 HALF_SPAN = 900.0
-COLUMNS, ROWS = np.linspace(-HALF_SPAN, HALF_SPAN, 7), (-180.0, -60.0, 60.0, 180.0)  # X and Y of the deck's
+COLUMNS, ROWS = np.linspace(-HALF_SPAN, HALF_SPAN, 7), (-180.0, -60.0, 60.0, 180.0)  # X and Y on the deck
 ABUTMENT = ((-1060.0, 60.0), (1060.0, 60.0))  # X and Z
 BARS = (((-600.0, -420.0), (600.0, -420.0)), ((-500.0, 420.0), (500.0, 420.0)))  # ends, on the ground
 GROUND = -250.0
@@ -40,7 +40,7 @@ SEED = 40
 
 
 def sag(x: FloatArray, middle: float) -> FloatArray:
-    """Return how far a deck that is clamped at both ends and evenly loaded is bent down, mm, positive."""
+    """Return the sag of a deck that is clamped at both ends and evenly loaded, mm, positive downwards."""
     return np.asarray(np.where(np.abs(x) < HALF_SPAN, middle * (1 - (x / HALF_SPAN) ** 2) ** 2, 0.0))
 
 
@@ -61,12 +61,12 @@ def codes() -> tuple[int, ...]:
 
 
 def camera() -> Camera:
-    """The camera of all epochs."""
+    """Return the camera of all epochs."""
     return camera_from_values("lens", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, values=LENS)
 
 
 def stations(rng: np.random.Generator, photographs: int = PHOTOGRAPHS) -> tuple[FloatArray, FloatArray]:
-    """Return projection centres (m, 3) and rotations (m, 3, 3): by hand around the bridge, turned."""
+    """Return projection centres (m, 3) and rotations (m, 3, 3): hand-held around the bridge, some rolled."""
     position, rotation = [], []
     for i in range(photographs):
         azimuth = 2 * np.pi * i / photographs + rng.uniform(-0.1, 0.1)
@@ -82,7 +82,7 @@ def stations(rng: np.random.Generator, photographs: int = PHOTOGRAPHS) -> tuple[
 
 
 def staging(epoch: str) -> Staging:
-    """Return what is photographed in an epoch, and from where."""
+    """Return the objects and stations of an epoch."""
     family = code_family(FAMILY)
     assert family is not None
     xyz, numbers = object_points(EPOCHS[epoch]), codes()
@@ -148,7 +148,7 @@ sigma_px = 0.02
 
 
 def render(folder: Path) -> None:
-    """Write the photographs of all epochs with their truth, and a survey file for each."""
+    """Write the photographs of all epochs with the true values, and one survey file for each epoch."""
     for epoch in EPOCHS:
         write_photographs(staging(epoch), folder / epoch)
         (folder / f"{epoch}.toml").write_text(survey_text(epoch), encoding="utf-8")

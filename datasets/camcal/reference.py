@@ -1,4 +1,4 @@
-"""Put the reference surveys of camcal into a folder, with the image points of PhotoModeler's export.
+"""Writes the reference surveys of camcal into a folder, with the image points of PhotoModeler's export.
 
 python datasets/camcal/reference.py FOLDER_OF_THE_EXPORT OUT
 kolinear adjust OUT/reference_fixed.toml
@@ -21,8 +21,8 @@ def prepare(export: Path, out: Path) -> None:
     """Write image_points.csv, control.csv and the survey files into `out`.
 
     Args:
-        export: folder of camcal-pmexport.txt and camcal-fixed.txt.
-        out: folder to make.
+        export: folder with camcal-pmexport.txt and camcal-fixed.txt.
+        out: folder to create.
     """
     network, _ = read_photomodeler(export / "camcal-pmexport.txt", control=export / "camcal-fixed.txt")
     out.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Render the textured survey: eight photographs of a hilly surface without any target, and their truth.
+"""Renders the textured survey: eight photographs of a hilly surface without targets, with known true values.
 
     python datasets/textured/render.py build/textured
 
-Every pixel is the mean over its area of the texture where its rays meet the surface, blurred and with noise.
+Every pixel is the mean of the texture where its rays meet the surface, blurred and with noise.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ PHOTOGRAPHS = 8
 HILL_M = 0.12  # height of the waves of the surface
 DISTANCE_M = 1.6
 ELEVATION_DEG = 62.0
-SAMPLES = 2  # rays along the side of a pixel
+SAMPLES = 2  # rays along each side of a pixel
 BLUR_PX = 0.6
-NOISE = 1.5  # standard deviation of an intensity of 256
+NOISE = 1.5  # standard deviation of an intensity, of 256 levels
 TEXEL_M = 0.0006  # about half a pixel in the photographs
 TEXTURE_M = 2.4  # side of the textured square
-OCTAVES = 6  # of the texture, each half as coarse
+OCTAVES = 6  # octaves of the texture, each half as coarse as the one before
 SEED = 20
 
 
 def camera() -> Camera:
-    """The camera of all photographs."""
+    """Return the camera of all photographs."""
     return camera_from_values("lens", "opencv", SIZE_PX, PIXEL_MM, c_mm=C_MM, values=LENS)
 
 
 def stations() -> tuple[FloatArray, FloatArray]:
-    """Projection centres (m, 3) and rotations (m, 3, 3): a ring around the surface, some upright."""
+    """Return projection centres (m, 3) and rotations (m, 3, 3) of a ring around the surface, some upright."""
     position, rotation = [], []
     for i in range(PHOTOGRAPHS):
         azimuth = 2 * np.pi * i / PHOTOGRAPHS
@@ -56,12 +56,12 @@ def stations() -> tuple[FloatArray, FloatArray]:
 
 
 def height(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of the surface, m."""
+    """Return the height of the surface, m."""
     return np.asarray(HILL_M * (np.sin(1.7 * x + 0.4) * np.cos(1.4 * y) + 0.2 * np.sin(2.1 * (x - y))))
 
 
 def surface_points(position: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return where rays from one point meet the surface, (k, 3); secant steps on the height above it."""
+    """Intersect rays from one point with the surface, (k, 3), by the secant method on the height above it."""
     z = directions[:, 2]
     t = -position[2] / z
     before = t * (1 - 0.05)
@@ -77,7 +77,7 @@ def surface_points(position: FloatArray, directions: FloatArray) -> FloatArray:
 
 
 def texture(seed: int = SEED) -> AnyArray:
-    """Return reflectances over the square, fine and coarse grains mixed, float32."""
+    """Return the reflectance over the square, a mixture of fine and coarse grain, float32."""
     rng = np.random.default_rng(seed)
     side = round(TEXTURE_M / TEXEL_M)
     total = np.zeros((side, side), dtype=np.float32)
@@ -90,7 +90,7 @@ def texture(seed: int = SEED) -> AnyArray:
 
 
 def intensities(index: int, skin: AnyArray) -> AnyArray:
-    """Return one photograph as it would be without noise, float32, 0 to 255."""
+    """Return one photograph without noise, float32, 0 to 255."""
     width, height_px = SIZE_PX
     position, rotation = (part[index] for part in stations())
     lens = camera()
@@ -105,25 +105,25 @@ def intensities(index: int, skin: AnyArray) -> AnyArray:
             at = at.astype(np.float32).reshape(height_px, width, 2)
             light += cv2.remap(skin, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderValue=0.45)
     light = cv2.GaussianBlur(light / SAMPLES**2, (0, 0), BLUR_PX)
-    # exposure changes a little from photograph to photograph
+    # the exposure differs slightly between photographs
     return np.asarray(255 * light * (0.85 + 0.04 * (index % 4)))
 
 
 def photograph(index: int, light: AnyArray) -> AnyArray:
-    """Return one photograph of its intensities, with noise, uint8."""
+    """Return one photograph with noise from its intensities, uint8."""
     noise = np.random.default_rng((SEED, index)).normal(0, NOISE, light.shape)
     return np.rint(np.clip(light + noise, 0, 255)).astype(np.uint8)
 
 
 def surface_at(index: int, xy: FloatArray) -> FloatArray:
-    """Return where the surface is at places of a photograph, px, (k, 2); shape (k, 3)."""
+    """Return the surface points (k, 3) at pixel positions (k, 2) of a photograph."""
     position, rotation = (part[index] for part in stations())
     uv = tangents_from_pixel(camera(), xy)
     return surface_points(position, np.column_stack([uv, -np.ones(len(uv))]) @ rotation.T)
 
 
 def render(folder: Path) -> None:
-    """Write the photographs, the survey file beside this module, and the true orientation."""
+    """Write the photographs and a copy of the survey file beside this module."""
     folder.mkdir(parents=True, exist_ok=True)
     skin = texture()
     for index in range(PHOTOGRAPHS):
