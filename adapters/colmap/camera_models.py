@@ -25,7 +25,7 @@ from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_o
 from sfm.conventions import BoolArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.open_folders import disk_errors, refuse_links_out
-from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shown
+from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shorten
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
 from sfm.network import Estimate, ImagePoints, Mounts, Network
@@ -235,11 +235,11 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     for i, name in zip(image_ids, labels, strict=True):
         if not is_name(name):
             raise SurveyFileError(
-                f"the name of image {i} is '{shown(name)}', needed plain text of 1 to {MAX_NAME} characters"
+                f"the name of image {i} is '{shorten(name)}', needed plain text of 1 to {MAX_NAME} characters"
             )
     duplicate = next((name for name, count in Counter(labels).items() if count > 1), None)
     if duplicate is not None:
-        raise SurveyFileError(f"more than one photograph has the name '{shown(duplicate)}'")
+        raise SurveyFileError(f"more than one photograph has the name '{shorten(duplicate)}'")
     network = Network(
         labels,
         np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),

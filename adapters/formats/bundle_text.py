@@ -41,7 +41,7 @@ from sfm.conventions import (
     rotation_from_angles,
 )
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.plain_text import shown
+from sfm.files.plain_text import shorten
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
@@ -234,7 +234,7 @@ def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
         if len(words) != 4 + 2 * m:
             raise text.error(f"{len(words)} words, needed id X Y Z and x y of {m} photographs")
         if words[0] in known:
-            raise text.error(f"point {shown(words[0])} is a duplicate")
+            raise text.error(f"point {shorten(words[0])} is a duplicate")
         known.add(text.name_of(words[0], "the id of a point"))
         labels.append(words[0])
         values = [text.number_of(word) for word in words[1:]]
@@ -247,7 +247,7 @@ def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
         if j:
             words = text.due_row(f"the sigmas of point {label}")
         if len(words) != 1 + 2 * m or words[0] != label:
-            raise text.error(f"'{shown(' '.join(words))}' where {label} and {2 * m} sigmas were expected")
+            raise text.error(f"'{shorten(' '.join(words))}' where {label} and {2 * m} sigmas were expected")
         values = [text.number_of(word) for word in words[1:]]
         sigma.extend(_positive(text, values))
     text.end()
@@ -297,7 +297,7 @@ def _exterior(text: Lines, count: int | None) -> tuple[list[str], list[list[floa
         if len(words) != 7:
             raise text.error(f"{len(words)} words, a photograph is id omega phi kappa XL YL ZL")
         if words[0] in known:
-            raise text.error(f"photograph {shown(words[0])} is a duplicate")
+            raise text.error(f"photograph {shorten(words[0])} is a duplicate")
         known.add(text.name_of(words[0], "the id of a photograph"))
         text.refuse_more(len(known), MAX_PHOTOGRAPHS, "photographs")
         names.append(words[0])

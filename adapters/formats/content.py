@@ -306,7 +306,7 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
     return replace(content, rejected=_no_image_points()) if "rejected" in gone else content, gone
 
 
-def placed(content: Content) -> Content:
+def select_placed(content: Content) -> Content:
     """Return the part of a survey that has coordinates in the object."""
     result = content.result
     network, estimate = result.network, result.estimate

@@ -17,7 +17,7 @@ from adapters.reading.text_lines import Lines
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.plain_text import shown
+from sfm.files.plain_text import shorten
 
 MAX_BYTES = 1_000_000_000
 STL_HEADER, STL_RECORD = 84, 50  # bytes
@@ -92,7 +92,7 @@ def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
         words = line.split()
         if words[:1] == ["vertex"]:
             if len(words) != 4:
-                raise text.error(f"'{shown(line)}', needed 'vertex X Y Z'")
+                raise text.error(f"'{shorten(line)}', needed 'vertex X Y Z'")
             corners += [text.number_of(word) for word in words[1:]]
     if len(corners) % 9:
         raise text.error(f"{len(corners) // 3} vertices, each triangle needs three")
@@ -109,7 +109,7 @@ def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
     elements: list[tuple[str, int, list[tuple[str, ...]]]] = []
     for number, line in enumerate(lines, 1):
         words = line.split()
-        where = f"{path}, line {number}: '{shown(line)}'"
+        where = f"{path}, line {number}: '{shorten(line)}'"
         if words[:1] == ["format"] and len(words) > 1:
             form = words[1]
         elif words[:1] == ["element"]:
@@ -123,7 +123,7 @@ def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
                 raise SurveyFileError(f"{where}, needed 'property TYPE NAME' of an element")
             elements[-1][2].append(tuple(words[1:]))
     if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        raise SurveyFileError(f"{path}: format {shown(form) or 'missing'}, expected ascii or binary")
+        raise SurveyFileError(f"{path}: format {shorten(form) or 'missing'}, expected ascii or binary")
     reader = _Values(path, data[after + 1 :], form)
     vertices, triangles = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
     for name, count, properties in elements:

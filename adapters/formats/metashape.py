@@ -33,7 +33,7 @@ from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.plain_text import MAX_PIXEL_MM, shown
+from sfm.files.plain_text import MAX_PIXEL_MM, shorten
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
@@ -162,7 +162,7 @@ def _camera(sensor: Node) -> Camera:
     """Return the camera of a sensor in the equivalent model."""
     if sensor.attributes.get("type", "frame") != "frame":
         raise sensor.error(
-            f"sensor of type {shown(sensor.attributes['type'])}, only frame sensors can be read"
+            f"sensor of type {shorten(sensor.attributes['type'])}, only frame sensors can be read"
         )
     resolution = sensor.one("resolution")
     size = (resolution.side_px("width"), resolution.side_px("height"))

@@ -44,7 +44,7 @@ from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angl
 from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import UNCODED
-from sfm.files.plain_text import MAX_SIDE_PX, shown
+from sfm.files.plain_text import MAX_SIDE_PX, shorten
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.solution import Solution
 
@@ -108,7 +108,7 @@ def read_export(
         number, _, name = line.strip().partition(" ")
         if number != str(len(names)) or not name.strip():
             raise text.error(
-                f"'{shown(line.strip())}' where photograph {len(names)} and its file were expected"
+                f"'{shorten(line.strip())}' where photograph {len(names)} and its file were expected"
             )
         text.refuse_more(len(names) + 1, MAX_PHOTOGRAPHS, "photographs")
         file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]

@@ -28,7 +28,7 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
-from adapters.formats.content import ALL, Content, losses, placed
+from adapters.formats.content import ALL, Content, losses, select_placed
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
@@ -100,7 +100,7 @@ def _write_database(path: Path, network: Network, estimate: Estimate) -> None:
 
 
 def _write_tables(folder: Path, content: Content) -> None:
-    there = placed(content)
+    there = select_placed(content)
     write_content_tables(folder, there)
     write_survey_file(folder, there, title=content.result.name)
 
@@ -410,7 +410,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
             )
 
 
-def written(name: str, network: Network, estimate: Estimate) -> str:
+def describe_stored(name: str, network: Network, estimate: Estimate) -> str:
     """Return in words which part of a network a format keeps."""
     form = format_named(name)
     if not form.models:

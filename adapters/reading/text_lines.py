@@ -11,7 +11,7 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
-from sfm.files.plain_text import MAX_NAME, is_name, shown
+from sfm.files.plain_text import MAX_NAME, is_name, shorten
 from sfm.files.whole_files import whole_file
 
 MAX_LINES = 2 * MAX_ROWS  # as for tables
@@ -120,7 +120,7 @@ class Lines:
         """
         words = self.row()
         if words is not None:
-            raise self.error(f"'{shown(' '.join(words))}' after the end of the data")
+            raise self.error(f"'{shorten(' '.join(words))}' after the end of the data")
 
     def number_of(self, text: str) -> float:
         """Return a finite number of permitted size.
@@ -133,9 +133,9 @@ class Lines:
         except ValueError:
             value = np.nan
         if not np.isfinite(value):
-            raise self.error(f"'{shown(text)}' is not a number")
+            raise self.error(f"'{shorten(text)}' is not a number")
         if abs(value) > MAX_NUMBER:
-            raise self.error(f"'{shown(text)}', needed a number of at most {MAX_NUMBER:g}")
+            raise self.error(f"'{shorten(text)}', needed a number of at most {MAX_NUMBER:g}")
         return value
 
     def whole_of(self, text: str, fewest: int, most: int, what: str) -> int:
@@ -147,7 +147,7 @@ class Lines:
         digits = text.removeprefix("-")
         sound = digits.isascii() and digits.isdecimal() and len(digits) <= MAX_DIGITS
         if not (sound and fewest <= int(text) <= most):
-            raise self.error(f"{what} is '{shown(text)}', needed a whole number from {fewest} to {most}")
+            raise self.error(f"{what} is '{shorten(text)}', needed a whole number from {fewest} to {most}")
         return int(text)
 
     def name_of(self, text: str, what: str) -> str:
@@ -157,7 +157,7 @@ class Lines:
             SurveyFileError: empty, too long or not plain text.
         """
         if not is_name(text):
-            raise self.error(f"{what} is '{shown(text)}', needed plain text of 1 to {MAX_NAME} characters")
+            raise self.error(f"{what} is '{shorten(text)}', needed plain text of 1 to {MAX_NAME} characters")
         return text
 
     def index_of(self, text: str, count: int, what: str) -> int:
@@ -189,7 +189,7 @@ class Lines:
             raise self.error(f"{len(parts)} numbers, needed {needed}")
         if photograph is not None and parts[0] != photograph:
             raise self.error(
-                f"'{shown(parts[0])}' at the start, needed the number {photograph} of the photograph"
+                f"'{shorten(parts[0])}' at the start, needed the number {photograph} of the photograph"
             )
         return np.array([self.number_of(part) for part in parts])
 

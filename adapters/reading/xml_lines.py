@@ -17,7 +17,7 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
-from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shown
+from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
 
 MAX_XML_BYTES = 4_000_000_000
 MAX_KEPT_BYTES = 1_000_000_000  # of memory; an export with 100,000 cameras takes half of it
@@ -81,7 +81,7 @@ class Node:
         """
         found = self.attribute(name)
         if not is_name(found):
-            raise self.error(f"{name} is '{shown(found)}', needed plain text of 1 to {MAX_NAME} characters")
+            raise self.error(f"{name} is '{shorten(found)}', needed plain text of 1 to {MAX_NAME} characters")
         return found
 
     def number(self, name: str) -> float:
@@ -107,7 +107,7 @@ class Node:
             value = np.nan
         if not abs(value) <= MAX_NUMBER:
             raise self.error(
-                f"'{shown(text)}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
+                f"'{shorten(text)}' in <{self.tag}> is not a finite number of at most {MAX_NUMBER:g}"
             )
         return value
 

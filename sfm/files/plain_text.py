@@ -133,7 +133,7 @@ def is_name(text: str) -> bool:
     return 0 < len(text) <= MAX_NAME and is_plain(text)
 
 
-def shown(text: str) -> str:
+def shorten(text: str) -> str:
     """Return the beginning of a text, for an error message."""
     return as_plain(text[:SHOWN])
 

@@ -24,7 +24,7 @@ from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of, joined
+from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of, join_functions
 from sfm.similarity import Similarity, fit_similarity, similarity_motions
 
 ITERATIONS = 50
@@ -365,7 +365,7 @@ def _align_by_coordinates(
         T: the transformation.
         entities: position or direction, whether it is a direction, and the axis along which it is held.
     """
-    held = joined([one for one, _, _ in entities])
+    held = join_functions([one for one, _, _ in entities])
     moves, by_places = np.zeros((6, 7)), np.zeros((6, len(held.value)))
     for k, (one, is_direction, axis) in enumerate(entities):
         value = T.rotation @ one.value if is_direction else T.apply(one.value)

@@ -257,7 +257,7 @@ def with_hidden_point(
         raise GeometryError(f"hidden point {name}: targets {start} and {end} coincide")
     u = d.value / length
     along = distance * (np.eye(3) - np.outer(u, u)) / length
-    found = joined([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
+    found = join_functions([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
     of_hidden = sigma**2 * np.outer(u, u) + points.covariance_between([found])
     Q = points.covariance
     if Q is not None and Q.ndim == 3:
@@ -297,7 +297,7 @@ def point_function(points: MeasuredPoints, name: str) -> Function:
     return Function(points.xyz[j], np.array([j], dtype=np.int64), np.eye(3))
 
 
-def joined(functions: list[Function]) -> Function:
+def join_functions(functions: list[Function]) -> Function:
     """Return the values of several functions as one function of all their points."""
     points: IntArray = np.unique(np.concatenate([one.points for one in functions]))
     rows = []
@@ -326,12 +326,12 @@ def distance(a: Function, b: Function) -> Function:
     if not length > 0:
         raise GeometryError("distance: both points coincide")
     u = d / length
-    return joined([a, b]).times(np.concatenate([-u, u])[None], np.array([length]))
+    return join_functions([a, b]).times(np.concatenate([-u, u])[None], np.array([length]))
 
 
 def difference(a: Function, b: Function) -> Function:
     """Return the vector from a to b (object unit), three values."""
-    return joined([a, b]).times(np.hstack([-np.eye(3), np.eye(3)]), b.value - a.value)
+    return join_functions([a, b]).times(np.hstack([-np.eye(3), np.eye(3)]), b.value - a.value)
 
 
 @checked_arguments()
@@ -361,7 +361,7 @@ def angle_of_directions(a: Function, b: Function, *, undirected: bool = False) -
         raise GeometryError("angle: the directions are parallel, their angle has no standard deviation")
     n = cross / sine
     J = np.concatenate([np.cross(u, n) / lp, np.cross(n, v) / lq])
-    return joined([a, b]).times(J[None], np.array([np.arctan2(sine, u @ v)]))
+    return join_functions([a, b]).times(J[None], np.array([np.arctan2(sine, u @ v)]))
 
 
 @checked_arguments()
@@ -392,7 +392,7 @@ def height(point: Function, origin: Function, direction: Function) -> Function:
     n, d = direction.value, point.value - origin.value
     # the normal keeps its length of 1: the part of its derivative along itself is rounding
     J = np.concatenate([n, -n, d - (d @ n) * n])
-    return joined([point, origin, direction]).times(J[None], np.array([d @ n]))
+    return join_functions([point, origin, direction]).times(J[None], np.array([d @ n]))
 
 
 @checked_arguments()
@@ -417,7 +417,7 @@ def distance_from_axis(point: Function, origin: Function, direction: Function) -
         raise GeometryError("distance: the point is on the line")
     u = across / length
     J = np.concatenate([u, -u, -along * u])
-    return joined([point, origin, direction]).times(J[None], np.array([length]))
+    return join_functions([point, origin, direction]).times(J[None], np.array([length]))
 
 
 @checked_arguments(origin="3", rotation="3 3")

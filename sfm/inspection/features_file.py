@@ -11,7 +11,7 @@ from sfm.errors import SurveyFileError
 from sfm.files.plain_text import read_toml
 from sfm.geometry.shapes.kinds import KINDS
 from sfm.survey.inputs.settings import LARGEST, Length, Name, Section, Value, first_error
-from sfm.survey.inputs.survey_file import inside
+from sfm.survey.inputs.survey_file import path_inside
 
 MAX_ENTRIES = 10_000  # of one kind
 
@@ -197,7 +197,7 @@ def read_features_file(path: Path, *, allow_outside: bool = False) -> tuple[Feat
         raise SurveyFileError(first_error(path, text, error, FeaturesFile)) from error
     _refuse_contradictions(path, features)
     paths = {
-        name: inside(path.parent, name, str(path), allow_outside=allow_outside)
+        name: path_inside(path.parent, name, str(path), allow_outside=allow_outside)
         for name in (*features.tables(), *features.meshes())
     }
     return features, paths

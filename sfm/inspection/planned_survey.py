@@ -431,7 +431,7 @@ def names_of(plan: PlannedSurvey, codes: str | None) -> tuple[str | None, ...]:
     return tuple(None if code == UNCODED else str(code) for code in codes_of(plan, _rings(codes)).tolist())
 
 
-def achieved(
+def compare_with_plan(
     plan: PlannedSurvey, codes: str | None, result: SurveyResult, *, seed: int = 0
 ) -> AchievedPrecision:
     """Compare the precision of a simulated survey with its plan.

@@ -29,7 +29,7 @@ from sfm.matching.conjugate_patches import (
     ConjugatePoints,
     Settings,
     Starts,
-    confirmed,
+    flag_unconfirmed,
     match_upright,
     match_warped,
 )
@@ -42,7 +42,7 @@ from sfm.matching.correlation import (
     match_ncc,
     match_ncc_warped,
 )
-from sfm.matching.radiometry import averaged, grey_of, grey_of_8_bit
+from sfm.matching.radiometry import grey_of, grey_of_8_bit, shrink_photograph
 from sfm.matching.tracks.features import match_features, sift_features
 
 TILE_PX = 128  # side of the squares whose spectra are averaged
@@ -174,7 +174,7 @@ def _match_by_size(
         wide: whether points not found are tried again, rotated, scaled, and with larger templates.
     """
     if not wide:
-        return confirmed(left, right, match_upright(left, right, a, b, by), by)
+        return flag_unconfirmed(left, right, match_upright(left, right, a, b, by), by)
     maps = local_affinities(left, right, a)
     if given:
         maps.xy[~(np.abs(maps.xy - b) <= by.search_px // 2).all(axis=1)] = np.nan
@@ -209,7 +209,7 @@ def _match(
         maps: positions and shapes that the key points predict.
         given: whether the caller gave the centres; if not, they are the positions in the left photograph.
     """
-    matched = confirmed(left, right, match_upright(left, right, a, b, by), by)
+    matched = flag_unconfirmed(left, right, match_upright(left, right, a, b, by), by)
     lost = np.array([bool(why) and "left photograph" not in why for why in matched.reason], dtype=bool)
     led = np.isfinite(maps.xy).all(axis=1)
     rows = np.flatnonzero(lost & led)
@@ -217,12 +217,12 @@ def _match(
         least = np.ceil(REACH_SIGMAS * maps.spread_px[rows]).astype(np.int64)
         reach = np.maximum(least, MIN_REACH_PX)
         again = match_warped(left, right, a[rows], Starts(maps.xy[rows], maps.linear[rows], reach), by)
-        again = confirmed(left, right, again, by, 2 * reach)
+        again = flag_unconfirmed(left, right, again, by, 2 * reach)
         matched = matched.with_rows(rows[again.good], again.rows(again.good))
     rows = np.flatnonzero(lost & ~led)
     if len(rows):
         again = match_turned(left, right, a[rows], b[rows], by, given=given)
-        again = confirmed(left, right, again, by, np.full(len(rows), by.reach_px))
+        again = flag_unconfirmed(left, right, again, by, np.full(len(rows), by.reach_px))
         matched = matched.with_rows(rows[again.good], again.rows(again.good))
     return matched
 
@@ -441,7 +441,7 @@ def equally_blurred(left: AnyArray, right: AnyArray) -> EquallyBlurred:
         smooth = np.asarray(cv2.GaussianBlur(sharper, (0, 0), sigma))
         left, right = (smooth, right) if more > 0.0 else (left, smooth)
     shrink = max(round(sigma / SHARP_PX), 1)
-    return EquallyBlurred(averaged(left, shrink), averaged(right, shrink), shrink)
+    return EquallyBlurred(shrink_photograph(left, shrink), shrink_photograph(right, shrink), shrink)
 
 
 def difference_of_blur(left: AnyArray, right: AnyArray) -> float:

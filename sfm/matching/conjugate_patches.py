@@ -158,7 +158,7 @@ def match_warped(
     return _refined(left, right, xy_left, found, start.linear, by)
 
 
-def confirmed(
+def flag_unconfirmed(
     left: AnyArray,
     right: AnyArray,
     matched: ConjugatePoints,

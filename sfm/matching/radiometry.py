@@ -97,7 +97,7 @@ def full_scale(photograph: AnyArray) -> float:
     return FULL_SCALE_16 if np.asarray(photograph).dtype == np.uint16 else FULL_SCALE_8
 
 
-def averaged(photograph: AnyArray, shrink: int) -> AnyArray:
+def shrink_photograph(photograph: AnyArray, shrink: int) -> AnyArray:
     """Return a photograph averaged over squares of side `shrink`; a remainder at the border is cut off."""
     if shrink == 1:
         return photograph

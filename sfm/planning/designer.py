@@ -40,7 +40,7 @@ from sfm.planning.prediction import (
     predict_network,
     short_of,
 )
-from sfm.planning.stations import Stations, filling_distance, looking, rolled
+from sfm.planning.stations import Stations, aim_camera, filling_distance, roll_rotations
 from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.planning.weakness import reason_of
 from sfm.runtime.progress import report_step
@@ -328,7 +328,7 @@ def candidates(
             continue
         near = planned.size / nearest > sees_all  # the object does not fit in a photograph from this position
         aimed_at = np.concatenate([planned.xyz[faced].mean(axis=0)[None], aims]) if near else aims[:1]
-        ways = np.array([looking(aim - place) for aim in aimed_at])
+        ways = np.array([aim_camera(aim - place) for aim in aimed_at])
         shown = sight_of(planned, camera, np.tile(place, (len(ways), 1)), ways, seeing).seen.sum(axis=1)
         best = int(np.argmax(shown))
         if shown[best] < MIN_POINTS:
@@ -343,7 +343,7 @@ def candidates(
         raise GeometryError(_no_room(least, most, inside))
     places, ways = np.array(position), np.array(rotation)
     names = tuple(f"{k + 1}" for k in range(2 * counted))
-    stations = Stations(names, np.tile(places, (2, 1)), np.concatenate([ways, rolled(ways)]))
+    stations = Stations(names, np.tile(places, (2, 1)), np.concatenate([ways, roll_rotations(ways)]))
     return Candidates(stations, sight_of(planned, camera, stations.position, stations.rotation, seeing))
 
 
@@ -354,7 +354,7 @@ def _distances(planned: PlannedObject, camera: Camera, allowed: StationLimits) -
         if not 0 < least < most:
             raise GeometryError(f"plan: distances {least:g} to {most:g}, needed 0 < least < most")
         return least, most
-    ways = [looking(np.array(way)) for way in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0), (1.0, 1.0, -1.0))]
+    ways = [aim_camera(np.array(way)) for way in ((1.0, 0, 0), (0, 1.0, 0), (0, 0, -1.0), (1.0, 1.0, -1.0))]
     fills = max(filling_distance(planned, camera, R) for R in ways)
     return DISTANCES[0] * fills - planned.size / 2 if fills > planned.size else 0.2 * fills, (
         DISTANCES[1] * fills

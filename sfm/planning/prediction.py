@@ -206,7 +206,7 @@ def predict_network(
     cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
     if sight is None:
         sight = _sight(planned, cameras, stations, seeing)
-    photographs, points = usable(sight.seen, stations.taken_at)
+    photographs, points = select_usable(sight.seen, stations.taken_at)
     if len(photographs) < 2 or not len(points):
         raise GeometryError(
             f"plan: {len(photographs)} of {len(stations)} photographs show {MIN_POINTS} or more points that "
@@ -272,7 +272,7 @@ def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations
     return Sight(*joined)
 
 
-def usable(seen: BoolArray, moment: IntArray | None = None) -> tuple[IntArray, IntArray]:
+def select_usable(seen: BoolArray, moment: IntArray | None = None) -> tuple[IntArray, IntArray]:
     """Return the indices of photographs that can be oriented, and of points that two of them show.
 
     Args:

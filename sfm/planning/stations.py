@@ -155,7 +155,7 @@ def around(planned: PlannedObject, camera: Camera, away: FloatArray) -> Stations
     """
     rolls = np.pi / 2 * (np.arange(len(away)) % 2)
     away = away / np.linalg.norm(away, axis=1, keepdims=True)
-    rotation = np.array([looking(-a, roll) for a, roll in zip(away, rolls, strict=True)])
+    rotation = np.array([aim_camera(-a, roll) for a, roll in zip(away, rolls, strict=True)])
     distance = np.array([filling_distance(planned, camera, R) for R in rotation])
     return Stations(_numbered(len(away)), planned.centre + distance[:, None] * away, rotation)
 
@@ -173,7 +173,7 @@ def filling_distance(planned: PlannedObject, camera: Camera, rotation: FloatArra
     return float((np.abs(local[:, :2]) / half + local[:, 2:]).max())
 
 
-def looking(direction: FloatArray, roll: float = 0.0) -> FloatArray:
+def aim_camera(direction: FloatArray, roll: float = 0.0) -> FloatArray:
     """Return R of a camera that looks along a direction; with roll 0 the x axis of the image is horizontal.
 
     Args:
@@ -189,7 +189,7 @@ def looking(direction: FloatArray, roll: float = 0.0) -> FloatArray:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def rolled(rotation: FloatArray) -> FloatArray:
+def roll_rotations(rotation: FloatArray) -> FloatArray:
     """Return the rotations, (..., 3, 3), rolled by 90 degrees."""
     return np.stack([rotation[..., 1], -rotation[..., 0], rotation[..., 2]], axis=-1)
 
@@ -208,7 +208,7 @@ def object_axes(planned: PlannedObject) -> tuple[FloatArray, FloatArray, FloatAr
             axis = -axis
     else:
         axis = mean / np.linalg.norm(mean)
-    R = looking(-axis)
+    R = aim_camera(-axis)
     return axis, R[:, 0], R[:, 1]
 
 
@@ -234,7 +234,7 @@ def _strips(text: str, number: str, planned: PlannedObject, camera: Camera) -> S
     ]
     rolls = np.array([(i + j) % 2 for j in range(b) for i in range(a)])
     position = planned.centre + np.array(places) @ np.stack([right, up]) + distances[rolls][:, None] * axis
-    rotation = np.array([looking(-axis, np.pi / 2 * roll) for roll in rolls])
+    rotation = np.array([aim_camera(-axis, np.pi / 2 * roll) for roll in rolls])
     return Stations(_numbered(a * b), position, rotation)
 
 

@@ -34,7 +34,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ScaleBars
 from sfm.observations.pose import MountObservations
-from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, spread_evenly, usable
+from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, select_usable, spread_evenly
 from sfm.planning.visibility import WORDS, Seeing, Visibility
 from sfm.reduced_network import reduce_network
 from sfm.similarity import OPEN, motions_along
@@ -314,7 +314,7 @@ def _without_rig(network: Network, estimate: Estimate) -> tuple[Network, Estimat
     network, _ = _without(replace(network, moment=None), estimate, MountObservations.name)
     seen = network.incidence(np.ones(len(network.image_points), dtype=bool)).toarray() > 0
     images, points = np.zeros(len(network.images), dtype=bool), np.zeros(len(network.points), dtype=bool)
-    left = usable(seen)
+    left = select_usable(seen)
     images[left[0]], points[left[1]] = True, True
     every = np.ones(len(network.image_points), dtype=bool)
     return reduce_network(network, replace(estimate, mounts=None), images, points, every)

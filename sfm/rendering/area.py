@@ -224,7 +224,7 @@ def interpolate(
 def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) -> float:
     """Return the fraction of a cell inside a mark, exact for edges that are straight in PARTS^2 parts."""
     a, b = cell.a - a0, cell.b - b0
-    f, fa, fb = inside(kind, a, b, shape)
+    f, fa, fb = distance_inside(kind, a, b, shape)
     gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
     if abs(f) > abs(gc) + abs(gr):  # the edge is beyond the corners of the cell
         return 1.0 if f > 0 else 0.0
@@ -234,7 +234,7 @@ def area_inside(kind: int, cell: Cell, a0: float, b0: float, shape: FloatArray) 
             dr, dc = (i + 0.5) / PARTS - 0.5, (j + 0.5) / PARTS - 0.5
             a_part = a + dc * cell.a_column + dr * cell.a_row
             b_part = b + dc * cell.b_column + dr * cell.b_row
-            f, fa, fb = inside(kind, a_part, b_part, shape)
+            f, fa, fb = distance_inside(kind, a_part, b_part, shape)
             gc, gr = fa * cell.a_column + fb * cell.b_column, fa * cell.a_row + fb * cell.b_row
             area += half_plane(f, gc, gr, 1.0 / PARTS)
     return area / PARTS**2
@@ -264,7 +264,7 @@ def half_plane(f: float, gx: float, gy: float, side: float) -> float:
 
 
 @compiled
-def inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, float, float]:
+def distance_inside(kind: int, a: float, b: float, shape: FloatArray) -> tuple[float, float, float]:
     """Return the distance inside a mark, object unit, at plane coordinates from its centre; its gradient."""
     if kind == DISC:
         radius = math.sqrt(a * a + b * b)

@@ -33,7 +33,7 @@ from sfm.camera import project
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints
-from sfm.planning.stations import looking
+from sfm.planning.stations import aim_camera
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, kinds_of
 from tests.survey.faults import EVERY, FAULTS, planted
@@ -453,7 +453,7 @@ def plate_seen_by_few(
     )
     around = 2 * np.pi * np.arange(photographs) / photographs + rng.uniform(-0.3, 0.3, photographs)
     away = 3 * np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(photographs, 0.85)])
-    turned = np.array([looking(-one, roll) for one, roll in zip(away, 2 * around, strict=True)])
+    turned = np.array([aim_camera(-one, roll) for one, roll in zip(away, 2 * around, strict=True)])
     truth = replace(truth, position=away, rotation=turned)
     stated = truth.points * [1 + strain, 1.0, 1.0] + sigma * rng.standard_normal(truth.points.shape)
     network = network.with_control(network.points, stated, sigma)

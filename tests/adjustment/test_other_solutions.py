@@ -107,7 +107,7 @@ def test_a_barrier_of_three_thousand_ends_the_search(
     height: float, length: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heights = iter([1.0, height, 1e6, 1e6])
-    monkeypatch.setattr(searched, "scaled", lambda estimate, _: estimate)
+    monkeypatch.setattr(searched, "scale_estimate", lambda estimate, _: estimate)
     search: Any = SimpleNamespace(
         adjusted=lambda start, held: SimpleNamespace(estimate=start, vPv=next(heights))
     )
@@ -128,7 +128,7 @@ def test_each_c_is_tried_from_the_one_before_and_from_the_start(monkeypatch: pyt
         camera = one.cameras[0]
         return SimpleNamespace(cameras=(camera.with_parameters(camera.parameters * factor),))
 
-    monkeypatch.setattr(searched, "scaled", scaled)
+    monkeypatch.setattr(searched, "scale_estimate", scaled)
     search: Any = SimpleNamespace(adjusted=lambda one, held: searched._Candidate(one, next(heights)))
     track = searched._Search._along(search, start, 2.0, 3, 1.0)
     assert [one.vPv for one in track] == [1.0, 3.0, 2.0, 7.0]

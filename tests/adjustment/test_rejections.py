@@ -12,7 +12,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses import alternatives as rejections
 from sfm.adjustment.hypotheses.alternatives import SecondPlace, explain_rejections
-from sfm.adjustment.quality.consistency import intersected
+from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
@@ -151,7 +151,7 @@ def test_the_distance_is_judged_by_both_covariances_and_the_rays_rejected(clean:
     rows = np.array([row_of(clean, 3, i) for i in (5, 6, 7)])
     kept = np.array([row_of(clean, 3, i) for i in (0, 1, 2, 3, 4)])
     a = with_rejected(clean, {row: at(clean, row, clean.estimate.points[3]) for row in rows.tolist()})
-    (_, Q, _), (first, Q0, _) = intersected(a, rows), intersected(a, kept)
+    (_, Q, _), (first, Q0, _) = intersect_rays(a, rows), intersect_rays(a, kept)
     limit = np.sqrt(chi2_isf(0.01 / 3, 3))
     unit = axis / np.sqrt(axis @ np.linalg.inv(Q + Q0) @ axis)
     shift = first - clean.estimate.points[3]
@@ -170,8 +170,8 @@ def test_rays_that_do_not_meet_have_no_second_place(clean: Adjustment) -> None:
         where[rows[1]] += (0.0, px)
         return with_rejected(clean, where)
 
-    assert intersected(beside(0.0), np.array(rows))[2] < 1e-3
-    misfit = intersected(beside(1.0), np.array(rows))[2]
+    assert intersect_rays(beside(0.0), np.array(rows))[2] < 1e-3
+    misfit = intersect_rays(beside(1.0), np.array(rows))[2]
     limit = np.sqrt(chi2_isf(0.01, 3) / misfit)  # 6 coordinates less 3
     assert len(rejections._second_places(beside(0.93 * limit), set())) == 1
     assert rejections._second_places(beside(1.07 * limit), set()) == []

@@ -25,7 +25,14 @@ from sfm.planning.prediction import (
     predict_network,
     short_of,
 )
-from sfm.planning.stations import Stations, arrangement, choose_coded, looking, roll_deg, rolled
+from sfm.planning.stations import (
+    Stations,
+    aim_camera,
+    arrangement,
+    choose_coded,
+    roll_deg,
+    roll_rotations,
+)
 from sfm.planning.visibility import Seeing, compute_target_size, sight_of
 from sfm.report.figures.comparisons import DIAGRAM_PIXELS, design_diagram
 from sfm.runtime.progress import Silent, StageClock
@@ -166,7 +173,7 @@ def test_candidates_keep_to_what_is_allowed() -> None:
     assert nearest.min() >= CORRIDOR.distance[0] and nearest.max() <= CORRIDOR.distance[1]
     assert (X0[:half] == X0[half:]).all()
     turn = found.stations.rotation[:half].transpose(0, 2, 1) @ found.stations.rotation[half:]
-    assert np.allclose(turn, rolled(np.eye(3)))
+    assert np.allclose(turn, roll_rotations(np.eye(3)))
 
 
 BEHIND = StationLimits(space=np.array([[-3.0, 1.0, 0.0], [3.0, 3.0, 2.0]]))
@@ -244,7 +251,7 @@ def test_coded_targets_give_every_photograph_five() -> None:
 @pytest.mark.parametrize("roll", [-90.0, 0.0, 37.0, 90.0])
 @pytest.mark.parametrize("direction", [(1.0, 0.2, -0.3), (0.0, 0.0, -1.0)])
 def test_the_roll_of_a_shot(direction: tuple[float, ...], roll: float) -> None:
-    assert roll_deg(looking(np.array(direction), np.radians(roll))) == pytest.approx(roll, abs=1e-6)
+    assert roll_deg(aim_camera(np.array(direction), np.radians(roll))) == pytest.approx(roll, abs=1e-6)
     assert isinstance(Stations(("a",), np.zeros((1, 3)), np.eye(3)[None]).places, int)
     assert object_of_points(("a", "b", "c"), np.eye(3), None).size == pytest.approx(np.sqrt(3))
 

@@ -12,7 +12,7 @@ import sfm
 from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
+from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.planning.plan import further_photographs, plan_of, verdict_of_plan
 from sfm.planning.planned_object import shape_object
@@ -95,7 +95,7 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     assert np.allclose(read.stations.rotation, stations.rotation, atol=1e-9)
     path = write_simulation(read, tmp_path)
     result = sfm.run_survey(path, compare_with="none")
-    found = achieved(read, "ring14", result)
+    found = compare_with_plan(read, "ring14", result)
     assert found.points == found.planned == 20
     # 60 coordinates, correlated through the datum: 10 % of sampling error, and sigma0 of some 200 redundancy
     assert found.ratio == pytest.approx(1.0, abs=0.25) and found.error == pytest.approx(1.0, abs=0.35)

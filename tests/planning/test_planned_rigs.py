@@ -16,7 +16,7 @@ from sfm.conventions import angles_from_rotation
 from sfm.distributions import chi2_ppf
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
-from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
+from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
 from sfm.network import Estimate, Network
 from sfm.observations import TABLES
 from sfm.observations.kind import PHOTOGRAPH, Group, TableKind
@@ -307,7 +307,7 @@ def test_true_errors_are_those_predicted_in_the_mean(tmp_path: Path) -> None:
         (tmp_path / str(seed)).mkdir()
         survey = write_simulation(read, tmp_path / str(seed), codes=None, seed=seed)
         result = sfm.run_survey(survey, compare_with="none")
-        squares.append(achieved(read, None, result, seed=seed).error ** 2)
+        squares.append(compare_with_plan(read, None, result, seed=seed).error ** 2)
     low, high = chi2_ppf(0.001, 10) / 10, chi2_ppf(0.999, 10) / 10  # of the bar alone
     assert low < np.mean(squares) < high
 
@@ -329,7 +329,7 @@ def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) 
     assert read.coded[[3, 16]].all()
     result = sfm.run_survey(write_simulation(read, tmp_path), compare_with="none")
     assert result.adjustment.expected_defect == 6 and len(result.adjustment.network.images) == 10
-    reached = achieved(read, "ring14", result)
+    reached = compare_with_plan(read, "ring14", result)
     assert reached.points == reached.planned == 20
     assert reached.mounts is not None and reached.mounts < 2.0
     assert reached.ratio == pytest.approx(1.0, abs=0.25)

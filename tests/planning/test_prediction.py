@@ -22,10 +22,10 @@ from sfm.planning.prediction import (
     ScaleBarPlan,
     largest_length_sigma,
     predict_network,
+    select_usable,
     simulate_network,
-    usable,
 )
-from sfm.planning.stations import ARRANGEMENTS, Stations, around, arrangement, looking
+from sfm.planning.stations import ARRANGEMENTS, Stations, aim_camera, around, arrangement
 from sfm.planning.visibility import Seeing, sight_of
 from sfm.planning.weakness import calibratability, reason_of, rolled_share, weak_points
 from sfm.rendering.render import write_photographs
@@ -137,17 +137,17 @@ def test_unusable_photographs_and_points_are_left_out_together() -> None:
     seen[0], seen[1] = True, True
     seen[2, :5] = True
     seen[3, [0, 1, 2]] = True
-    photographs, points = usable(seen)
+    photographs, points = select_usable(seen)
     assert photographs.tolist() == [0, 1, 2] and points.tolist() == list(range(8))
     seen[1, :] = False
     seen[1, :3] = True  # then photograph 1 goes, and with it the second ray of the others' last points
-    photographs, points = usable(seen)
+    photographs, points = select_usable(seen)
     assert photographs.tolist() == [0, 2] and points.tolist() == list(range(5))
 
 
 def test_a_weak_point_is_named_with_its_reason() -> None:
     plate = shape_object("plate", (1.0, 0.7), 40)
-    two = looking(np.array([0.0, 0.0, -1.0]))
+    two = aim_camera(np.array([0.0, 0.0, -1.0]))
     away = np.array([[0.0, -1, 1], [0.3, 1, 1], [1, 0.2, 1], [-1, 0, 1.2]])
     stations = around(plate, CAMERA, away)
     lonely = np.array([1.2, 0.9, 0.0])
@@ -201,7 +201,7 @@ def test_what_cannot_be_an_arrangement_is_refused() -> None:
 def test_stations_all_at_one_place_are_refused() -> None:
     plate = shape_object("plate", (1000, 600), 40)
     ring = arrangement("ring:4", plate, CAMERA)
-    one = looking(np.array([0.0, 0.0, -1.0]))
+    one = aim_camera(np.array([0.0, 0.0, -1.0]))
     same = Stations(ring.names, np.tile([0.0, 0.0, 3000.0], (4, 1)), np.stack([one] * 4))
     for free in (CAMERA, replace(CAMERA, free=np.zeros_like(CAMERA.free))):
         with pytest.raises(GeometryError, match="different places, there are 1"):
@@ -234,7 +234,7 @@ def test_calibration_needs_convergence_and_rolled_photographs() -> None:
     ring = arrangement("ring:12", plate, CAMERA)
     good = calibratability(predict_network(plate, CAMERA, ring, SEEING), SEEING)
     assert good is not None and good.good and good.rolled == 0.5 and not good.reasons
-    upright = replace(ring, rotation=np.array([looking(-R[:, 2]) for R in ring.rotation]))
+    upright = replace(ring, rotation=np.array([aim_camera(-R[:, 2]) for R in ring.rotation]))
     worse = calibratability(predict_network(plate, CAMERA, upright, SEEING), SEEING)
     assert worse is not None and worse.contribution > good.contribution and "rolled by 90" in worse.reasons[0]
     flat = calibratability(

@@ -19,7 +19,7 @@ from sfm.planning.planned_object import (
     open_edges,
     shape_object,
 )
-from sfm.planning.stations import looking
+from sfm.planning.stations import aim_camera
 from sfm.planning.visibility import (
     DepthOfField,
     Lens,
@@ -76,7 +76,9 @@ def test_the_tree_of_boxes_finds_what_every_triangle_finds() -> None:
 
 def test_a_box_shows_three_sides_and_its_bottom_never() -> None:
     box = shape_object("box", (1.0, 1.0, 1.0), 300)
-    seen = sight_of(box, CAMERA, np.array([[3.0, 3.0, 3.5]]), looking(np.array([-3.0, -3, -3]))[None], WIDE)
+    seen = sight_of(
+        box, CAMERA, np.array([[3.0, 3.0, 3.5]]), aim_camera(np.array([-3.0, -3, -3]))[None], WIDE
+    )
     faces = box.normals @ np.array([1.0, 1.0, 1.0]) > 0.5
     assert (seen.visibility[0] == Visibility.SEEN).tolist() == faces.tolist()
     assert box.normals[:, 2].min() > -0.5
@@ -90,7 +92,7 @@ def test_incidence_format_and_unknown_normals() -> None:
     normals = np.column_stack([np.sin(angle), np.zeros(5), np.cos(angle)])
     xyz = np.array([[0.0, 0, 0], [0, 0.1, 0], [0.1, 0, 0], [0.1, 0.1, 0], [-0.1, 0, 0]])
     planned = object_of_points(tuple("abcde"), xyz, normals)
-    above, down = np.array([[0.0, 0.0, 10.0]]), looking(np.array([0.0, 0, -1]))[None]
+    above, down = np.array([[0.0, 0.0, 10.0]]), aim_camera(np.array([0.0, 0, -1]))[None]
     why = sight_of(planned, CAMERA, above, down, Seeing(sigma_px=0.1)).visibility[0]
     assert [Visibility(w) for w in why] == [
         Visibility.SEEN,
@@ -122,7 +124,7 @@ def test_depth_of_field_by_the_rays_of_the_lens() -> None:
     planned = object_of_points(tuple("abc"), np.array([[0.0, 0, 0], [0.1, 0, 0.2], [0, 0.1, -0.2]]), None)
     seeing = Seeing(sigma_px=0.1, depth=DepthOfField(0.9, 1.1, 1.0))
     why = sight_of(
-        planned, CAMERA, np.array([[0.0, 0, 1]]), looking(np.array([0.0, 0, -1]))[None], seeing
+        planned, CAMERA, np.array([[0.0, 0, 1]]), aim_camera(np.array([0.0, 0, -1]))[None], seeing
     ).visibility[0]
     assert [Visibility(w) for w in why] == [Visibility.SEEN, Visibility.UNSHARP, Visibility.UNSHARP]
 
@@ -158,7 +160,7 @@ def test_the_outline_of_a_target_is_that_of_its_projection() -> None:
     planned = object_of_points(
         tuple("abc"), np.array([[0.1, 0.2, 0], [0, 0, 0.1], [0.2, 0, 0]]), np.tile(normal, (3, 1))
     )
-    position, rotation = np.array([0.3, -0.4, 2.0]), looking(np.array([-0.1, 0.2, -1.0]), 0.7)
+    position, rotation = np.array([0.3, -0.4, 2.0]), aim_camera(np.array([-0.1, 0.2, -1.0]), 0.7)
     found = sight_of(planned, CAMERA, position[None], rotation[None], Seeing(diameter=0.02))
     a = np.cross(normal, [1.0, 0, 0])
     a /= np.linalg.norm(a)

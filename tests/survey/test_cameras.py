@@ -11,7 +11,7 @@ import pytest
 
 import sfm
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.other_solutions import scaled
+from sfm.adjustment.quality.other_solutions import scale_estimate
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.errors import SurveyFileError
@@ -127,7 +127,7 @@ def test_a_long_lens_converges(free: tuple[str, ...]) -> None:
     # from the other depth and another c: back at the c of the start, and of the right depth
     datum = Datum("free")
     start = replace(a.estimate, cameras=truth.cameras)
-    found = nearer_start(a.network, start, reverse_depth(scaled(start, 1.3)), datum)
+    found = nearer_start(a.network, start, reverse_depth(scale_estimate(start, 1.3)), datum)
     assert found is not None and found.cameras == truth.cameras
     again = adjust(a.network, found, datum=datum, reject="none", method="gauss-newton")
     assert again.sigma0_px == pytest.approx(a.sigma0_px, rel=1e-6)

@@ -17,7 +17,7 @@ from sfm.camera import camera_from_values
 from sfm.network import Estimate, ObjectPoints
 from sfm.remarks.remark import Remark, kinds_of, of_kind
 from sfm.report.findings.survey_remarks import findings_of, ray_remarks
-from sfm.survey.adjusting.solution_remarks import datum_remarks, not_calibrated
+from sfm.survey.adjusting.solution_remarks import datum_remarks, remarks_on_uncalibrated
 from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.calibration import plate_control
 from sfm.survey.inputs.measurements import MeasuredPhotographs
@@ -81,15 +81,15 @@ def test_projection_uncertainty_is_not_that_of_a_guess(tmp_path: Path) -> None:
     survey = plates_survey(tmp_path, 2, free=FREE.replace('"c", ', ""), c_mm=8.137)
     result = run_plates(survey, plates, about(plates, rng, 4), rng)
     estimate = result.adjustment.estimate
-    assert len(findings_of(result).calibrated) == 1 and not_calibrated(survey, estimate) == ()
+    assert len(findings_of(result).calibrated) == 1 and remarks_on_uncalibrated(survey, estimate) == ()
     asked = plates_survey(tmp_path, 2)
-    told = not_calibrated(asked, estimate)
+    told = remarks_on_uncalibrated(asked, estimate)
     assert kinds_of(told) == ("calibration_failed",)
     assert findings_of(replace(result, remarks=(*result.remarks, *told))).calibrated == ()
     free = replace(
         estimate, cameras=tuple(replace(one, free=np.ones_like(one.free)) for one in estimate.cameras)
     )
-    assert not_calibrated(asked, free) == ()
+    assert remarks_on_uncalibrated(asked, free) == ()
 
 
 def test_a_camera_is_known_by_its_whole_name(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_a_camera_is_known_by_its_whole_name(tmp_path: Path) -> None:
     survey = replace(survey, cameras=both)
     nothing = np.zeros((0, 3))
     estimate = Estimate((first, second), nothing, np.zeros((0, 3, 3)), nothing)
-    (found,) = not_calibrated(survey, estimate)
+    (found,) = remarks_on_uncalibrated(survey, estimate)
     assert found.names("camera") == ("cam 2",)
 
 

@@ -24,7 +24,7 @@ from benchmarks.textured import covariance_on_centres
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
-from sfm.planning.stations import looking
+from sfm.planning.stations import aim_camera
 from sfm.remarks.remark import kinds_of
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
@@ -102,8 +102,9 @@ def around(
 
 def upright(direction: FloatArray, roll: float = 0.0) -> FloatArray:
     """Return the rotation of a camera that looks along a direction, Y up."""
-    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # Y of the scene to Z of `looking`
-    return np.asarray(turn.T @ looking(turn @ direction, roll))
+    # from Y of the scene to Z of `aim_camera`
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return np.asarray(turn.T @ aim_camera(turn @ direction, roll))
 
 
 def usual(rng: np.random.Generator) -> Scene:

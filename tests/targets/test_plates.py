@@ -17,7 +17,7 @@ from sfm.rendering.render import render_photograph
 from sfm.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes import dot_plates
-from sfm.targets.codes.boards import FLAGS, REDUCED_PX, reduced
+from sfm.targets.codes.boards import FLAGS, REDUCED_PX, reduce_photograph
 from sfm.targets.codes.dot_plates import Lattice, name_dots, placements
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import Targets, find_targets
@@ -201,7 +201,7 @@ def test_small_squares_are_found_in_the_reduced_photograph() -> None:
     board = np.where(squares, 220, 30).astype(np.uint8).repeat(36, 0).repeat(36, 1)
     photograph[700 : 700 + len(board), 900 : 900 + board.shape[1]] = board
     for largest_px, is_found in ((REDUCED_PX, True), (REDUCED_PX // 2, False)):
-        small, _ = reduced(cv2.GaussianBlur(photograph, (0, 0), 1.5), largest_px)
+        small, _ = reduce_photograph(cv2.GaussianBlur(photograph, (0, 0), 1.5), largest_px)
         assert cv2.findChessboardCornersSB(small, (9, 6), flags=FLAGS)[0] == is_found
         assert small.size <= photograph.size / 16
 

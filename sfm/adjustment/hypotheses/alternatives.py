@@ -59,7 +59,7 @@ from sfm.adjustment.hypotheses.score import (
     log_likelihood_gain,
     log_probability,
 )
-from sfm.adjustment.quality.consistency import intersected
+from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
@@ -451,8 +451,8 @@ def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
         kept = np.flatnonzero((seen.point == j) & ~a.rejected)
         if len(out) < MIN_RAYS or len(kept) < 2:
             continue
-        X, Q, misfit = intersected(a, out)
-        first, Q0, _ = intersected(a, kept)
+        X, Q, misfit = intersect_rays(a, out)
+        first, Q0, _ = intersect_rays(a, kept)
         if not np.isfinite(misfit) or chi2_sf(misfit, 2 * len(out) - 3) < ALPHA:
             continue
         apart = X - first

@@ -197,7 +197,7 @@ MAX_STEPS = 10  # most steps of an intersection, which starts at the adjusted po
 LAST_STEP_SIGMAS = 1e-3  # standard deviations
 
 
-def intersected(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, FloatArray, float]:
+def intersect_rays(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, FloatArray, float]:
     """Return position (3,), cofactors (3, 3) and v'Pv over sigma0^2 of a point from some of its rays alone.
 
     It iterates, because a position far from the adjusted point needs more than one step. This happens, for

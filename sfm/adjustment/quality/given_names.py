@@ -77,11 +77,11 @@ def cost_of_choice(order: tuple[int, ...]) -> float:
     Args:
         order: index of the point whose coordinates each point gets, (n,).
     """
-    n, moved = len(order), len(moved_by(order))
+    n, moved = len(order), len(find_renamed(order))
     return 2 * (lgamma(n + 1) - lgamma(n - moved + 1))
 
 
-def moved_by(order: tuple[int, ...]) -> tuple[int, ...]:
+def find_renamed(order: tuple[int, ...]) -> tuple[int, ...]:
     """Return the points that get the coordinates of another point."""
     return tuple(k for k, one in enumerate(order) if one != k)
 

@@ -16,7 +16,7 @@ from math import comb, log
 
 import numpy as np
 
-from sfm.adjustment.quality.given_names import assignments, cost_of_choice, moved_by
+from sfm.adjustment.quality.given_names import assignments, cost_of_choice, find_renamed
 from sfm.adjustment.quality.given_values import (
     MARGIN,
     RANK,
@@ -237,7 +237,7 @@ class PlacedPoints:
     @property
     def renamed(self) -> tuple[int, ...]:
         """Points that have the coordinates of another point."""
-        return tuple(k for k in moved_by(self.order) if k not in self.judgement.wrong)
+        return tuple(k for k in find_renamed(self.order) if k not in self.judgement.wrong)
 
 
 def judge_points(
@@ -327,7 +327,9 @@ def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:
 
 def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
     """Return points as given, marked as doubtful because several explanations are possible."""
-    some = {k for one in like for k in (*moved_by(one.order), *one.judgement.wrong, *one.judgement.doubtful)}
+    some = {
+        k for one in like for k in (*find_renamed(one.order), *one.judgement.wrong, *one.judgement.doubtful)
+    }
     if not some or any(one.mirrored or one.strain for one in like):
         some = set(range(found.model.items))
     return replace(

@@ -223,7 +223,9 @@ class _Search:
         track: list[_Candidate] = []
         estimate = start
         for k in range(steps + 1):
-            starts = (scaled(estimate, factor), scaled(start, factor**k))[: min(k, 2)] or (start,)
+            starts = (scale_estimate(estimate, factor), scale_estimate(start, factor**k))[: min(k, 2)] or (
+                start,
+            )
             ended = [self.adjusted(one, held=steps > 0) for one in starts]
             found = min((one for one in ended if one is not None), key=lambda one: one.vPv, default=None)
             if found is None:
@@ -256,7 +258,7 @@ def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
     return replace(estimate, cameras=cameras)
 
 
-def scaled(estimate: Estimate, factor: float) -> Estimate:
+def scale_estimate(estimate: Estimate, factor: float) -> Estimate:
     """Return the estimate with c and the distances of photographs from the object multiplied.
 
     Args:

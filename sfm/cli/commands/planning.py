@@ -389,7 +389,7 @@ def simulate_command(
         from sfm.api import run_survey
         from sfm.files.open_folders import locked, refuse_foreign_folder
         from sfm.files.whole_files import remove_leftovers, whole_folder
-        from sfm.inspection.planned_survey import achieved, read_plan, write_simulation
+        from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
 
     refuse_foreign_folder(out)
     with working_on(str(folder)):
@@ -402,7 +402,7 @@ def simulate_command(
                 result = run_survey(survey, compare_with="none", progress=True)
                 result.write(part / "result")
                 (part / ".result.lock").unlink(missing_ok=True)
-                found = achieved(planned, family, result, seed=seed)
+                found = compare_with_plan(planned, family, result, seed=seed)
                 text = json.dumps(asdict(found), indent=2, allow_nan=False)
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
     print(f"{found.points} of {found.planned} planned points measured")

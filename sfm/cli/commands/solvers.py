@@ -150,12 +150,12 @@ def convert(
         from adapters.formats.registry import (
             ENDINGS,
             FORMATS,
+            describe_stored,
             format_named,
             losses_in_words,
             read_content,
             refuse_taken,
             write_content,
-            written,
         )
         from sfm.comparison.camera_conversion import Conversion, convert_cameras, undistort
 
@@ -189,7 +189,7 @@ def convert(
             )
     for note in content.notes:
         print(f"{source}: {note}")
-    print(f"{target}: {written(form.name, network, estimate)} as {form.name}")
+    print(f"{target}: {describe_stored(form.name, network, estimate)} as {form.name}")
     for loss in losses_in_words(form.name, content, gone):
         print(f"{target}: {loss} left out, format {form.name} cannot store them")
 

@@ -11,7 +11,12 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled_fused
 from sfm.kernels.small_algebra import MAX_ROOTS, find_positive_roots
-from sfm.orientation.resection.least_squares import ResectionSolution, checked_points, ordered, solution_of
+from sfm.orientation.resection.least_squares import (
+    ResectionSolution,
+    checked_points,
+    solution_of,
+    sort_solutions,
+)
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # size of the scratch space
@@ -56,7 +61,7 @@ def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[Re
     found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
     if not found:
         raise GeometryError("fischler-bolles: no camera sees the first three points under these angles")
-    return ordered(found)
+    return sort_solutions(found)
 
 
 def resect_triples(rays: FloatArray, points: FloatArray) -> Poses:

@@ -405,7 +405,7 @@ def rotation_from_position(tangents: FloatArray, points: FloatArray, position: F
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-def ordered(solutions: list[ResectionSolution]) -> tuple[ResectionSolution, ...]:
+def sort_solutions(solutions: list[ResectionSolution]) -> tuple[ResectionSolution, ...]:
     """Return solutions in the order of their residuals, smallest first."""
     return tuple(sorted(solutions, key=lambda solution: solution.rms))
 

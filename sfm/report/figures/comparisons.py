@@ -27,10 +27,10 @@ from sfm.report.figures.plots import (
     GREY,
     ORANGE,
     RED,
-    alone,
-    panelled,
     plan_axes,
     plot,
+    single_panel_figure,
+    two_panel_figure,
 )
 from sfm.report.phrases import finer_unit, significant
 
@@ -64,7 +64,7 @@ def difference_figure(
     finer, fine_unit = finer_unit(unit, max(longest, across))
     fine_unit = fine_unit or "object units"
     height = float(np.clip(ALONE_IN * np.ptp(flat[:, 1]) / max(np.ptp(flat[:, 0]), 1e-12 * size), 2.5, 8.0))
-    picture = alone(height + 0.8)
+    picture = single_panel_figure(height + 0.8)
     axes = picture.subplots()
     colours = np.where(significant_ones, RED, BLUE)
     arrows = axes.quiver(
@@ -90,7 +90,7 @@ def time_figure(validation: Validation) -> Figure:
     """Draw the seconds of both adjusters over the number of image points."""
     k = np.array([t.image_points for t in validation.trials])
     seconds = np.array([t.seconds for t in validation.trials])
-    picture = alone(3.6)
+    picture = single_panel_figure(3.6)
     axes = picture.subplots()
     axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label=program_name("kolinear"))
     axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=program_name(validation.backend))
@@ -114,7 +114,7 @@ def plot_series(found: EpochSeries) -> Plot | None:
     if not chosen:
         return None
     factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
-    picture = alone(3.8)
+    picture = single_panel_figure(3.8)
     axes = picture.subplots()
     at = np.arange(len(found.names))
     for name in chosen:
@@ -200,7 +200,7 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
     largest = float(np.abs([*found.value, *limits]).max())
     factor, fine = finer_unit(unit, largest)
     value, U = found.value * factor, found.coverage * np.nan_to_num(found.sigma) * factor
-    picture = panelled(3.6)
+    picture = two_panel_figure(3.6)
     left, right = picture.subplots(1, 2)
     left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
     left.set(xlabel=f"deviation [{fine}]", ylabel="points")
@@ -220,7 +220,7 @@ def length_error_figure(found: Acceptance) -> Figure:
     length, error = found.lengths.length, found.error
     U = found.coverage * np.nan_to_num(found.lengths.sigma)
     factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
-    picture = alone(4.2)
+    picture = single_panel_figure(4.2)
     axes = picture.subplots()
     x = np.linspace(0, 1.05 * float(length.max()), 200)
     limit = np.minimum(found.a + found.k * x, found.b) * factor

@@ -55,7 +55,7 @@ def all_plots(shown: PlotData) -> tuple[Plot, ...]:
 
 
 def plot(stem: str, caption: str, figure: Figure) -> Plot:
-    """Draw a figure, and cut it into its panels if it is `panelled`."""
+    """Draw a figure, and cut it into its panels if `two_panel_figure` made it."""
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
@@ -85,12 +85,12 @@ def _cells(figure: Figure) -> list[tuple[slice, slice]]:
     return [(slice(y[r], y[r + 1]), slice(x[c], x[c + 1])) for r, c in positions]
 
 
-def alone(height_in: float) -> Figure:
+def single_panel_figure(height_in: float) -> Figure:
     """Return a figure for one panel, narrow enough to be legible on a telephone."""
     return Figure(figsize=(ALONE_IN, height_in), layout="constrained")
 
 
-def panelled(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
+def two_panel_figure(height_in: float, *, rows: int = 1, bottom_in: float = BOTTOM_IN) -> Figure:
     """Return a figure with margins for rows of two panels; matplotlib's layouts would draw twice."""
     each_in = (height_in - TOP_IN - bottom_in - (rows - 1) * BETWEEN_IN) / rows
     figure = Figure(figsize=(WIDTH_IN, height_in))
@@ -153,7 +153,7 @@ def epipolar_figure(shown: PlotData) -> Figure:
 def _two_in_a_row(count: int) -> tuple[Figure, list[Axes]]:
     """Return a figure with the given number of panels for photograph formats."""
     rows = -(-count // 2)
-    figure = panelled(4.4 * rows, rows=rows)
+    figure = two_panel_figure(4.4 * rows, rows=rows)
     panels = figure.subplots(rows, 2, squeeze=False).ravel()
     for panel in panels[count:]:
         panel.set_axis_off()
@@ -174,7 +174,7 @@ def network_figure(shown: PlotData) -> Figure:
     points = shown.points @ axes_from_object.T
     position = shown.position @ axes_from_object.T
     size = 0.12 * float(np.median(np.linalg.norm(position - np.median(points, axis=0), axis=1)))
-    figure = panelled(5.2)
+    figure = two_panel_figure(5.2)
     for panel, title, plane in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
         across, up = plane
         panel.plot(points[:, across], points[:, up], ".", color=GREY, markersize=4)
@@ -237,7 +237,7 @@ def precision_figure(shown: PlotData) -> Figure:
     known = np.isfinite(shown.sigma)
     worst_last = np.argsort(np.where(known, shown.sigma, -1.0))
     worst_last = worst_last[known[worst_last]]
-    figure = panelled(4.6)
+    figure = two_panel_figure(4.6)
     for panel, title, (across, up) in zip(figure.subplots(1, 2), TITLES, ((0, 1), (0, 2)), strict=True):
         panel.plot(points[~known, across], points[~known, up], ".", color=GREY, markersize=3)
         x, y = points[worst_last][:, [across, up]].T
@@ -274,7 +274,7 @@ def projection_figure(shown: PlotData) -> Figure:
 def residual_figure(shown: PlotData) -> Figure:
     """Draw residual vectors over the format of each camera: each one, and the mean of each cell."""
     rows = len(shown.cameras)
-    figure = panelled(4.4 * rows, rows=rows)
+    figure = two_panel_figure(4.4 * rows, rows=rows)
     panels = figure.subplots(rows, 2, squeeze=False)
     owner = shown.camera[shown.image]
     for k, camera in enumerate(shown.cameras):
@@ -297,7 +297,7 @@ def residual_figure(shown: PlotData) -> Figure:
 def distribution_figure(shown: PlotData) -> Figure:
     """Draw the histogram of standardised residuals, and residuals by distance from the centre."""
     v, ray = shown.residuals, shown.from_centre
-    figure = panelled(3.8)
+    figure = two_panel_figure(3.8)
     histogram, radial = figure.subplots(1, 2)
     z = shown.standardised[np.isfinite(shown.standardised)]
     bins = np.linspace(-5, 5, 41)
@@ -333,7 +333,7 @@ def photograph_figure(shown: PlotData) -> Figure:
     m = len(rms)
     labels = [_plain(_short(name)) for name in shown.images] if m <= MAX_NAMED else []
     names_in = LETTER_IN * max(map(len, labels), default=0)
-    figure = panelled(3.4 + max(0.0, names_in - 0.7), bottom_in=max(BOTTOM_IN, 0.2 + names_in))
+    figure = two_panel_figure(3.4 + max(0.0, names_in - 0.7), bottom_in=max(BOTTOM_IN, 0.2 + names_in))
     bars, numbers = figure.subplots(1, 2)
     x = np.arange(m)
     for panel, values, colour, label in (

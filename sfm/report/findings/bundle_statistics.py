@@ -110,12 +110,12 @@ def statistics_of(result: SurveyResult) -> Statistics:
         else (global_test(adjustment),),
         w=w,
         tau=tau,
-        largest_w=spread(np.abs(w.statistic)).largest,
-        largest_tau=spread(np.abs(tau.statistic)).largest,
+        largest_w=summarise_redundancy(np.abs(w.statistic)).largest,
+        largest_tau=summarise_redundancy(np.abs(tau.statistic)).largest,
         reliability=found,
-        minimal_bias=spread(found.minimal_bias),
-        external=spread(found.external),
-        redundancy=spread(adjustment.redundancy_numbers),
+        minimal_bias=summarise_redundancy(found.minimal_bias),
+        external=summarise_redundancy(found.external),
+        redundancy=summarise_redundancy(adjustment.redundancy_numbers),
         redundancy_of_image_points=float(np.nansum(adjustment.redundancy_numbers)),
         redundancy_sum=float(kinds.redundancy.sum()),
         kinds=kinds,
@@ -127,7 +127,7 @@ def statistics_of(result: SurveyResult) -> Statistics:
     )
 
 
-def spread(values: FloatArray) -> Spread:
+def summarise_redundancy(values: FloatArray) -> Spread:
     """Return smallest, mean, median and largest known value; infinite if nothing checks an observation."""
     known = values[~np.isnan(values)]
     if not len(known):

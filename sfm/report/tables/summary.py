@@ -18,7 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.report.findings.bundle_statistics import Given, Spread, spread
+from sfm.report.findings.bundle_statistics import Given, Spread, summarise_redundancy
 from sfm.report.findings.calibrated_cameras import Rig
 from sfm.report.findings.checks import point_sigma
 from sfm.report.findings.survey_remarks import Findings
@@ -259,7 +259,7 @@ def _geometry(findings: Findings) -> dict[str, Any]:
 
 def _spread(values: FloatArray) -> dict[str, float | None]:
     """Return smallest, mean and largest of the known values."""
-    found = spread(values)
+    found = summarise_redundancy(values)
     return {"min": or_none(found.smallest), "mean": or_none(found.mean), "max": or_none(found.largest)}
 
 

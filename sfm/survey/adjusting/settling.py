@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.other_solutions import scaled
+from sfm.adjustment.quality.other_solutions import scale_estimate
 from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
@@ -392,7 +392,7 @@ def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> t
 def _start_candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
     """Yield the ended adjustment scaled to c of the start, and the start; each also reversed in depth."""
     factor = start.cameras[0].c_px / ended.cameras[0].c_px
-    back = replace(scaled(ended, factor), cameras=start.cameras) if factor > 0 else start
+    back = replace(scale_estimate(ended, factor), cameras=start.cameras) if factor > 0 else start
     for one in (back, start):
         yield one
         if datum.kind != "control":

@@ -44,9 +44,9 @@ from sfm.survey.adjusting.settling import (
 from sfm.survey.adjusting.solution_remarks import (
     handedness_unchecked,
     left_out_points,
-    not_calibrated,
     remarks_on_held_c,
     remarks_on_solution,
+    remarks_on_uncalibrated,
     unused_image_points,
     windows_elsewhere,
 )
@@ -182,7 +182,7 @@ def _solve(survey: Survey, matched: Correspondences, varying: frozenset[str] = f
                 for name, c, unit in _c_per_photograph(varying, final.estimate)
             ),
             *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
-            *not_calibrated(survey, final.estimate),
+            *remarks_on_uncalibrated(survey, final.estimate),
             *handedness_unchecked(survey, checked=given.checks_handedness),
             *windows_elsewhere(survey, judged.causes),
             *judged.unchecked,

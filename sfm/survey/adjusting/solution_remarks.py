@@ -229,7 +229,7 @@ def remarks_on_held_c(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tupl
     return (remark("c_held_contradicted", cameras=held),)
 
 
-def not_calibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
+def remarks_on_uncalibrated(survey: Survey, estimate: Estimate) -> tuple[Remark, ...]:
     """Return a remark for each camera that a plate should calibrate, but whose c was held in the end.
 
     Args:

@@ -22,7 +22,7 @@ from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
-from sfm.targets.codes.boards import find_crossings, read_april_tags, reduced
+from sfm.targets.codes.boards import find_crossings, read_april_tags, reduce_photograph
 from sfm.targets.codes.concentric import WIDTHS as CONCENTRIC
 from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.dot_plates import find_lattice
@@ -274,7 +274,7 @@ def _look(grey: AnyArray) -> _Look:
     """
     height, width = grey.shape
     top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
-    whole, middle = reduced(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
+    whole, middle = reduce_photograph(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
     circles = 0
     for picture in (whole, np.ascontiguousarray(middle)):
         targets = find_targets(picture)

@@ -131,7 +131,7 @@ def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
     return tuple(found)
 
 
-def calibrated(
+def apply_calibration(
     settings: CameraSettings,
     calibrations: tuple[Calibration, ...],
     where: str,

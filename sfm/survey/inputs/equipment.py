@@ -130,7 +130,7 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
             bounds, a calibration in the future, a duplicate name, or a table that is outside its folder or
             unreadable.
     """
-    from sfm.survey.inputs.survey_file import inside
+    from sfm.survey.inputs.survey_file import path_inside
 
     text, table = read_toml(path, "an equipment file", repeated=("bar", "frame"))
     try:
@@ -143,7 +143,7 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
             raise SurveyFileError(f"{path}: '{name}' occurs twice; bars and frames need different names")
     tables = {}
     for frame in content.frames:
-        file = inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
+        file = path_inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
         found = read_table(file, ("point",), COORDINATES)
         found.keys("point")
         tables[frame.name] = found

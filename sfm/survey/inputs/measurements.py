@@ -22,7 +22,7 @@ from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import SurveyFile, inside, is_home_file
+from sfm.survey.inputs.survey_file import SurveyFile, is_home_file, path_inside
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
 
@@ -147,7 +147,7 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
         if images_dir is not None and is_home_file(path):
             return
         name = path.relative_to(folder).as_posix()
-        inside(folder, name, survey.source, allow_outside=survey.allow_outside)
+        path_inside(folder, name, survey.source, allow_outside=survey.allow_outside)
 
     def matching(camera: str, glob: str) -> list[Path]:
         try:

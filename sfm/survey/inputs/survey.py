@@ -20,7 +20,7 @@ from sfm.observations.pose import MountObservations
 from sfm.result import PlacedEquipment
 from sfm.survey.inputs.calibration import (
     Calibration,
-    calibrated,
+    apply_calibration,
     is_plate_control,
     plate_control,
     plate_family,
@@ -332,17 +332,18 @@ def with_calibration(
     """Return the survey with each camera held at a calibration, or with the calibration as an observation.
 
     Args:
-        survey: its cameras take the calibration of their name, or the only one, see `calibrated`.
+        survey: its cameras take the calibration of their name, or the only one, see `apply_calibration`.
         calibrations: cameras of an earlier result.
         source: name of the earlier result in error messages.
         weighted: whether the cameras are adjusted, with the calibration and its covariance as an observation;
             else they are held.
 
     Raises:
-        SurveyFileError: as in `calibrated`.
+        SurveyFileError: as in `apply_calibration`.
     """
     cameras = (
-        calibrated(one, calibrations, survey.source, source, weighted=weighted) for one in survey.cameras
+        apply_calibration(one, calibrations, survey.source, source, weighted=weighted)
+        for one in survey.cameras
     )
     return replace(survey, cameras=tuple(cameras))
 
@@ -353,7 +354,9 @@ def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSett
         return camera
     folder = file.beside(camera.calibration)
     weighted = camera.calibration_use == "weighted"
-    return calibrated(camera, read_calibrations(folder), file.source, camera.calibration, weighted=weighted)
+    return apply_calibration(
+        camera, read_calibrations(folder), file.source, camera.calibration, weighted=weighted
+    )
 
 
 def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:

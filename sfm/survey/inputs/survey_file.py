@@ -121,7 +121,7 @@ class SurveyFile(Section):
             SurveyFileError: the path leaves the survey's folder; only the person who runs the survey can
                 allow that.
         """
-        return inside(self._path.parent, name, str(self._path), allow_outside=self._allow_outside)
+        return path_inside(self._path.parent, name, str(self._path), allow_outside=self._allow_outside)
 
     def tables(self) -> tuple[Path, ...]:
         """Return the paths of all tables of the survey.
@@ -152,7 +152,7 @@ class SurveyFile(Section):
         return tuple(self.beside(name) for name in names if name is not None)
 
 
-def inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
+def path_inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
     """Return the path of a file in a folder; symbolic links are followed for the check.
 
     Args:

@@ -20,7 +20,7 @@ from sfm.matching.lsm.coverage import MAX_COST_RATIO, plane_warps, points_apart
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
-from sfm.matching.radiometry import MEMORY_BYTES, Grey, GreyPhotographs, averaged, grey_of
+from sfm.matching.radiometry import MEMORY_BYTES, Grey, GreyPhotographs, grey_of, shrink_photograph
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.photographs.reading import read_photograph
@@ -293,7 +293,7 @@ class Photographs:
 
     def _read(self, i: int) -> AnyArray:
         photograph = read_of_size(self._paths[i], self._names[i], self._sizes[i])
-        return photograph if self.shrink == 1 else averaged(grey_of(photograph), self.shrink)
+        return photograph if self.shrink == 1 else shrink_photograph(grey_of(photograph), self.shrink)
 
 
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:

@@ -108,7 +108,7 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     full photograph if the squares are too small. OpenCV's older finder accepts boards without a white rim.
     """
     size = plate.columns, plate.rows
-    small, scale = reduced(grey, REDUCED_PX)
+    small, scale = reduce_photograph(grey, REDUCED_PX)
     found, corners = cv2.findChessboardCornersSB(small, size, flags=FLAGS)
     if not found:
         xy, code = name_cut_board(grey, plate.rows, plate.columns)
@@ -132,7 +132,7 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     return xy.reshape(-1, 2), np.arange(plate.count)
 
 
-def reduced(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]:
+def reduce_photograph(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]:
     """Return a photograph reduced to a maximum size, and its scale relative to the original."""
     scale = min(1.0, largest_px / max(grey.shape))
     if scale == 1.0:

@@ -23,7 +23,7 @@ from sfm.targets.codes.boards import (
     find_crossings,
     name_corners,
     read_april_tags,
-    reduced,
+    reduce_photograph,
 )
 from sfm.targets.codes.dot_plates import find_lattice, placements, rings_among, size_of_marks
 from sfm.targets.codes.plates import GRIDS, MAX_OFF_PLACE, PlateFamily, quarter_turn, refuse_unusable_plate
@@ -78,7 +78,7 @@ def part_of_checkerboard(grey: AnyArray) -> Part | None:
     Args:
         grey: photograph, uint8, (H, W).
     """
-    small, _ = reduced(grey, SEARCHED_PX)
+    small, _ = reduce_photograph(grey, SEARCHED_PX)
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
     if not found or meta is None or min(meta.shape[:2]) < MIN_SIDE:
         return None

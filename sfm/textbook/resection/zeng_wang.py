@@ -29,9 +29,9 @@ from sfm.orientation.resection.fischler_bolles import (
 from sfm.orientation.resection.least_squares import (
     ResectionSolution,
     checked_points,
-    ordered,
     rotation_from_position,
     solution_of,
+    sort_solutions,
 )
 
 MAX_STEPS = 100
@@ -63,7 +63,7 @@ def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Resectio
     found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
     if not found:
         raise GeometryError("zeng-wang: no camera sees the first three points at these angles")
-    return ordered(found)
+    return sort_solutions(found)
 
 
 def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
@@ -369,7 +369,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
             found.append(solution)
     if not found:
         raise failure
-    return ordered(found)
+    return sort_solutions(found)
 
 
 def _rampal_position(uv: FloatArray, xyz: FloatArray) -> FloatArray:

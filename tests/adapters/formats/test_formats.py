@@ -23,12 +23,12 @@ from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.registry import FORMATS as FILE_FORMATS
 from adapters.formats.registry import (
+    describe_stored,
     format_named,
     format_of,
     read_any,
     read_comparable,
     write_any,
-    written,
 )
 from adapters.formats.sba_text import read_sba_text, write_sba_text
 from sfm.camera import Camera, camera_from_values, pixel_jacobian
@@ -462,9 +462,9 @@ def test_image_points_are_corrected_for_formats_without_distortion(name: str, tm
 def test_what_was_written_is_reported(tmp_path: Path) -> None:
     network, truth = network_in("opencv")
     k = len(network.image_points)
-    assert written("ply", network, truth) == "20 points"
-    assert written("colmap", network, truth) == f"6 photographs, 20 points, {k} image points"
-    assert written("colmap-database", network, truth) == (
+    assert describe_stored("ply", network, truth) == "20 points"
+    assert describe_stored("colmap", network, truth) == f"6 photographs, 20 points, {k} image points"
+    assert describe_stored("colmap-database", network, truth) == (
         f"6 photographs, {k} image points, no coordinates of points"
     )
     position = truth.position.copy()
@@ -474,7 +474,7 @@ def test_what_was_written_is_reported(tmp_path: Path) -> None:
     again, _ = read_any(tmp_path / "t")
     assert len(again.images) == 5
     assert (
-        written("tables", network, part)
+        describe_stored("tables", network, part)
         == f"5 photographs, 20 points, {len(again.image_points)} image points"
     )
     write_any(tmp_path / "c.db", "colmap-database", network, truth)
