@@ -72,7 +72,7 @@ def test_what_is_not_determined_comes_first_and_without_precision(
     printed = capsys.readouterr().out
     found = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "bad" and found["remarks"][0]["kind"] == "plan_undetermined"
-    assert "sigma of points, what is not determined left out: " in printed
+    assert "sigma of points, without those not determined: " in printed
     kinds_found = {one["kind"] for one in found["remarks"]}
     assert "plan_does_not_calibrate" not in kinds_found  # nothing is calibrated by what is not determined
     unknown = found["remarks"][0]
@@ -204,10 +204,13 @@ def test_the_camera_of_a_survey_file(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "camera synthetic has no focal length, expected c_mm or --c-mm" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("command", "file"), [("simulate", "plan.json"), ("more", "summary.json")])
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [("simulate", "nowhere/plan.json: cannot be read"), ("more", "nowhere: not the folder of a result")],
+)
 def test_a_folder_that_is_none_is_one_line(
     command: str,
-    file: str,
+    said: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -215,7 +218,7 @@ def test_a_folder_that_is_none_is_one_line(
     monkeypatch.chdir(tmp_path)
     assert plan("nowhere", command=command) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and f"nowhere/{file}: cannot be read" in lines[0]
+    assert len(lines) == 1 and said in lines[0]
     assert not Path("out").exists()
 
 

@@ -55,7 +55,7 @@ def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pyte
         asked.append(pitch)
         return Draft("plate", "[survey]\n", (), (), ())
 
-    monkeypatch.setattr(drafting, "_draft", drafted)
+    monkeypatch.setattr(drafting, "_draft_folder", drafted)
     out = tmp_path / "out" / "plate"
     with stopped_once():  # as every command
         file, _ = drafting.drafted_beside(tmp_path, out, 12.5)
@@ -69,7 +69,7 @@ def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where the run failed and left no result, and after all was moved together."""
-    monkeypatch.setattr(drafting, "_draft", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
+    monkeypatch.setattr(drafting, "_draft_folder", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
     first, second = tmp_path / "all" / 'b "1"' / "plate", tmp_path / "all" / "c" / "plate"
     for folder in (first, second):
         folder.mkdir(parents=True)
