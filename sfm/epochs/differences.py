@@ -12,7 +12,7 @@ control that both share.
 
 The change of the mounts of a rig is tested by T = d' (Q_1 + Q_2)^-1 d over its degrees of freedom. If both
 epochs use the same given values, such as a scale bar, the true variance of d is smaller than Q_1 + Q_2. The
-test then finds fewer changes, but reports no false ones.
+test is then conservative: it finds fewer changes.
 
 Source: Niemeier (2008), Ausgleichungsrechnung, sec. 12.2; Koch (1999), Parameter Estimation and Hypothesis
 Testing in Linear Models, sec. 3.2.3 (covariance of estimates and observations).

@@ -154,7 +154,6 @@ def _test(found: ResultComparison, tested: int) -> tuple[Part, ...]:
     )
     datum = "the points that did not move" if found.majority else "all common points"
     words = (
-        "T = d' (Qa + Qb)^-1 d / 3 of a difference d, with the covariance of each point alone"
         "T = d' (Qa + Qb)^-1 d / 3 for a difference d, with the covariance of each point alone"
         if found.approximate
         else f"Both results refer to the datum of {datum}. T of a point is a third of the decrease in the "

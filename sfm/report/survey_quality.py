@@ -172,7 +172,7 @@ def _covered(one: Coverage) -> str:
     hull, radius = 100 * one.hull, 100 * one.radius
     area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
     reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
-    return f"{area}, all together {100 * one.hull_of_all:.0f} %; from the centre {reach}"
+    return f"{area}, all together {100 * one.hull_of_all:.0f} %; reach from the centre {reach}"
 
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:

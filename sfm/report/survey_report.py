@@ -258,9 +258,9 @@ def rejected(report: Report) -> Section:
     if len(rows):
         parts.append(
             Paragraph(
-                f"{len(rows)} of {len(a.rejected)} image points were rejected in the adjustment "
-                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Their residuals are too large for their "
-                f"standard deviations, so they do not contribute to the result. {limits}"
+                f"Rejected in the adjustment: {len(rows)} of {len(a.rejected)} image points "
+                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Image points with residuals that are too "
+                f"large for their standard deviations do not contribute to the result. {limits}"
             )
         )
         parts += [_rejected_points(a), FoldedParts("Rejected rays by point", _rejected_rays(f), in_text=True)]

@@ -306,7 +306,7 @@ def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
 
 
 def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:
-    """Return whether all other photographs but one of the same moment already have a separate pose."""
+    """Return whether all other photographs of the same moment already have a separate pose."""
     taken_with = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
     return taken_with + 2 > int((moment == moment[tested[k]]).sum())
 

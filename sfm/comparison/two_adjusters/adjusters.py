@@ -64,7 +64,7 @@ class BetterFit:
 
     @property
     def times(self) -> float:
-        """Ratio of the residuals."""
+        """RMS residual with the camera of the survey over that with the camera of the comparison."""
         return self.own_rms_px / self.rms_px if self.rms_px > 0 else np.inf
 
 

@@ -61,7 +61,7 @@ REFINING = (
     Kind(
         "refinement_hardly_better",
         "warning",
-        "The RMS is {times} times that before, expected far less.",
+        "The RMS is {times} times that before; far less was expected.",
         "a camera model that does not suit the lens, something that moved, or little texture",
         "Use another camera model; mask what moved.",
     ),

@@ -128,9 +128,11 @@ def _limits(result: SurveyResult) -> str:
     a = result.adjustment
     if result.reject == "tau":
         critical = tau_critical(a.test_alpha, a.redundancy)
-        return f"where |tau| is beyond {critical:.2f} (level {a.test_alpha:.2g}), taken back where it is not"
+        return (
+            f"where |tau| exceeds {critical:.2f} (level {a.test_alpha:.2g}), restored where it no longer does"
+        )
     if result.reject == "tukey":
-        return f"weight 0 beyond {TUKEY:g} standard deviations, taken back below"
+        return f"weight 0 beyond {TUKEY:g} standard deviations, restored below"
     if result.reject == "huber":
         return f"none rejected; weight below 1 beyond {HUBER:g} standard deviations"
     return "none rejected"

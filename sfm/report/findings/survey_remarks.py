@@ -72,7 +72,7 @@ HEADLINES: Mapping[Level, str] = {
     "fair": "The survey worked, with remarks: {found}.",
     "bad": "The survey has no dependable result.",
 }
-SIGMA0_LOW = 0.5  # as cautious by this factor as it may be too small without a warning
+SIGMA0_LOW = 0.5  # sigma0 over the stated value below which this is called pessimistic
 
 
 def headlines_of(result: SurveyResult) -> dict[Level, str]:
