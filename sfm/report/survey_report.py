@@ -259,8 +259,8 @@ def rejected(report: Report) -> Section:
         parts.append(
             Paragraph(
                 f"Rejected in the adjustment: {len(rows)} of {len(a.rejected)} image points "
-                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Image points with residuals that are too "
-                f"large for their standard deviations do not contribute to the result. {limits}"
+                f"({fixed(100 * len(rows) / len(a.rejected), 1)} %). Image points with residuals that are "
+                f"too large for their standard deviations do not contribute to the result. {limits}"
             )
         )
         parts += [_rejected_points(a), FoldedParts("Rejected rays by point", _rejected_rays(f), in_text=True)]

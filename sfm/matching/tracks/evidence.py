@@ -98,7 +98,6 @@ def grow(
         density: unused targets per px^2 in each photograph, (m,).
         log_tests: natural logarithm of the number of hypotheses tested.
         min_rays: fewest rays of a point.
-        min_rays: fewest rays of a point.
         cos_angle: cosine of the smallest angle between the two rays of a pair.
 
     Returns:
