@@ -233,7 +233,7 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
 
 
 def _strongest(network: Network) -> BoolArray:
-    """Choose the points with the most rays, and at least POINTS_PER_PHOTOGRAPH of every photograph, (n,)."""
+    """Choose the points with the most rays, and up to POINTS_PER_PHOTOGRAPH of each photograph, (n,)."""
     seen = network.image_points
     order = np.argsort(-network.rays(), kind="stable")
     chosen = np.zeros(len(network.points), dtype=bool)

@@ -80,6 +80,7 @@ def find_boards(
         The crossings of each board, and the plate point of each crossing.
 
     Source: OpenCV's finders (Duda and Frese 2018, for the checkerboard) for position and name; measured by
+    `measure_saddles`.
     """
     grey = as_bytes(photograph, scale)
     grids = {plate.dictionary for plate in plates if plate.name == "aprilgrid"}
