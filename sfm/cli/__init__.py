@@ -68,7 +68,7 @@ def _prepare() -> None:
 
 
 def _run() -> None:
-    """Run the command that the arguments name."""
+    """Run the command named by the arguments."""
     with loading():
         from sfm.cli.app import USAGE_ERROR, commands
     try:

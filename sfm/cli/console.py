@@ -189,7 +189,7 @@ def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
-    """Return further figures, for --verbose."""
+    """Return further key figures, for --verbose."""
     result, counts = findings.result, findings.counts
     a = result.adjustment
     rows = [
