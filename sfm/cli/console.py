@@ -51,7 +51,7 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
     table = Table(show_header=False, box=None, padding=(0, COLUMN_GAP, 0, 0), pad_edge=False)
-    figures = (*_figures(findings), ("time", f"{seconds:.1f} s, report included"))
+    figures = (*_figures(findings), ("time", f"{seconds:.1f} s, including the report"))
     rows = (*figures, *(_details(findings) if verbose else ()))
     room = console.width - max(len(name) for name, _ in rows) - COLUMN_GAP
     for name, value in rows:
@@ -159,8 +159,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         rows.append(
             (
                 other,
-                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both of the image "
-                f"points alone{f', {left_out}' if left_out else ''}, equal weights, free datum, {both.model}",
+                f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both from the image "
+                f"points alone{f', {left_out}' if left_out else ''}, with equal weights, a free datum and the "
+                f"camera model {both.model}",
             )
         )
     found = result.baseline

@@ -271,7 +271,7 @@ def test_a_result_that_cannot_be_depended_on_has_exit_code_1(
     good = tmp_path / "good"
     assert kolinear("adjust", survey, "--out", good, "-v") == 0
     shown = capsys.readouterr().out
-    assert "global test" in shown and "report included" in shown
+    assert "global test" in shown and "including the report" in shown
     text = survey.read_text(encoding="utf-8").replace('free = ["c"]', "free = []")
     survey.write_text(text.replace("c_mm = 10.0", "c_mm = 11.0"), encoding="utf-8")
     bad = tmp_path / "bad"
