@@ -340,9 +340,10 @@ def _correlations(f: Findings) -> Iterator[Part]:
     if strong:
         heads = (Column("camera parameter"), Column("strongly correlated with"))
         rows = [
-            (one.parameter, one.partners, 100 * one.largest, f"{one.part} of {one.image}") for one in strong
+            (one.parameter, one.partners, 100 * one.largest, f"with {one.part} of {one.image}")
+            for one in strong
         ]
-        yield Table((*heads, Column("largest", "", "%", "+.1f"), Column("with")), rows)
+        yield Table((*heads, Column("largest correlation", "", "%", "+.1f"), Column("")), rows)
         yield Note(
             "The photographs can hardly separate these, such as c from Z0 in a flat network. Photographs "
             "rolled about their axis, convergent photographs, and an object with depth can."
