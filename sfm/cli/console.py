@@ -160,8 +160,8 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
             (
                 other,
                 f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both from the image "
-                f"points alone{f', {left_out}' if left_out else ''}, with equal weights, a free datum and the "
-                f"camera model {both.model}",
+                f"points alone{f', {left_out}' if left_out else ''}, with equal weights, a free datum and "
+                f"the camera model {both.model}",
             )
         )
     found = result.baseline

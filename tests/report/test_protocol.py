@@ -59,7 +59,7 @@ def test_rejected_rays_stand_in_the_text_report_by_point(found: Findings) -> Non
     text = text_report(found)
     point, images, rays = found.protocol.rejected[0]
     assert re.search(rf"\n  {point} +1 of {rays} +{images[0]}\n", text)
-    assert "where |tau| is beyond" in " ".join(text.split())
+    assert "where |tau| exceeds" in " ".join(text.split())
 
 
 def test_the_text_report_has_correlations_and_names_the_tables(found: Findings, tmp_path: Path) -> None:
