@@ -143,7 +143,7 @@ class Camera:
 
     @property
     def shared_name(self) -> str:
-        """Name of the group that shares parameters with this camera; its own name if nothing is shared."""
+        """Name of the group that shares parameters with this camera; its name if nothing is shared."""
         return next(filter(None, self.shared), self.name)
 
     def reduced(self, shrink: int) -> Camera:

@@ -64,7 +64,7 @@ class GivenResiduals:
         return GivenResiduals(self.kind, self.coordinates, names, units, *values)
 
     def components(self, kind: str, some: slice) -> GivenResiduals:
-        """Return some of the coordinates as a kind of their own."""
+        """Return some of the coordinates as a separate kind."""
         values = (x[:, some] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(
             kind, self.coordinates[some], self.names, tuple(u[some] for u in self.units), *values

@@ -172,7 +172,7 @@ class Network:
         return cls(images, owner, points, seen)
 
     def with_control(self, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> Network:
-        """Return the network with the given control points in place of its own.
+        """Return the network with the given control points in place of its present ones.
 
         Args:
             names: names of points of the network, c of them.

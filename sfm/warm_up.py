@@ -1,8 +1,8 @@
 """Compiles the numba kernels before the first survey: `python -m sfm.warm_up`.
 
 Numba keeps compiled kernels on disk. Without them, the first run of each kind would take most of a minute
-longer. Each part solves a small synthetic problem in its own process, since numba compiles one function at a
-time.
+longer. Each part solves a small synthetic problem in a separate process, since numba compiles one function
+at a time.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def main(progress: Progress = SILENT) -> None:
 
 
 def _compile(part: Callable[[], None]) -> None:
-    """Compile a part in its own process, without garbage collection.
+    """Compile a part in a separate process, without garbage collection.
 
     Searching the many objects of the compiler for cycles would take a tenth of the time. The cycles use
     0.2 GB, which the end of the process frees.

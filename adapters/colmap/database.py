@@ -5,7 +5,7 @@ point. A point is therefore written as matches between all photographs that show
 connected component of the graph of matches. Keypoints are single precision: 1e-4 px at 2000 px.
 
 The file is not trusted. It is opened read-only and immutable, so nothing is written to it or beside it. Only
-its own tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.
+its tables are read: no views, virtual tables or computed columns, whose expressions could run for ever.
 
 Source: COLMAP 4.2 documentation, "Database Format"; sqlite.org/fileformat.html, sec. 1.3, for the header, and
 sqlite.org/security.html.

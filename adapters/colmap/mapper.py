@@ -37,7 +37,7 @@ class MapperBaseline:
     """The result of COLMAP's pipeline on the photographs."""
 
     network: Network  # registered photographs and their SIFT points
-    estimate: Estimate  # its orientations and points, in its own frame and scale
+    estimate: Estimate  # its orientations and points, in its frame and scale
     total: int  # photographs processed
     rms_px: float  # root mean square residual per coordinate of its points, px
     seconds: float  # from photographs to model, s

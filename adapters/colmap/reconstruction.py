@@ -6,7 +6,7 @@ All differences are converted here and nowhere else:
     camera axes    COLMAP looks along +z with y down: R_colmap = diag(1, -1, -1) M, t = -R_colmap X0
     numbers        cameras, photographs and points are numbered from 1 in COLMAP
     rigs, frames   since COLMAP 4 a photograph belongs to a frame of a rig: a moment is a frame, and a
-                   photograph without a rig has a frame of its own
+                   photograph without a rig has a separate frame
 
 The caller passes pycolmap, which only `adapters.colmap.adjuster` imports.
 

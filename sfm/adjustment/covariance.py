@@ -221,7 +221,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     weight = np.ascontiguousarray(adjustment.weights[layout.order])
     optimum = optimum_at(problem_of(layout, observed, resolved), state, weight)
     if optimum is None:
-        motions_of(layout, observed, state, resolved)  # raises its own error if the datum is the reason
+        motions_of(layout, observed, state, resolved)  # raises if the datum is the reason
         raise GeometryError("adjustment: its normal equations cannot be solved")
     return Marginal(adjustment, layout, observed, optimum, cofactors(optimum, layout, cross=cross))
 

@@ -56,7 +56,7 @@ class Congruency:
     difference: FloatArray  # d_S, (n, 3)
     covariance: FloatArray  # Q_S of all coordinates, (3 n, 3 n)
     motions: FloatArray  # G: motions that are not a change, (3 n, u)
-    statistic: FloatArray  # T of each point: its drop of Omega if stable, else its own test, over 3, (n,)
+    statistic: FloatArray  # T of each point: its drop of Omega if stable, else its single test, over 3, (n,)
     level: FloatArray  # alpha of the test of each point, (n,)
     critical: FloatArray  # critical value of T, (n,)
     weights: FloatArray  # P_kk of each stable point, which gives its drop, 0 for others, (n, 3, 3)

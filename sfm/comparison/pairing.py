@@ -309,7 +309,7 @@ def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class PointPairs:
-    """Coordinates of the same points in two results, each in its own frame and unit."""
+    """Coordinates of the same points in two results, each in its frame and unit."""
 
     names: tuple[str, ...]  # (n,)
     a: FloatArray  # (n, 3)

@@ -267,7 +267,7 @@ class Baseline(Protocol):
 
     @property
     def estimate(self) -> Estimate:
-        """Its cameras, orientations and points, in its own frame and scale."""
+        """Its cameras, orientations and points, in its frame and scale."""
 
     @property
     def total(self) -> int:
@@ -289,7 +289,7 @@ class BaselineComparison:
     name: str  # of the baseline
     photographs: tuple[int, int]  # numbers of oriented photographs
     total: int  # number of given photographs
-    rms_px: tuple[float, float]  # residuals of each one's own image points, per coordinate, px
+    rms_px: tuple[float, float]  # residuals of the image points of each, per coordinate, px
     targets: int  # object points of the survey that the baseline's photographs also determine
     target_rms_px: float  # of the survey's image points with the baseline's orientations, px
     points: FloatArray  # baseline minus survey after the similarity, object unit, NaN if missing, (n, 3)

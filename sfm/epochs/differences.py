@@ -54,7 +54,7 @@ class Differences:
     names: tuple[str, str]  # of the epochs
     unit: str
     points: tuple[str, ...]  # names in the first epoch, (n,)
-    pairs: PointPairs  # the points of both epochs, each in its own frame
+    pairs: PointPairs  # the points of both epochs, each in its frame
     xyz: FloatArray  # coordinates in the first epoch, object unit, (n, 3)
     difference: FloatArray  # object unit, (n, 3)
     covariance: FloatArray  # of the differences, object unit^2, (3 n, 3 n)
@@ -242,7 +242,7 @@ def _correlation_of_shared(
 
 
 def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray) -> FloatArray:
-    """Return a b' for the common points, each epoch in its own frame, (3 n, 3 n)."""
+    """Return a b' for the common points, each epoch in its frame, (3 n, 3 n)."""
     rows_a, rows_b = (
         coordinates_of(one.result.covariance_rows(p)) for one, p in zip((first, second), pairs.T, strict=True)
     )

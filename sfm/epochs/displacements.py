@@ -78,7 +78,7 @@ class Displacements:
 
     @property
     def undecided(self) -> BoolArray:
-        """Reference points that are not stable, but did not move by their own test, (n,)."""
+        """Reference points that are not stable, but did not move by the test of each, (n,)."""
         return self.reference & ~self.stable & ~self.moved
 
     @property
@@ -148,7 +148,7 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
 def _detectable(found: Congruency, redundancy: int | None) -> FloatArray:
     """Return the smallest detectable displacement of each point in its worst direction, (n,).
 
-    A stable point is tested by the drop of Omega, any other point by its own test in the datum.
+    A stable point is tested by the drop of Omega, any other point by a separate test in the datum.
     """
     shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(found.level.tolist())}
     variance = point_blocks(found.covariance, 3)

@@ -2,7 +2,7 @@
 
 A folder from somebody else may contain links at every path that is written. Therefore no part of such a path
 may be a link, except for links of the system in its root folder (such as /tmp of macOS). A folder is opened
-before anything is made, opened or moved in it, so that nobody can replace it meanwhile. Windows cannot open
+before anything is made, opened or moved in it, so that it cannot be replaced meanwhile. Windows cannot open
 files through such a handle, so there only the path is checked.
 
 A lock lets only one run at a time write into a folder, and shows everybody its owner. The operating system
@@ -314,7 +314,7 @@ def _owner(handle: int) -> Owner | None:
 def refuse_foreign_folder(out: Path) -> None:
     """Raise OutputError unless a folder is absent, empty, or unchanged by its manifest since it was written.
 
-    It is also called before the work starts, so that nobody waits for a result that cannot be written.
+    It is also called before the work starts, so that no one waits for a result that cannot be written.
     """
     refuse_links(out)
     try:

@@ -1,7 +1,7 @@
 """Compile functions with numba, and keep the compiled code for the sources from which it was made.
 
 Compiled functions are kept in `__pycache__` of this folder. Each module has a folder there, named by the hash
-of all sources on which the module depends: its own and those of every module of the package that it imports.
+of all sources on which the module depends: itself and every module of the package that it imports.
 Numba itself checks only the file of a kernel. It would continue to use a function after the functions
 compiled into it have changed. Measurements of photographs on disk are kept by the same hash.
 
@@ -149,7 +149,7 @@ def when_compiling(send: Callable[[], None]) -> Iterator[None]:
 
 
 class _First(Listener):
-    """A listener that is told of every kernel and reports the first."""
+    """A listener that is called for every kernel and reports the first."""
 
     def __init__(self, send: Callable[[], None]) -> None:
         self._send: Callable[[], None] | None = send

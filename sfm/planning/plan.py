@@ -326,7 +326,7 @@ def further_photographs(
         np.concatenate([seen.xy, sight.xy[i, j]]),
         np.concatenate([seen.covariance, sight.covariance[i, j]]),
     )
-    moment = network.moment  # of photographs of a rig; each further photograph has its own moment
+    moment = network.moment  # of photographs of a rig; each further photograph has a separate moment
     larger = replace(
         network,
         images=(*network.images, *names),

@@ -7,7 +7,7 @@ in true perspective and distortion, and is not just an ellipse drawn around its 
 photograph that is crossed by an edge receives the area inside. The blur is applied on a raster finer than the
 pixels. Each pixel is then the mean over its area.
 
-The painting order tells which face of a scene hides which, as seen from a camera. The truth of a rendered
+The painting order decides which face of a scene hides which, as seen from a camera. The truth of a rendered
 photograph is the position of each target in it, and whether the target is whole.
 """
 
@@ -101,7 +101,7 @@ def render_photographs(
     seed: int,
     threads: int = 2,
 ) -> tuple[list[AnyArray], list[ProjectedTargets]]:
-    """Photograph a scene from several stations in parallel; the seed gives each photograph its own noise.
+    """Photograph a scene from several stations in parallel; the seed gives each photograph different noise.
 
     Args:
         scene: the scene.
@@ -327,7 +327,7 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     """Return the faces turned towards the camera, from back to front (painter's algorithm).
 
     If the images of two faces overlap, one is painted first if it lies on the far side of the plane of the
-    other, or if the other lies on the near side of its own plane.
+    other, or if the other lies on the near side of its plane.
 
     Source: Newell, Newell and Sancha (1972), Proc. ACM National Conference, p. 443 (tests 2 to 4).
     """

@@ -23,7 +23,7 @@ from sfm.survey.refining.windows import MIN_RAYS
 
 @dataclass(frozen=True)
 class Numbers:
-    """Identifiers in the files of a model, and its interior orientation in its own terms."""
+    """Identifiers in the files of a model, and its interior orientation in COLMAP's terms."""
 
     image_ids: tuple[int, ...]  # of each photograph
     point_ids: tuple[int, ...]  # of each point

@@ -375,7 +375,7 @@ def coordinates(report: Report) -> Section:
     if result.comparison and report.has_model:
         words = (
             f"the compared solution in COLMAP's camera model ({result.comparison.model}): free datum, equal "
-            "weights, no control or scale bars; the survey's own result is in the files above"
+            "weights, no control or scale bars; the result of the survey is in the files above"
         )
         files.append(("colmap/", words))
     points, photographs = _object_points(f), _exterior(f)

@@ -40,7 +40,7 @@ _STEP_PX, _RISE_PX = 0.5, 3.0
 # Variance of rounding to integer intensities.
 QUANTISATION = 1 / 12
 # Number of targets from which the shading of a photograph is estimated from them. A target whose gain differs
-# from it by more than this many sigmas keeps its own.
+# from it by more than this many sigmas is not shrunk.
 MIN_FOR_SHADING, OWN_GAIN_SIGMAS = 10, 3.0
 # A halo exceeds this part of the contrast (9 of 10 of the retro-panel are below) and this many of its sigmas.
 # Flare means a background of which more than this part is saturated, that has glare behind it on more than

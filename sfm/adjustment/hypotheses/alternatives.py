@@ -245,7 +245,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     """Yield the alternatives of cameras, strain and bending in some of the photographs.
 
     If there are more than MAX_RUNS photographs, neighbours in the sequence are combined. A camera changes in
-    some of its own photographs, an object in some of all photographs.
+    some of its photographs, an object in some of all photographs.
     """
     camera = cameras_of_photographs(a)
     run = runs_of(camera)

@@ -146,8 +146,8 @@ class Family(ABC):
 class OfPhotographs(Family):
     """Some of the freedoms of a single photograph, see `Columns.freedoms`.
 
-    In the pattern `each`, every photograph or run of photographs has its own parameters; the factors are then
-    the numbers of the runs.
+    In the pattern `each`, every photograph or run of photographs has separate parameters; the factors are
+    then the numbers of the runs.
     """
 
     places: tuple[int, ...]  # indices in the freedoms

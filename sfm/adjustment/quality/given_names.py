@@ -34,7 +34,7 @@ def assignments(
         given: given coordinates, (n, 3); incomplete points keep their names.
         variance: variance of a coordinate of the free points in their frame, and of the given points, (n,)
             each.
-        agreed: similarity on which more than half of the points agree with their own names, if any. Three
+        agreed: similarity on which more than half of the points agree with their names, if any. Three
             points may agree by chance, so other similarities are tried as well.
     """
     from scipy.optimize import (

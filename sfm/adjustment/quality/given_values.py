@@ -129,7 +129,7 @@ class Kept:
             return 1.0
         fall, rank = self.decreases()
         of_rank = [self._sf_of_one(float(fall[rank == r].max()), int(r)) for r in np.unique(rank[rank > 0])]
-        single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked on its own
+        single = int((rank > 0).sum()) * min(of_rank) if of_rank else np.inf  # no value is checked alone
         if self.model.estimated:
             return min(1.0, single)
         of_one, u = np.diagonal(self.precision) * self.model.size**2, self.u * self.model.size

@@ -67,13 +67,13 @@ def batch(
     allow_outside: AllowOutside = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run many surveys in parallel, each with its own report.
+    """Run many surveys in parallel, each with a report.
 
     One table lists all surveys.  Exit code 0 if every survey has a dependable result, 1 if not, 70 if a
     survey failed by an error of the program, 2 if the input must be corrected.
     """
     if cluster is not None and jobs is not None:
-        raise KolinearError("--jobs counts processes on this computer; --cluster has its own workers")
+        raise KolinearError("--jobs counts processes on this computer; --cluster has other workers")
     with loading():
         from rich.console import Console
 

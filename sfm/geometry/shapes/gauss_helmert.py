@@ -67,7 +67,7 @@ def refine_weighted(
     Args:
         start: fit with equal weights.
         xyz: points about their centroid, of unit size, (n, 3).
-        covariance: Q, joint (3 n, 3 n) or of each point (n, 3, 3), in its own unit of length.
+        covariance: Q, joint (3 n, 3 n) or of each point (n, 3, 3), in any unit of length.
         free: which of the six motions and the form are adjusted, (6 + q,).
         offset: required signed distances of the points, (c,).
         size: unit of the points in the unit of the covariance.

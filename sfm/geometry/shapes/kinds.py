@@ -1,6 +1,6 @@
 """Shapes in space and their kinds: orthogonal distances of points, with derivatives.
 
-Each shape has its own axes y = R' (x - c), with its axis or normal along y3. A kind lists the motions of
+Each shape has axes y = R' (x - c), with its axis or normal along y3. A kind lists the motions of
 these axes that change it; a sphere has no direction, and a cylinder no position along its axis. It also lists
 its form parameters. One function gives the signed distance d of points, its gradient g by the point, which is
 a unit vector, and its derivative by the form parameters. A curve in space has two distances, in its plane and

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
 
-# A warning if the 95 % value reaches one pixel, which nobody expects of a calibrated camera. An error if the
+# A warning if the 95 % value reaches one pixel, which no one expects of a calibrated camera. An error if the
 # standard deviation reaches one pixel and is large compared with the image points of the calibration, so that
 # points of that precision would contradict the camera. If these points are imprecise, it is only a weak
 # calibration.

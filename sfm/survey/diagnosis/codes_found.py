@@ -30,7 +30,7 @@ from sfm.targets.detect import Targets, find_targets
 from sfm.targets.outlines import Flag, scale_of
 
 MIN_VIEWS = 2  # photographs that show where a missing side of a plate should be
-NOT_FOUND = {  # kinds of remarks by the codes of a board; plates of dots have their own kinds
+NOT_FOUND = {  # kinds of remarks by the codes of a board; plates of dots have other kinds
     "checkerboard": "checkerboard_not_found",
     "charuco": "charuco_not_found",
     "aprilgrid": "aprilgrid_not_found",

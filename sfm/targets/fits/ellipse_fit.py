@@ -195,8 +195,8 @@ def _fit_one(
 def _skirt(blur: float) -> float:
     """Return the distance before the rise to a neighbour at which the background is undisturbed, px.
 
-    As beside the target's own edge, a few thousandths of the step remain there. Rays find a rise up to a step
-    late.
+    As beside the edge of the target, a few thousandths of the step remain there. Rays find a rise up to a
+    step late.
     """
     return (goodness.EDGE_ENDS_BLURS - RISE_BLURS) * blur + STEP_PX
 

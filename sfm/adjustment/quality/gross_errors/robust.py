@@ -340,7 +340,7 @@ class _Rays:
     C: FloatArray  # cofactors of the point, (3, 3); -B C B' are the cofactors between residuals
 
     def without(self, a: int) -> _Rays:
-        """Return the rays after rejecting one; its own values are meaningless afterwards."""
+        """Return the rays after rejecting one; the old values are meaningless afterwards."""
         with_a = -self.B @ self.C @ self.B[a].T
         weight = np.linalg.pinv(self.Q[a], rcond=MIN_REDUNDANCY, hermitian=True)
         gain = with_a @ weight
