@@ -594,6 +594,8 @@ def test_differences_of_directions_have_no_mean() -> None:
     directions = HorizontalDirections("station", np.arange(7), value, rng.uniform(1e-4, 3e-4, (6, 1)))
     l, w = directions.fit(X).difference[:, 0], directions.weights
     assert np.abs(l).max() > 0.5 and abs((w * l).sum() / w.sum()) < 1e-12
+    orientation = np.arctan2(*(X[1:, :2] - X[0, :2]).T) - value[:, 0] - l
+    np.testing.assert_allclose(np.exp(1j * orientation), np.exp(1j * orientation[0]), atol=1e-12)
 
 
 def test_a_plane_is_that_of_the_weights() -> None:
@@ -616,3 +618,24 @@ def test_the_inverse_is_over_what_is_determined() -> None:
     found = inverse_of_determined(N)
     assert not found[3].any()
     np.testing.assert_allclose(found[:3, :3] @ N[:3, :3], np.eye(3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "columns", "row", "refused"),
+    [
+        ("horizontal direction", "station,point,direction_deg,sdirection_deg", "a,b,10.0,0.001", True),
+        ("plane", "group,point,offset,soffset", "floor,b,0.0,0.001", True),
+        ("distance with additive constant", "instrument,from,to,length,slength", "i,a,b,1.0,0.001", False),
+        ("distance", "from,to,length,slength", "a,b,1.0,0.001", False),
+    ],
+)
+def test_a_point_is_once_in_a_group_and_a_distance_as_often_as_measured(
+    kind: str, columns: str, row: str, refused: bool, tmp_path: Path
+) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join((columns, row, row)) + "\n", encoding="utf-8")
+    if refused:
+        with pytest.raises(SurveyFileError, match="on line 2 already"):
+            read_observation_table(kind, path, "survey.toml")
+    else:
+        read_observation_table(kind, path, "survey.toml")
