@@ -639,3 +639,13 @@ def test_a_point_is_once_in_a_group_and_a_distance_as_often_as_measured(
             read_observation_table(kind, path, "survey.toml")
     else:
         read_observation_table(kind, path, "survey.toml")
+
+
+@pytest.mark.parametrize("orientation", [0.0, np.pi / 2, np.pi, -np.pi / 2, 4.0])
+def test_directions_may_be_counted_from_anywhere(orientation: float) -> None:
+    rng = seed_of("orientation")
+    X = rng.uniform(-1, 1, (9, 3))
+    away = X[1:, :2] - X[0, :2]
+    value = np.arctan2(away[:, 0], away[:, 1]) - orientation + 1e-5 * rng.standard_normal(8)
+    directions = HorizontalDirections("station", np.arange(9), value[:, None], np.full((8, 1), 1e-5))
+    assert np.abs(directions.fit(X).difference).max() < 1e-4
