@@ -14,7 +14,8 @@ in displacements.py the redundancy from which F is chi-square; in fischler_bolle
 polished by its misfit, which saves time, as no wrong one passes the polish; in rings.py the sense in which
 rings are sampled, as arcs are counted alike in a mirror; in given.py the length of a direction left open; in
 rigid_frames.py the singular values below which a step is cut, which only rounding needs; in intersection.py
-how much room there is for directions, of which there may be more.
+how much room there is for directions, of which there may be more; in point_pairs.py the multiple of 2 pi by
+which directions are wrapped.
 """
 
 from __future__ import annotations
