@@ -209,7 +209,7 @@ def test_what_is_not_measured_stays_as_it_is(
     printed = capsys.readouterr().out
     assert "measured anew" in printed
     after = pycolmap.Reconstruction(str(out))
-    assert f"in the files  {_rms(after):.4f} px, with " in printed
+    assert f"in the files  {_rms(after):.4f} px, including " in printed
     assert list(after.images) == list(before.images) and set(after.point3D_ids()) == set(before.point3D_ids())
     assert after.camera(7).model_name == camera
     params = after.camera(7).params

@@ -37,7 +37,7 @@ def test_stated_weights_have_one_sigma0_for_all(weights: str) -> None:
     a, said = result.adjustment, describe_weights(result)
     assert a.sigma0_px == pytest.approx(0.1, rel=0.15)
     if weights == "stated":
-        assert (a.image_sigma_factor == 1).all() and "those stated for all observations" in said
+        assert (a.image_sigma_factor == 1).all() and "as stated for all observations" in said
         assert a.sigma0 == pytest.approx(1 / 3, rel=0.15)
     else:
         assert a.weight_factor == pytest.approx(1 / 3, rel=0.15) and "variance component" in said
