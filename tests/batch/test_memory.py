@@ -76,6 +76,7 @@ def one_worker() -> Iterator[DaskEngine]:
         yield engine
 
 
+@pytest.mark.slow
 def test_workers_do_not_remember_what_they_did(one_worker: DaskEngine) -> None:
     works = [Work(str(k), (), Call(_wander, ())) for k in range(12)]
     blocks = [event.value for event in one_worker.run(works, at_a_time=2) if isinstance(event, Done)]

@@ -107,7 +107,7 @@ def test_a_camera_is_known_by_its_whole_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("slip_mm", "kind"),
-    [(3.0, "plate_moved"), (60.0, "plate_elsewhere")],
+    [pytest.param(3.0, "plate_moved", marks=pytest.mark.slow), (60.0, "plate_elsewhere")],
 )
 def test_a_plate_that_slipped_far_is_named(tmp_path: Path, slip_mm: float, kind: str) -> None:
     """Before, photographs were mirrored pictures by 3 mm, and 48 codes each at several places by 20 mm."""

@@ -154,7 +154,7 @@ def network_of_all() -> tuple[Network, Estimate]:
     ), truth
 
 
-@pytest.mark.parametrize("datum", ["free", "control"])
+@pytest.mark.parametrize("datum", [pytest.param("free", marks=pytest.mark.slow), "control"])
 def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
     """50 draws, rig included: chi-square of a point and of the mount, v'Pv; redundancy numbers add up."""
     network, truth = network_of_all()

@@ -46,7 +46,8 @@ def test_bars_are_no_targets() -> None:
 
 
 @pytest.mark.parametrize(
-    "codes", ["arcs", "ring14", *(pytest.param(one, marks=pytest.mark.slow) for one in ("ring12", "ring20"))]
+    "codes",
+    ["arcs", *(pytest.param(one, marks=pytest.mark.slow) for one in ("ring12", "ring14", "ring20"))],
 )
 def test_no_code_is_read_from_print(codes: str) -> None:
     rng = np.random.default_rng(2)

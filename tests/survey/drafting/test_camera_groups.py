@@ -139,7 +139,7 @@ def test_small_and_large_targets_are_seen(diameter: int, spacing: int) -> None:
     assert target_trial._look(photograph).shows_targets
 
 
-@pytest.mark.parametrize("side", [24, pytest.param(48, marks=pytest.mark.slow), 200])
+@pytest.mark.parametrize("side", [*(pytest.param(side, marks=pytest.mark.slow) for side in (24, 48)), 200])
 def test_tags_are_seen(side: int) -> None:
     photograph = texture("look at tags")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
