@@ -15,6 +15,7 @@ from sfm.similarity import (
     fit_similarities,
     fit_similarity,
     similarity_motions,
+    without_motions,
 )
 from tests.synthetic import make_network, seed_of
 
@@ -123,3 +124,19 @@ def test_points_have_depth_from_a_twentieth_of_their_extent(depth: float, axes: 
     box = np.array([[x, y, z] for x in (-1, 1) for y in (-0.8, 0.8) for z in (-depth, depth)])
     found, along = extended_axes(box)
     assert found.shape == (axes, 3) and along.shape == (8, axes)
+
+
+def test_displacements_without_motions_keep_what_no_motion_explains() -> None:
+    rng = seed_of("without motions")
+    xyz = rng.normal([5.0, -3.0, 8.0], size=(12, 3))
+    xyz[4] = np.nan
+    motion = np.zeros((12, 3, 1))
+    motion[..., 0] = np.cross([0.1, -0.2, 0.3], xyz) + 0.05 * xyz + [1.0, 2.0, 3.0]
+    motion[4] = 0.0
+    assert np.abs(without_motions(xyz, motion)).max() < 1e-12
+    away = rng.normal(size=(12, 3, 2))
+    left = without_motions(xyz, away)
+    assert not left[4].any()
+    known = np.arange(12) != 4
+    np.testing.assert_allclose(without_motions(xyz, left)[known], left[known], atol=1e-12)
+    assert ((left[known] ** 2).sum(axis=(0, 1)) < (away[known] ** 2).sum(axis=(0, 1))).all()

@@ -329,3 +329,25 @@ def test_shading_across_a_ring_is_a_plane_with_a_prior() -> None:
     assert rings._read_cells(found, family, 0.0)[0] == family.number[family.pattern.tolist().index(71)]
     found[:3, bits] = np.sort(shaded)[[0, 3, 1, 2]]
     assert rings._read_cells(found, family, 0.0)[0] == rings.UNREADABLE
+
+
+@pytest.mark.parametrize(("around", "read"), [(0.12, True), (0.0, False)])
+def test_glare_across_a_ring_is_no_cell(around: float, read: bool) -> None:
+    """A clear cell as bright as the ring before and behind it."""
+    family = code_family("ring14")
+    assert isinstance(family, rings.CodeFamily)
+    bits = (int(family.pattern[5]) >> np.arange(13, -1, -1)) & 1
+    found = np.zeros((7, 14))
+    found[:3] = bits
+    clear = np.flatnonzero(bits == 0)[0]
+    found[:3, clear], found[4:6, clear] = 0.12, around
+    assert bool(rings._read_cells(found, family, 0.0)[0] == family.number[5]) is read
+
+
+def test_the_border_of_a_label_is_on_four_sides_with_free_corners() -> None:
+    border = np.tile([0.0, 0.6, 0.7], 4)
+    assert rings._find_border(border, 1.0).tolist() == [False, True, True] * 4
+    assert not rings._find_border(border[:11], 1.0).any()  # no multiple of four
+    assert not rings._find_border(border + 0.3, 1.0).any()  # no free corner
+    border[1] = 0.0
+    assert rings._find_border(border, 1.0).tolist() != [False, True, True] * 4  # one side is free
