@@ -13,7 +13,8 @@ from sfm.adjustment.hypotheses.columns import columns_of, interior_columns, inte
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import pixel_from_tangents, project
-from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.comparison.solutions import reprojection
+from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import Role
 from tests.synthetic import make_network, seed_of
 
@@ -55,18 +56,6 @@ def test_fields_of_the_object_by_hand() -> None:
     assert not object_fields(points)[0][4].any()
 
 
-def computed(a: Adjustment) -> FloatArray:
-    """Return where the image points of an estimate are, px."""
-    network, estimate = a.network, a.estimate
-    found = []
-    for i, j in zip(network.image_points.image, network.image_points.point, strict=True):
-        camera = estimate.cameras[network.camera[i]]
-        found.append(
-            project(camera, estimate.position[i], estimate.rotation[i], estimate.points[j : j + 1])[0]
-        )
-    return np.array(found)
-
-
 def test_columns_are_differences(a: Adjustment) -> None:
     found, estimate, h = columns_of(a), a.estimate, 1e-6
     assert found.usable.all()
@@ -77,7 +66,7 @@ def test_columns_are_differences(a: Adjustment) -> None:
             (found.exterior[:, :, 3 + c], replace(estimate, rotation=turned)),
             (found.point[:, :, c], replace(estimate, points=estimate.points + h * axis)),
         ):
-            right = (computed(replace(a, estimate=changed)) - computed(a)) / h
+            right = (reprojection(a.network, changed) - reprojection(a.network, estimate)) / h
             np.testing.assert_allclose(own, right, rtol=2e-3, atol=0.5)
     unit = np.array([1.0, -2.0])[a.network.camera[a.network.image_points.image]]
     for index in (0, 1):
@@ -89,7 +78,8 @@ def test_columns_are_differences(a: Adjustment) -> None:
             p[s] += 0.01 * step
             cameras[index] = camera.with_parameters(p)
             right = (
-                computed(replace(a, estimate=replace(estimate, cameras=tuple(cameras)))) - computed(a)
+                reprojection(a.network, replace(estimate, cameras=tuple(cameras)))
+                - reprojection(a.network, estimate)
             ) / 0.01
             own = interior_columns(a, index, [s])[:, :, 0]
             np.testing.assert_allclose(own, right, rtol=5e-3, atol=5e-3)

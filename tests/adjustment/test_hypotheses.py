@@ -30,7 +30,8 @@ from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, 
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
-from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.comparison.solutions import reprojection
+from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints
 from sfm.planning.stations import aim_camera
@@ -45,21 +46,6 @@ def solved(network: Network, start: Estimate, reject: str = "tau") -> Adjustment
     return adjust(network, start, datum=Datum("free"), reject=reject, alpha=alpha)
 
 
-def computed(network: Network, estimate: Estimate) -> FloatArray:
-    seen = network.image_points
-    return np.array(
-        [
-            project(
-                estimate.cameras[network.camera[i]],
-                estimate.position[i],
-                estimate.rotation[i],
-                estimate.points[j : j + 1],
-            )[0]
-            for i, j in zip(seen.image, seen.point, strict=True)
-        ]
-    )
-
-
 @pytest.fixture(scope="module")
 def clean() -> Adjustment:
     network, truth = make_network(seed_of("columns"), images=6, points=25, free=("c", "x0", "y0"))
@@ -68,21 +54,24 @@ def clean() -> Adjustment:
 
 def test_the_columns_are_the_derivatives(clean: Adjustment) -> None:
     columns, network, estimate = columns_of(clean), clean.network, clean.estimate
-    h, at = 1e-6, computed(clean.network, clean.estimate)
+    h, at = 1e-6, reprojection(clean.network, clean.estimate)
     step = np.array([1.0, -2.0, 0.5])
     moved = replace(estimate, position=estimate.position + h * step)
     np.testing.assert_allclose(
-        columns.exterior[:, :, :3] @ step, (computed(network, moved) - at) / h, rtol=1e-3, atol=0.5
+        columns.exterior[:, :, :3] @ step, (reprojection(network, moved) - at) / h, rtol=1e-3, atol=0.5
     )
     turned = replace(estimate, rotation=estimate.rotation @ rotation_from_vector(h * step))
     np.testing.assert_allclose(
-        columns.exterior[:, :, 3:] @ step, (computed(network, turned) - at) / h, rtol=1e-3, atol=0.5
+        columns.exterior[:, :, 3:] @ step, (reprojection(network, turned) - at) / h, rtol=1e-3, atol=0.5
     )
     field, _ = object_fields(estimate.points)
     for f in range(field.shape[2]):
         bent = replace(estimate, points=estimate.points + h * field[:, :, f])
         np.testing.assert_allclose(
-            columns.freedoms[:, :, len(CAMERA) + f], (computed(network, bent) - at) / h, rtol=1e-3, atol=0.5
+            columns.freedoms[:, :, len(CAMERA) + f],
+            (reprojection(network, bent) - at) / h,
+            rtol=1e-3,
+            atol=0.5,
         )
     camera = estimate.cameras[0]
     for s, name in enumerate(camera.names):
@@ -92,7 +81,7 @@ def test_the_columns_are_the_derivatives(clean: Adjustment) -> None:
         p[s] += 0.1 * unit
         other = replace(estimate, cameras=(camera.with_parameters(p),))
         np.testing.assert_allclose(
-            found, (computed(network, other) - at) / 0.1, rtol=0.02, atol=0.02, err_msg=name
+            found, (reprojection(network, other) - at) / 0.1, rtol=0.02, atol=0.02, err_msg=name
         )
 
 

@@ -19,6 +19,7 @@ from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, 
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, project
+from sfm.comparison.solutions import reprojection
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
@@ -292,18 +293,6 @@ def test_sigma0_at_the_start_values_is_that_of_their_residuals() -> None:
     network, truth = make_network(seed_of("start"), images=6, points=30)
     start = replace(truth, points=truth.points + 0.01)
     a = adjust(network, start, reject="none", max_iterations=50)
-    seen = network.image_points
-    v = np.concatenate(
-        [
-            project(
-                start.cameras[network.camera[i]],
-                start.position[i],
-                start.rotation[i],
-                start.points[seen.point[seen.image == i]],
-            )
-            - seen.xy[seen.image == i]
-            for i in range(6)
-        ]
-    )
-    sigma = float(np.sqrt(seen.covariance[0, 0, 0]))
+    v = reprojection(network, start)
+    sigma = float(np.sqrt(network.image_points.covariance[0, 0, 0]))
     assert a.start_sigma0 == pytest.approx(np.sqrt((v**2).sum() / sigma**2 / a.redundancy), rel=1e-6)

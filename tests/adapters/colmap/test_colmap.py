@@ -16,7 +16,8 @@ from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.mapper import map_photographs
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
+from sfm.camera import camera_from_values
+from sfm.comparison.solutions import reprojection
 from sfm.errors import BackendError, OutputError, SurveyFileError
 from sfm.network import Estimate, Network, ObjectPoints
 from sfm.pipeline import run_survey
@@ -40,19 +41,8 @@ def scene(model: str = "opencv", *, cameras: int = 1, noise_px: float = 0.1) -> 
 
 
 def rms(network: Network, estimate: Estimate) -> float:
-    seen = network.image_points
-    v = np.array(
-        [
-            project(
-                estimate.cameras[network.camera[i]],
-                estimate.position[i],
-                estimate.rotation[i],
-                estimate.points[j : j + 1],
-            )[0]
-            - xy
-            for i, j, xy in zip(seen.image, seen.point, seen.xy, strict=True)
-        ]
-    )
+    v = reprojection(network, estimate)
+    assert len(v) == len(network.image_points)
     return float(np.sqrt((v**2).mean()))
 
 
