@@ -85,7 +85,8 @@ POINTS = (
         "warning",
         "Taken together, the residuals of {points:point} are larger than expected by chance: {points}.",
         "a point moved a little, is damaged, or is seen at a flat angle",
-        "Look at {points:it|them} in the photographs; leave out any that you do not trust.",
+        "Look at {points:it|them} in the photographs; "
+        "leave out {points:the point if you do not trust it|any that you do not trust}.",
     ),
     Kind(
         "image_points_identical",
