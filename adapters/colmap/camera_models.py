@@ -66,10 +66,10 @@ def write_model(
 
 
 def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
-    """Write a pycolmap.Reconstruction, and read it back to check that it is complete.
+    """Write a pycolmap.Reconstruction, and read it back to check that it is complete and finite.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or the scene has a number that `read_model` would refuse.
     """
     pycolmap = load_pycolmap()
     with quiet(pycolmap):
@@ -89,13 +89,21 @@ def write_scene(folder: Path, scene: Any, *, text: bool = False) -> None:
 
 
 def _refuse_incomplete(pycolmap: ModuleType, folder: Path, scene: Any, *, text: bool) -> None:
-    """Raise OSError unless a model can be read back complete: COLMAP ignores a full disk."""
+    """Raise OSError unless a model can be read back complete: COLMAP ignores a full disk.
+
+    Raises:
+        OutputError: what was written has numbers that are not finite or too large.
+    """
     try:
+        check_model_files(folder, text=text)
         written = _opened(pycolmap, folder, text=text)
         whole = all(
             getattr(written, count)() == getattr(scene, count)()
             for count in ("num_images", "num_points3D", "compute_num_observations")
         )
+    except SurveyFileError as error:
+        refuse_full(folder)
+        raise OutputError(str(error)) from error
     except (ValueError, RuntimeError, IndexError, OSError):
         whole = False
     if not whole:

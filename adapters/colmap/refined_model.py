@@ -130,18 +130,20 @@ def update_model(
 
 
 def key_points_of(model: OpenModel) -> tuple[int, float]:
-    """Return the number of key points with a point, and their RMS per coordinate by COLMAP, px."""
-    scene, count, squares = model.scene, 0, 0.0
+    """Return the number of key points with a point, and the RMS per coordinate by COLMAP's projection, px."""
+    scene, count, projected, squares = model.scene, 0, 0, 0.0
     for i in scene.reg_image_ids():
         image = scene.image(i)
         used = [p for p in image.points2D if p.has_point3D()]
         if used:
             pose = image.cam_from_world().matrix()
             xyz = np.array([scene.point3D(p.point3D_id).xyz for p in used]) @ pose[:, :3].T + pose[:, 3]
-            v = scene.camera(image.camera_id).img_from_cam(xyz) - np.array([p.xy for p in used])
-            squares += float(np.nansum(v**2))  # COLMAP does not project points behind a photograph
+            computed = scene.camera(image.camera_id).img_from_cam(xyz)
+            before = np.isfinite(computed).all(axis=1)  # COLMAP does not project points behind a photograph
+            squares += float(((computed - np.array([p.xy for p in used]))[before] ** 2).sum())
             count += len(used)
-    return count, float(np.sqrt(squares / (2 * max(count, 1))))
+            projected += int(before.sum())
+    return count, float(np.sqrt(squares / (2 * max(projected, 1))))
 
 
 def interior_rows(

@@ -5,14 +5,17 @@ A format lists the kinds that it keeps. Kinds that it loses are reported when a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
 
 from sfm.conventions import FloatArray
+from sfm.display import counted
+from sfm.errors import OutputError
 from sfm.files.covariance_file import UNCODED
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
 from sfm.reduced_network import reduce_network
@@ -335,6 +338,56 @@ def select_placed(content: Content) -> Content:
         rejected=replace(rejected, image=image[rejected.image], point=point[rejected.point]),
         checks=ObjectPoints(point[checks.point[known]], checks.xyz[known], checks.covariance[known]),
     )
+
+
+def refuse_not_finite(path: Path, content: Content) -> None:
+    """Refuse content with a number that is not finite; NaN may only mark what is not determined.
+
+    All formats are checked here, before anything is written.
+
+    Args:
+        path: file or folder to be written, for the message.
+        content: content of a survey.
+
+    Raises:
+        OutputError: with the kind and the number of items.
+    """
+    for what, rows in _numbers(content):
+        wrong = np.flatnonzero(~np.isfinite(rows).all(axis=tuple(range(1, rows.ndim))))
+        if len(wrong):
+            raise OutputError(
+                f"{path}: {counted(len(wrong), what)} of {len(rows)} with numbers that are not finite "
+                f"(NaN or infinite), the first is row {wrong[0] + 1}; nothing is written"
+            )
+
+
+def _numbers(content: Content) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the numbers that every format may write, by kind; those that are not determined are left out."""
+    result = content.result
+    network, estimate = result.network, result.estimate
+    for what, seen in (("image point", network.image_points), ("rejected image point", content.rejected)):
+        yield what, np.column_stack([seen.xy, seen.covariance.reshape(len(seen), 4)])
+    for camera in estimate.cameras:
+        yield "interior orientation", np.hstack([camera.pixel_mm, camera.parameters])[None]
+    yield "exterior orientation", estimate.rotation[estimate.oriented]
+    if estimate.mounts is not None:
+        mounts = estimate.mounts
+        yield "mount", np.column_stack([mounts.position, mounts.rotation.reshape(len(mounts.rig), 9)])
+    for kind in (*network.kinds, content.checks):
+        covariance = kind.covariances()
+        n, d = covariance.shape[:2]
+        variance = np.einsum("nii->ni", covariance)
+        given = ~np.isposinf(variance) if d > 1 else np.ones((n, 1), dtype=bool)  # infinite: not observed
+        of_given = np.where(given[:, :, None] & given[:, None, :], covariance, 0.0)
+        yield kind.single, np.column_stack([np.where(given, kind.values, 0.0), of_given.reshape(n, d * d)])
+    for what, matrix in (
+        ("row of the correlations of interior parameters", network.interior.correlation),
+        ("row of the covariance of the points", result.covariance),
+        ("row of the covariance of mounts", result.rig_covariance),
+        *(("row of the covariance of a camera", Q) for Q in result.interior_covariance),
+    ):
+        if matrix is not None:
+            yield what, matrix
 
 
 def losses(content: Content, held: frozenset[str]) -> tuple[tuple[Kind, int], ...]:

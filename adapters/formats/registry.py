@@ -28,7 +28,7 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
-from adapters.formats.content import ALL, Content, losses, select_placed
+from adapters.formats.content import ALL, Content, losses, refuse_not_finite, select_placed
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
@@ -341,11 +341,12 @@ def write_content(path: Path, name: str, content: Content) -> None:
     """Write everything that a format keeps of a survey; it must have the models of the cameras.
 
     Raises:
-        KolinearError: the format cannot store the survey, or it cannot be written.
+        KolinearError: the format cannot store the survey, a number is not finite, or it cannot be written.
     """
     form = format_named(name)
     estimate = content.result.estimate
     refuse_taken(path, form)
+    refuse_not_finite(path, content)
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
         points_only = not form.models

@@ -32,7 +32,7 @@ from sfm.files.covariance_file import (
 from sfm.files.csv_tables import CsvTable
 from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
-from sfm.files.plain_text import Name, Pixel, Side, Text, read_json
+from sfm.files.plain_text import Name, Pixel, Side, Text, or_none, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.reduced_network import CORRELATION_LIMIT
@@ -160,8 +160,8 @@ def write_content(folder: Path, content: Content) -> None:
         "redundancy": result.redundancy,
         "length_unit": result.unit,
         "datum": {"kind": result.datum},
-        "sigma0": content.sigma0,
-        "sigma0_px": content.sigma0_px,
+        "sigma0": None if content.sigma0 is None else or_none(content.sigma0),
+        "sigma0_px": None if content.sigma0_px is None else or_none(content.sigma0_px),
         "cameras": [
             {
                 "name": camera.name,
@@ -183,7 +183,7 @@ def write_content(folder: Path, content: Content) -> None:
         if any(Q is not None for Q in full) or any(map(len, result.interior_covariance)):
             write_covariances(folder, result)
         write_given(folder, network, estimate, result.unit)
-        text = json.dumps(summary, indent=2, ensure_ascii=False)
+        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
 
 

@@ -9,8 +9,9 @@
                        point_names (n,), points (n, 3, 3)    X, Y, Z of a point; only of surveys, not read
                        back
 
-Units are object units and rad. The files are NumPy arrays without executable content, and their sizes are
-checked before they are read.
+Photographs and points without a covariance are left out, so that all numbers are finite. Units are object
+units and rad. The files are NumPy arrays without executable content, and their sizes are checked before they
+are read.
 
 Source: NumPy, Enhancement Proposal 1 (a simple file format for NumPy arrays).
 """
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
@@ -143,14 +144,20 @@ def write_covariances(folder: Path, solution: Solution, *, points: bool = False)
     network = solution.network
     arrays: dict[str, Any] = {}
     if points and solution.point_covariance is not None:
-        arrays |= {"point_names": np.array(network.points), "points": solution.point_covariance}
+        arrays["point_names"], arrays["points"] = _known(network.points, solution.point_covariance)
     if solution.exterior_covariance is not None:
-        arrays |= {"image_names": np.array(network.images), "exterior": solution.exterior_covariance}
+        arrays["image_names"], arrays["exterior"] = _known(network.images, solution.exterior_covariance)
     arrays["camera_names"] = np.array([camera.name for camera in solution.estimate.cameras])
     arrays |= {f"interior_{k}": Q for k, Q in enumerate(solution.interior_covariance)}
     if solution.rig_covariance is not None:
         arrays |= {"rig_parameters": np.array(solution.rig_parameters), "rigs": solution.rig_covariance}
     np.savez_compressed(folder / ARRAYS, **arrays)
+
+
+def _known(names: tuple[str, ...], covariance: FloatArray) -> tuple[AnyArray, FloatArray]:
+    """Return the names and covariances that are finite."""
+    rows = np.isfinite(covariance).all(axis=(1, 2))
+    return np.array(names)[rows], covariance[rows]
 
 
 def read_covariances(folder: Path, result: Solution) -> Solution:
@@ -176,18 +183,22 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
             known = {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
     except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
         raise SurveyFileError(f"{path}: not an array of NumPy") from error
-    exterior = known.get("exterior")
+    stored = known.get("exterior")
+    named = np.asarray(known.get("image_names", ())).tolist()
+    exterior = None if stored is None else np.full((len(images), 6, 6), np.nan)
     interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
-    fits = exterior is None or (
-        tuple(known.get("image_names", ())) == images and exterior.shape == (len(images), 6, 6)
+    fits = stored is None or (
+        stored.shape == (len(named), 6, 6) and len(set(named)) == len(named) and set(named) <= set(images)
     )
     fits &= all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
     rigs = known.get("rigs")
+    if exterior is not None and stored is not None and fits:
+        exterior[[images.index(name) for name in named]] = stored
     found = replace(result, exterior_covariance=exterior, interior_covariance=interior, rig_covariance=rigs)
     if rigs is not None:
         names = found.rig_parameters
         fits &= tuple(known.get("rig_parameters", ())) == names and rigs.shape == (len(names), len(names))
-    matrices = (*interior, *(Q for Q in (exterior, rigs) if Q is not None))
+    matrices = (*interior, *(Q for Q in (stored, rigs) if Q is not None))
     if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
         raise SurveyFileError(f"{path}: its photographs or cameras are not those of the tables beside it")
     return found

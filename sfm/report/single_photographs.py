@@ -65,7 +65,12 @@ def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
         entry | {"covariance_px2": Q if np.isfinite(Q).all() else None, "gain": gain, "offset": offset}
         for entry, Q, gain, offset in beside
     ]
-    return json.dumps(plain({"method": found.method, "points": entries}), indent=1, ensure_ascii=False) + "\n"
+    return (
+        json.dumps(
+            plain({"method": found.method, "points": entries}), indent=1, ensure_ascii=False, allow_nan=False
+        )
+        + "\n"
+    )
 
 
 def refuse_outputs(out: Path | None, picture: Path | None, inputs: tuple[Path, ...], as_json: bool) -> None:

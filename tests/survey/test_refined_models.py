@@ -462,11 +462,26 @@ def test_points_not_found_in_fine_pixels_are_looked_for_in_coarser_ones(tmp_path
     known = seen.point < 20
     windows.xy[known] = seen.xy[known]
     keys = KeyPoints(tmp_path, network, rows, reference, Limits(3.0, 0.7))
-    found = match_reduced(keys, estimate, windows, size=Size(15), tolerance_px=3.0)
+    every = np.ones(len(network.points), dtype=bool)
+    found = match_reduced(keys, estimate, windows, every, size=Size(15), tolerance_px=3.0)
     again = rows[~known[rows]]
     assert np.isfinite(found.xy[again]).all(axis=1).mean() > 0.9
     assert np.abs(found.xy[again] - seen.xy[again])[np.isfinite(found.xy[again])].max() < 3.0
     assert (found.xy[known] == seen.xy[known]).all()
+
+
+def test_what_is_written_is_what_was_adjusted(tmp_path: Path) -> None:
+    """Points that one photograph lacks in fine pixels are not replaced after the adjustment."""
+    _model(tmp_path)
+    path = sorted(tmp_path.glob("b/*.png"))[-1]
+    sharp = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float)
+    seen = cv2.GaussianBlur(sharp, (0, 0), 2.0) + np.random.default_rng(2).normal(0, 2, sharp.shape)
+    cv2.imwrite(str(path), seen.clip(0, 255).astype(np.uint8))
+    found = refine_model(*read_model(tmp_path / "model"), tmp_path)
+    adjusted = found.adjustment.network.image_points
+    assert len(found.rows) == len(adjusted) > 50
+    np.testing.assert_array_equal(found.xy[found.rows], adjusted.xy)
+    assert np.isfinite(found.xy[found.accepted]).all()
 
 
 def test_matches_of_a_point_with_too_few_of_them_contradict_nothing(tmp_path: Path) -> None:

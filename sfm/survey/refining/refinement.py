@@ -278,9 +278,12 @@ def refine_model(
         if chosen != size:
             size, oriented = chosen, measured(oriented.whole, chosen)
     anew, tolerance_px = oriented.network, TOLERANCE_FACTOR * oriented.spread_px
-    progress.stage("matching in reduced photographs")
-    windows = match_reduced(keys, oriented.whole, oriented.windows, size=size, tolerance_px=tolerance_px)
     part, start, images, points = part_of(anew, oriented.solved, oriented.accepted, oriented.rays)
+    progress.stage("matching in reduced photographs")
+    others = ~points[: len(network.points)]  # adjusted points keep their image points
+    windows = match_reduced(
+        keys, oriented.whole, oriented.windows, others, size=size, tolerance_px=tolerance_px
+    )
     final, remarks = adjust_finally(
         part,
         start,

@@ -196,7 +196,13 @@ def best_size(
 
 
 def match_reduced(
-    keys: KeyPoints, estimate: Estimate, windows: Windows, *, size: Size, tolerance_px: float
+    keys: KeyPoints,
+    estimate: Estimate,
+    windows: Windows,
+    others: BoolArray,
+    *,
+    size: Size,
+    tolerance_px: float,
 ) -> Windows:
     """Measure points that were not matched in all of their photographs again, in reduced photographs.
 
@@ -207,11 +213,12 @@ def match_reduced(
         keys: key points of the model.
         estimate: adjusted with the image points measured so far.
         windows: image points measured so far.
+        others: points that may be measured again, those that were not adjusted, (n,).
         size: size of these windows; windows in reduced photographs have the same number of pixels.
         tolerance_px: largest residual of a ray that counts, px.
     """
-    network, rows = keys.network, keys.rows
-    seen, n = network.image_points, len(network.points)
+    network, seen, n = keys.network, keys.network.image_points, len(keys.network.points)
+    rows = keys.rows[others[seen.point[keys.rows]]]
     xy, covariance, flag = windows.xy.copy(), windows.covariance.copy(), windows.flag.copy()
     asked = np.bincount(seen.point[rows], minlength=n)
     rays = np.bincount(seen.point[_rays_that_meet(network, estimate, windows, tolerance_px)[0]], minlength=n)
