@@ -38,6 +38,7 @@ class Content:
     checks: ObjectPoints = field(default_factory=ObjectPoints)  # known points that only check the result
     sigma0: float | None = None  # of unit weight, the scale of the covariances
     sigma0_px: float | None = None  # a posteriori, of an image coordinate, px
+    stated_weights: bool = False  # whether its program weights all observations as it states them
     notes: tuple[str, ...] = ()  # remarks on content that is read but not used unchanged
 
 

@@ -4,7 +4,7 @@ Blocks follow one another, and each ends with an empty line:
 
     title
     tolerance  most_iterations  [width_px height_px]
-    nine default standard deviations
+    nine default standard deviations           the first of a point marked by hand (px)
     c xp yp xs ys K1 K2 K3 P1 P2               of the default camera (mm)
     its standard deviations
     per photograph (n = its number from 0)
@@ -72,9 +72,9 @@ def read_export(
     Photographs with the same interior orientation share a camera, in model `brown_dbat` with the affinity of
     its pixels. The camera is held, except in a calibration project, where everything but the shear is free.
     Control with a negative or zero standard deviation is fixed. Adjusted control is not an observation
-    and becomes an object point. The covariance of an image point is that in the file, or 1 px^2 if it states
-    none. A repeated image point is read once; one with two positions is read with both, for the adjustment
-    to decide.
+    and becomes an object point. An image point with a standard deviation of 0 (a "smart" point) has that of a
+    point marked by hand, with which the program adjusts it; if all are 0, none is stated. A repeated image
+    point is read once; one with two positions is read with both, for the adjustment to decide.
 
     Args:
         path: the export.
@@ -94,7 +94,8 @@ def read_export(
         size_px = (width, height)
     if size_px is None:
         raise text.error("no size of the photographs in this line, give size_px")
-    text.numbers(9, 9)
+    by_hand_px = float(text.numbers(9, 9)[0])
+    by_hand_px = by_hand_px if by_hand_px > 0 else 1.0
     default = text.numbers(INNER, INNER)
     text.numbers(INNER, INNER)
     names: list[str] = []
@@ -148,7 +149,7 @@ def read_export(
         point.append(index[point_name])
         xy.append(row[1:3] - HALF_PIXEL)
         stated.append(bool((row[3:5] > 0).all()))
-        covariance.append(np.diag(np.where(row[3:5] > 0, row[3:5], 1.0) ** 2))
+        covariance.append(np.diag(np.where(row[3:5] > 0, row[3:5], by_hand_px) ** 2))
     observed = [(key, row) for _, key, row in control_rows if (key, *row.tolist()) not in adjusted]
     lost = len(control_rows) - len(observed)
     free = FREE if calibrates else ()
@@ -167,7 +168,7 @@ def read_export(
             np.array(point, dtype=np.int64),
             np.array(xy).reshape(-1, 2),
             np.array(covariance).reshape(-1, 2, 2),
-            np.array(stated, dtype=bool),
+            np.full(len(stated), any(stated)),
         ),
         ObjectPoints(
             np.array([index[key] for key, _ in observed], dtype=np.int64),

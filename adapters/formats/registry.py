@@ -73,6 +73,7 @@ class FileFormat:
     read_all: Callable[..., Content] | None = None  # for a format with more content than `read` returns
     write_all: Callable[[Path, Content], None] | None = None  # likewise for `write`
     control: bool = False  # whether `read_all` accepts a control file as keyword
+    adjusts: bool = False  # whether it is the input of an adjustment with the standard deviations in it
 
     def held(self, content: Content) -> frozenset[str]:
         """Return the kinds of content that are unchanged when a survey is read again."""
@@ -169,6 +170,7 @@ FORMATS = (
         read_all=read_export,
         write_all=write_export,
         control=True,
+        adjusts=True,
     ),
     FileFormat(
         *("bal", ("opencv", "radial"), read_bal, write_bal, _SOLVED),
@@ -181,6 +183,7 @@ FORMATS = (
         *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp),
         _NAMED | {"image sigmas"},
         straight=_BROWN_DISTORTION,
+        adjusts=True,
     ),
     FileFormat(
         *("bundle-matlab", ("brown",), read_bundle_matlab_folder, write_bundle_matlab_folder),
@@ -188,6 +191,7 @@ FORMATS = (
         folder=True,
         straight=_BROWN_DISTORTION,
         names=(False, True),
+        adjusts=True,
     ),
     FileFormat(
         *("sba", ("opencv",), _read_sba, _write_sba),
@@ -195,6 +199,7 @@ FORMATS = (
         folder=True,
         straight=_OPENCV_DISTORTION,
         names=NUMBERS,
+        adjusts=True,
     ),
     FileFormat(
         *("rig", ("opencv",), None, None, frozenset({"rigs"})), folder=True, write_all=write_rig_files
@@ -291,16 +296,20 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
         raise SurveyFileError(f"{path}: format {form.name} takes no control file, photomodeler does")
     refuse_links_out(path)
     if form.read_all is not None:
-        return form.read_all(path, control=control) if form.control else form.read_all(path)
-    assert form.read is not None
-    network, estimate = form.read(path)
-    points_named = _names_points(form, path)
-    if not points_named:
-        uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
-        network = replace(network, points=uncoded)
-    return Content(
-        Solution(*(path.name, network, estimate), points_named=points_named, images_named=form.names[1])
-    )
+        content = form.read_all(path, control=control) if form.control else form.read_all(path)
+    else:
+        assert form.read is not None
+        network, estimate = form.read(path)
+        points_named = _names_points(form, path)
+        if not points_named:
+            uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
+            network = replace(network, points=uncoded)
+        content = Content(
+            Solution(path.name, network, estimate, points_named=points_named, images_named=form.names[1])
+        )
+    seen = content.result.network.image_points
+    stated = bool(len(seen) and np.isfinite(seen.stated_sigma).all())
+    return replace(content, stated_weights=stated and form.adjusts)
 
 
 def _names_points(form: FileFormat, path: Path) -> bool:

@@ -66,8 +66,13 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
         ends = [_text(network.points[j]) for j in (start, end)]
         lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
         lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}", ""]
-    if len(content.rejected):  # they are among the image points, and will be detected again
-        lines += ["[adjust]", 'reject = "tau"', ""]
+    adjust = []
+    if len(content.rejected):
+        adjust.append('reject = "tau"')  # they are among the image points, and will be detected again
+    if content.stated_weights:
+        adjust.append('weights = "stated"')
+    if adjust:
+        lines += ["[adjust]", *adjust, ""]
     kind = result.datum or ("control" if len(control.complete) >= MIN_CONTROL else "free")
     lines += ["[datum]", f'kind = "{kind}"']
     (folder / "survey.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")

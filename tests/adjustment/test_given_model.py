@@ -450,32 +450,6 @@ def test_mirrored_points_state_what_was_wrong_as_given() -> None:
     assert judge_points(one.select(np.arange(2)), 0.001) is None
 
 
-@pytest.mark.parametrize(
-    ("numbers", "step"),
-    [
-        ([0.125, 2.5], 1e-3),
-        ([1234567.1, 5.0], 0.1),
-        ([0.12345678, 0.5], 1e-8),
-        ([0.123456789, 0.5], 0.0),
-        ([3.0, 5.0], 0.0),
-        ([0.1, 0.25 + 9e-9], 1e-2),
-        ([0.1, 0.25 + 1.1e-8], 0.0),
-        ([np.pi, 0.5], 0.0),
-        ([np.nan, 0.25], 1e-2),
-        ([np.nan], 0.0),
-    ],
-)
-def test_the_last_decimal_place_of_numbers(numbers: list[float], step: float) -> None:
-    assert given_points.decimal_step(np.array(numbers)) == pytest.approx(step, abs=1e-12)
-
-
-def test_rounded_points_are_as_precise_as_their_last_place() -> None:
-    one = exact(5, "rounded")
-    rounded = replace(one, given=np.round(one.given, 4), stated=np.zeros((5, 3, 3))).rounded()
-    np.testing.assert_allclose(rounded.stated, np.tile(1e-8 / 12 * np.eye(3), (5, 1, 1)))
-    assert not one.rounded().stated.any()
-
-
 @pytest.mark.parametrize("estimated", [False, True])
 @pytest.mark.parametrize("far", [0.0, 1e6])
 def test_points_without_noise_fit(estimated: bool, far: float) -> None:

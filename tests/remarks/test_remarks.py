@@ -141,6 +141,7 @@ LIMITS: dict[
     "given_contradicted": ("shift", 0.0, 5.0),
     "given_differs": ("shift", 0.0, 5.0),
     "given_not_exact": ("shift", 3.0, 5.0),
+    "given_scatter": ("share", 0.2, None),
     "photographs_missing": ("share", 0.0, 0.5),
     "c_far_from_given": ("share", 5e-4, None),
     "c_hardly_determined": ("share", 0.05, 1 / 3),

@@ -244,13 +244,22 @@ def test_errors_of_fixed_control_shift_the_datum() -> None:
     assert given.shift_of_fixed(model, 10.0) == pytest.approx(5 * np.sqrt(h / (1 + h)))
 
 
-@pytest.mark.parametrize(("error", "severity"), [(4e-4, "warning"), (4e-3, "error")])
-def test_fixed_control_that_shifts_the_result_is_an_error(error: float, severity: str) -> None:
+@pytest.mark.parametrize(
+    ("error", "severity", "weighted"), [(4e-4, "warning", "note"), (4e-3, "error", "warning")]
+)
+def test_fixed_control_that_shifts_the_result_is_an_error(error: float, severity: str, weighted: str) -> None:
     network, truth = make_network(seed_of("not exact"), images=8, points=30)
     xyz = truth.points[:12] + error * seed_of("errors of fixed control").standard_normal((12, 3))
     control = KnownPoints.from_arrays([str(k + 1) for k in range(12)], xyz)
-    said = remarks_on_given(run_survey(survey_of(network, truth, control=control, datum={"kind": "control"})))
-    assert said[0].kind == "given_not_exact" and said[0].severity == severity
+    for weights, kind, expected in (
+        ("stated", "given_not_exact", severity),
+        ("components", "given_scatter", weighted),
+    ):
+        survey = survey_of(
+            network, truth, control=control, datum={"kind": "control"}, adjust={"weights": weights}
+        )
+        said = remarks_on_given(run_survey(survey))
+        assert said[0].kind == kind and said[0].severity == expected
 
 
 def test_mirrored_control_names_what_does_not_fit_either() -> None:
@@ -276,7 +285,7 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
     of = {"doubtful": (), "factor": 2.0, "rescale": True, "estimated": False, "fixed": False} | case
     stated = np.diag([0.0, 0.0, np.inf] if of["fixed"] else [1e-4, 4e-4, np.inf])[None]
     group: Any = SimpleNamespace(
-        rounded=False,
+        scatter=0.0,
         found=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
         placed=SimpleNamespace(model=SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))),
     )

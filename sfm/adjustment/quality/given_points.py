@@ -32,8 +32,6 @@ from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_simi
 
 MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct
 MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten
-MAX_DECIMALS = 8  # most decimals of typed coordinates; computed ones have more
-SAME_DECIMAL = 1e-6  # deviation of a scaled number from a whole number that is due to binary rounding
 STRAINS = (  # derivatives of coordinates by the parameters, along an axis or of an affinity, (u, 3, 3)
     *(np.diag(e)[None] for e in np.eye(3)),
     np.array(
@@ -91,14 +89,6 @@ class GivenPoints:
             free=self.free[some],
             joint=self.joint[np.ix_(rows, rows)],
         )
-
-    def rounded(self) -> GivenPoints:
-        """Return the points with the standard deviations that follow from rounding to the last decimal place.
-
-        Source: Foerstner and Wrobel (2016), sec. 2.3 (uniform distribution).
-        """
-        variance = decimal_step(self.given) ** 2 / 12
-        return replace(self, stated=np.broadcast_to(variance * np.eye(3), self.stated.shape))
 
     @property
     def variances(self) -> tuple[FloatArray, FloatArray]:
@@ -170,17 +160,6 @@ class GivenPoints:
         rotation = R @ placing.rotation
         shift = centre + dx[:3] + scale * R @ (placing.translation - centre)
         return Similarity(scale * placing.scale, rotation, shift)
-
-
-def decimal_step(numbers: FloatArray) -> float:
-    """Return the unit of the last decimal place of numbers; 0 for whole and for computed numbers."""
-    known = numbers[np.isfinite(numbers)]
-    if np.abs(known - np.rint(known)).max(initial=0.0) < SAME_DECIMAL:
-        return 0.0  # whole numbers may be nominal ones
-    steps = 10.0 ** -np.arange(1, MAX_DECIMALS + 1)
-    return next(
-        (s for s in steps.tolist() if np.abs(known / s - np.rint(known / s)).max() < SAME_DECIMAL), 0.0
-    )
 
 
 def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sfm.conventions import SWELLING
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 DATUM = (
@@ -274,12 +275,14 @@ ROWS = (
         explains=PULLED,
     ),
     Kind(
-        "given_rounded",
-        "note",
-        "The rounding of {of:@} to {step} is coarse for this network: they were weighted with the "
-        "standard deviation of the rounding, {sigma}.",
-        "coordinates printed with few decimals",
-        "Give more decimals, or the standard deviations of these coordinates.",
+        "given_scatter",
+        # weighted, they harm no result; beyond the swelling of paper they are hardly rounded coordinates
+        Grade("share", warning=100 * SWELLING, at_most=Grade("shift", warning=WRONG_SIGMAS)),
+        "Coordinates of {of:@}, stated as exact, scatter by {sigma} ({share} of their extent) against the "
+        "network of the image points, more than by chance: they were weighted with it. Held fixed, they "
+        "would shift the result by up to {shift} of its standard deviations.",
+        "rounded coordinates, coordinates of a drawing or a print, or points that moved",
+        "State the standard deviations of these coordinates.",
     ),
     Kind(
         "given_differs",

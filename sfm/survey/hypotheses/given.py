@@ -207,8 +207,8 @@ def _group(
     if placed is None:
         return None
     group = Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
-    if fixed and in_datum and task.rescale and not (task.of_plate or placed.judgement.fits):
-        group = _rounded(group, start, task.level)
+    if fixed and in_datum and not (task.of_plate or placed.judgement.fits):
+        group = _scattering(group, start, task)
     found = group.found
     if found.factor == 1.0:
         return group
@@ -219,13 +219,30 @@ def _group(
     return replace(group, points=points, placed=placed)
 
 
-def _rounded(group: Group, start: Similarity | None, level: float) -> Group:
-    """Judge fixed coordinates with the precision of their decimals, if this explains the misfit."""
-    points = group.points.rounded()
-    placed = judge_points(points, level, start=start) if points.stated.any() else None
-    if placed is None or placed.judgement.factor != 1.0 or placed.judgement.doubtful:
+def _scattering(group: Group, start: Similarity | None, task: Task) -> Group:
+    """Judge fixed coordinates as values of unknown precision, if their scatter explains the misfit.
+
+    No coordinate is exact. Single points are then wrong only if they exceed the scatter of the others, which
+    does not depend on how many decimals the coordinates are written with.
+    """
+    placed = judge_points(group.points, task.level, start=start, estimated=True)
+    if placed is None or placed.mirrored or placed.judgement.doubtful or not placed.judgement.explained:
         return group
-    return replace(group, points=points, placed=placed, rounded=True)
+    kept = ~np.isin(placed.model.item, placed.judgement.wrong)
+    sigma = placed.model.part(kept).factor()[0]
+    points = replace(group.points, stated=np.broadcast_to(sigma**2 * np.eye(3), group.points.stated.shape))
+    again = judge_points(points, task.level, start=start)
+    if again is None or again.judgement.doubtful or again.judgement.wrong != placed.judgement.wrong:
+        return group
+    tested = group.found  # the test of the coordinates as they were given
+    judgement = replace(
+        again.judgement,
+        factor=1.0,
+        statistic=tested.statistic,
+        dof=tested.dof,
+        probability=tested.probability,
+    )
+    return replace(group, points=points, placed=replace(again, judgement=judgement), scatter=sigma)
 
 
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
@@ -248,13 +265,16 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
         yield _left_out(group, task.unit)
     if found.doubtful:
         yield _doubtful(task, group)
-    if group.rounded:
-        sigma = float(np.sqrt(group.points.stated.max()))
-        step, used = (sigma * np.sqrt(12), task.unit), (sigma, task.unit)
-        yield remark("given_rounded", of=of, step=step, sigma=used)
+    if group.scatter:
+        sigma, shift = (group.scatter, task.unit), shift_of_fixed(group.placed.model, group.scatter)
+        if task.rescale:
+            share = (100 * group.scatter / group.placed.model.extent, "%")
+            yield remark("given_scatter", of=of, sigma=sigma, share=share, shift=shift)
+        else:
+            yield remark("given_not_exact", of=of, sigma=sigma, shift=shift)
     if task.datum.kind == "control":
         yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong)
-    if found.factor == 1.0 or group.rounded or group.placed.model.estimated:
+    if found.factor == 1.0 or group.scatter or group.placed.model.estimated:
         return
     covariance = (task.network.control if of == "control" else task.network.exterior).covariance
     of_points = covariance[group.rows, :3, :3]

@@ -375,7 +375,7 @@ class Group:
     points: GivenPoints
     places: IntArray  # rows of the points in `Places`, (n,)
     placed: PlacedPoints
-    rounded: bool = False  # whether the standard deviations are those of rounding
+    scatter: float = 0.0  # standard deviation of fixed coordinates from their scatter, object unit; 0: exact
 
     @property
     def found(self) -> Judgement:
@@ -427,7 +427,7 @@ class Group:
     def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
         """Return the covariance with which the points fit."""
         known = np.isfinite(covariance)
-        if self.rounded:
+        if self.scatter and rescale:
             return np.where(known, self.points.stated, covariance)
         fixed = not np.where(known, covariance, 0.0).any()
         changes = bool(self.found.doubtful) or self.found.factor != 1.0

@@ -21,6 +21,7 @@ from sfm.camera import Camera, base_name, camera_from_values
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.brown import from_balanced
+from sfm.distortion.models import MODELS
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, InteriorObservations, Network
 from sfm.observations.pose import MountObservations
@@ -79,7 +80,7 @@ def start_cameras(
         metadata: size and EXIF data of the readable photographs, (m,); empty with [observations].
         camera: camera index of each photograph, (m,).
         names: names of the photographs, (m,).
-        given: start values of [approximate] for free parameters, which replace all others.
+        given: values of [approximate]; see `approximate_values`.
 
     Raises:
         PhotographError: photographs of one camera differ in size from one another or from size_px.
@@ -99,7 +100,7 @@ def start_cameras(
             pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
         known = dict(from_balanced(one.balanced)) if one.balanced else {}
         known |= {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
-        known |= dict(one.start) | free_start_values(one, one.name, given)
+        known |= dict(one.start) | approximate_values(one, one.name, given)
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in photographs if metadata[k].pixel_mm), None)
         if focal is None:
@@ -162,16 +163,28 @@ def _refuse_implausible_view(
     )
 
 
-def free_start_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:
-    """Return the start values of [approximate] for the free parameters of a camera, by parameter.
+def approximate_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:
+    """Return the values of [approximate] for a camera, by parameter.
+
+    Free parameters start from them, and parameters that the survey file states nowhere are held at them.
 
     Args:
-        settings: states the free parameters.
+        settings: states the free parameters, and the values of others.
         name: name of the camera in the table, or of its photograph or group with separate values.
         given: the table, or None.
     """
     values = given.of(name) if given is not None else {}
-    return {parameter: value for parameter, value in values.items() if parameter in settings.may_be_free}
+    stated = {name for name, _ in (*settings.fixed, *settings.weighted)}
+    if settings.balanced:
+        stated |= {name for name, _ in from_balanced(settings.balanced)}
+    if settings.c_mm is not None:
+        stated |= {"c", "f"}
+    return {
+        parameter: value
+        for parameter, value in values.items()
+        if parameter in settings.may_be_free
+        or (parameter in MODELS[settings.model].names and parameter not in stated)
+    }
 
 
 def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCameras | None) -> None:
@@ -293,7 +306,7 @@ def _with_start_values(camera: Camera, settings: CameraSettings, given: StartCam
     A parameter that several cameras share starts from the value of the survey file's camera.
     """
     p = camera.parameters.copy()
-    for name, value in free_start_values(settings, camera.name, given).items():
+    for name, value in approximate_values(settings, camera.name, given).items():
         s = camera.names.index(name)
         if not camera.group_of(s):
             p[s] = value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +11,14 @@ import pytest
 
 from adapters.formats.content import Content, losses
 from adapters.formats.photomodeler import read_export, read_photomodeler, write_export
-from adapters.formats.registry import format_named
+from adapters.formats.registry import format_named, write_any
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import project, tangents_from_pixel
+from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.solvers import convert
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
@@ -293,3 +295,65 @@ def test_camcal_export_projects_onto_its_own_marks() -> None:
     # The export rounds K2 to one digit and angles to 1e-3 deg; a wrong sign or origin would show as 50 px.
     assert np.sqrt((v**2).mean()) < 2.0
     assert np.abs(v.mean(axis=0)).max() < 0.3
+
+
+def test_smart_points_have_the_precision_of_points_marked_by_hand(tmp_path: Path) -> None:
+    """Their sigma is 0 in the export: they were weighted with 0.1 px after `convert`, marks with 1 px."""
+    text = EXPORT.replace(" 1.00000  0.10000 10.00000", " 0.70000  0.10000 10.00000")
+    network, _ = read_photomodeler(write(tmp_path, text))
+    assert network.image_points.stated_sigma.tolist() == [[0.1, 0.2], [0.1, 0.1], [0.7, 0.7], [0.1, 0.1]]
+    none = re.sub(r"( +0\.[12]0000){2}\n", " 0.00000  0.00000\n", EXPORT)
+    network, _ = read_photomodeler(write(tmp_path, none))
+    assert np.isnan(network.image_points.stated_sigma).all()  # as it came: nothing is stated
+
+
+def _with_control(tmp_path: Path) -> tuple[Path, Network, Estimate]:
+    """Write an export with weighted control and half of its image points without a standard deviation."""
+    rng = seed_of("smart points")
+    network, truth = make_network(rng, images=6, points=40, model="brown", noise_px=1.0, free=())
+    seen = network.image_points
+    stated = np.arange(len(seen)) % 2 == 0
+    control = ObjectPoints(
+        np.arange(8),
+        truth.points[:8] + 1e-3 * rng.standard_normal((8, 3)),
+        np.tile(1e-6 * np.eye(3), (8, 1, 1)),
+    )
+    points = tuple(str(j + 1) for j in range(40))
+    network = replace(network, points=points, control=control, image_points=replace(seen, stated=stated))
+    lens = truth.cameras[0]
+    values = tuple((n, v) for n, v in zip(lens.names, lens.parameters.tolist(), strict=True) if n != "b1")
+    square = float(lens.pixel_mm[0])
+    camera = camera_from_values(
+        lens.name, "brown_dbat", lens.size_px, (square, square), c_mm=lens.value("c"), values=values
+    )
+    truth = replace(truth, cameras=(camera,))
+    network = observed_anew(network, truth, 1.0, rng)
+    path = tmp_path / "export.txt"
+    write_export(path, Content(Solution("smart", network, truth)))
+    return path, network, truth
+
+
+def test_converted_weights_are_those_of_the_export(tmp_path: Path) -> None:
+    """sigma0 is that of the adjustment with all standard deviations as stated, 10 times as large before."""
+    path, network, truth = _with_control(tmp_path)
+    convert(path, tmp_path / "tables", "tables")
+    survey = read_survey(tmp_path / "tables" / "survey.toml")
+    assert survey.adjust.weights == "stated"
+    result = run_survey(survey)
+    expected = adjust(network, truth, reject="none", datum=Datum("control"))
+    assert result.adjustment.sigma0 == pytest.approx(expected.sigma0, rel=1e-6)
+    assert 0.9 < result.adjustment.sigma0 < 1.1
+    index = [network.points.index(name) for name in result.network.points]
+    np.testing.assert_allclose(result.estimate.points, expected.estimate.points[index], atol=1e-7)
+
+
+def test_a_held_camera_keeps_the_distortion_of_its_table(tmp_path: Path) -> None:
+    """`free = []` written into a converted survey file set K1 to 0, in silence."""
+    network, truth = make_network(seed_of("held camera"), images=6, points=40, model="brown")
+    write_any(tmp_path / "tables", "tables", network, truth)
+    file = tmp_path / "tables" / "survey.toml"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(re.sub(r"^free = \[.+\]", "free = []", text, flags=re.MULTILINE), encoding="utf-8")
+    (camera,) = run_survey(read_survey(file)).estimate.cameras
+    assert not camera.free.any()
+    np.testing.assert_allclose(camera.parameters, truth.cameras[0].parameters, rtol=1e-12)
