@@ -12,7 +12,8 @@ import math
 import sys
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import TextIO
 
@@ -80,6 +81,22 @@ class CsvTable:
             if name in self.numbers:
                 found[:, k] = self.values[:, self.numbers.index(name)]
         return found
+
+    @property
+    def copies(self) -> BoolArray:
+        """Which rows have the names and numbers of an earlier row, (rows,)."""
+        rows = zip(zip(*self.texts, strict=True), map(tuple, self.values.tolist()), strict=True)
+        seen: set[object] = set()
+        found = []
+        for row in rows:
+            found.append(row in seen)
+            seen.add(row)
+        return np.array(found, dtype=bool)
+
+    def select(self, rows: BoolArray) -> CsvTable:
+        """Return the table with some of its rows."""
+        texts = tuple(tuple(compress(column, rows)) for column in self.texts)
+        return replace(self, texts=texts, values=self.values[rows], line=self.line[rows])
 
     def refuse(self, values: FloatArray, wrong: BoolArray, columns: tuple[str, ...], needed: str) -> None:
         """Raise SurveyFileError for the first wrong value.

@@ -46,6 +46,7 @@ class ObservationTable:
     value: FloatArray  # q values without and d with standard deviation, object unit or rad, (n, q + d)
     sigma: FloatArray  # object unit or rad, (n, d)
     table: CsvTable  # has the names of points or photographs
+    copies: tuple[str, ...] = ()  # names of observations that the table has more than once; each counts once
 
     @property
     def of(self) -> type[TableKind]:
@@ -79,10 +80,17 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     Raises:
         SurveyFileError: an unknown kind, an unreadable table, wrong columns, a standard deviation that is not
             positive, or an observation between a point and itself.
+
+    Returns:
+        The observations; rows with equal names and numbers are one observation, not repeated measurements.
     """
     if kind not in TABLES:
         raise SurveyFileError(f"{source}: kind = '{kind}', needed one of {listed(list(TABLES))}")
-    return observation_table(kind, read_table(path, TABLES[kind].texts, TABLES[kind].columns()))
+    table = read_table(path, TABLES[kind].texts, TABLES[kind].columns())
+    copies = table.copies
+    once = observation_table(kind, table.select(~copies))
+    copied = dict.fromkeys(zip(*table.select(copies).texts, strict=True))
+    return replace(once, copies=tuple(f"{kind} {' - '.join(names)}" for names in copied))
 
 
 def observation_table(kind: str, table: CsvTable) -> ObservationTable:
@@ -175,7 +183,7 @@ def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
 
 
 def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
-    """Return the remarks on observations whose points or photographs are not in the network."""
+    """Return the remarks on observations of tables that are not used: without their points, or copies."""
     frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
@@ -192,6 +200,7 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
     return (
         *([remark("observations_unused", observations=unused)] if unused else []),
+        *([remark("observations_identical", observations=survey.copied)] if survey.copied else []),
         *([remark("frame_points_computed", points=computed)] if computed else []),
     )
 

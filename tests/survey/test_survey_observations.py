@@ -633,12 +633,44 @@ def test_a_point_is_once_in_a_group_and_a_distance_as_often_as_measured(
     kind: str, columns: str, row: str, refused: bool, tmp_path: Path
 ) -> None:
     path = tmp_path / "table.csv"
-    path.write_text("\n".join((columns, row, row)) + "\n", encoding="utf-8")
+    again = row.replace(".0,", ".1,")  # measured again
+    path.write_text("\n".join((columns, row, again)) + "\n", encoding="utf-8")
     if refused:
         with pytest.raises(SurveyFileError, match="on line 2 already"):
             read_observation_table(kind, path, "survey.toml")
     else:
-        read_observation_table(kind, path, "survey.toml")
+        assert len(read_observation_table(kind, path, "survey.toml").value) == 2
+
+
+@pytest.mark.parametrize("kind", ["height difference", "distance", "zenith angle", "antenna position"])
+def test_copied_rows_count_once(kind: str, tmp_path: Path) -> None:
+    """A copied table made its observations count twice, and their precision 1.4 times too good."""
+    network, truth = network_of("copies", (kind,))
+    (one,) = network.observations
+    names = network.images if TABLES[kind].texts_of == PHOTOGRAPH else network.points
+    sigma = np.sqrt(np.einsum("nii->ni", one.covariances()))
+    ends = [one.image] if hasattr(one, "image") else [one.start, one.end]  # type: ignore[attr-defined]
+    factor = TABLES[kind].in_tables()
+    lever = one.lever if hasattr(one, "lever") else np.zeros((len(sigma), 0))
+    cells = np.hstack([lever, factor * one.values, factor * sigma]).tolist()
+    rows = [
+        ",".join((*(names[k] for k in of_row), *(repr(cell) for cell in row)))
+        for of_row, row in zip(zip(*ends, strict=True), cells, strict=True)
+    ]
+    header = ",".join((*TABLES[kind].texts, *TABLES[kind].columns()))
+    found = []
+    for copies in (1, 3):
+        folder = tmp_path / str(copies)
+        folder.mkdir()
+        (folder / "t.csv").write_text("\n".join([header, *(copies * rows)]), encoding="utf-8")
+        text = f'[[survey_observations]]\nkind = "{kind}"\nfile = "t.csv"\n\n'
+        found.append(run_survey(read_survey(written(folder, network, truth, text))))
+    first, second = (result.adjustment for result in found)
+    assert first.redundancy == second.redundancy
+    np.testing.assert_array_equal(first.estimate.points, second.estimate.points)
+    said = [one for one in found[1].remarks if one.kind == "observations_identical"]
+    assert len(said[0].names("observations")) == len(set(zip(*(end.tolist() for end in ends), strict=True)))
+    assert not [one for one in found[0].remarks if one.kind == "observations_identical"]
 
 
 @pytest.mark.parametrize("orientation", [0.0, np.pi / 2, np.pi, -np.pi / 2, 4.0])

@@ -131,6 +131,14 @@ ROWS = (
         "Correct the names, or look among the points that were left out.",
     ),
     Kind(
+        "observations_identical",
+        "note",
+        "{observations:survey observation} {observations:is|are} more than once in a table with the same "
+        "numbers: {observations}. Each counts once.",
+        "rows that were copied into the table twice",
+        "Remove the copies; measurements that were repeated differ in a digit.",
+    ),
+    Kind(
         "frame_points_computed",
         "note",
         "{points:point} of rigid frames {points:is|are} in no photograph and {points:was|were} computed "

@@ -118,6 +118,7 @@ class Survey:
     moments: Mapping[str, str] = field(default_factory=dict)  # moments of photographs from tables
     scale_bars: tuple[ScaleBar, ...] = ()
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
+    copied: tuple[str, ...] = ()  # observations that a table has more than once
     equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
     observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
@@ -147,6 +148,9 @@ class Survey:
             "source": where,
             "cameras": cameras,
             "scale_bars": (*self.scale_bars, *(bar for table in self.tables for bar in bars_of(table))),
+            "copied": tuple(
+                dict.fromkeys((*self.copied, *(n for table in self.tables for n in table.copies)))
+            ),
             "tables": tuple(table for table in self.tables if table.kind != DISTANCE),
             "folder": Path(self.folder),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
