@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, ObjectPoints
 from sfm.observations.kind import Kind
@@ -123,9 +124,13 @@ def select_determined(
     images, points = select_supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
         needed = " or ".join(str(one) for one in np.unique(min_points))
+        moments = 0 if network.moment is None else int((np.bincount(network.moment) > 1).sum())
+        paired = (
+            f"; {counted(moments, 'moment')} may pair photographs of different moments, see [[rig]] moment"
+        )
         raise GeometryError(
             f"{images.sum()} of {len(images)} photographs see enough points of the network (at least "
-            f"{needed}), at least 2 photographs are needed"
+            f"{needed}), at least 2 photographs are needed{paired if moments else ''}"
         )
     return images, points
 

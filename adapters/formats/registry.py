@@ -202,7 +202,7 @@ FORMATS = (
         adjusts=True,
     ),
     FileFormat(
-        *("rig", ("opencv",), None, None, frozenset({"rigs"})), folder=True, write_all=write_rig_files
+        *("rig", ("opencv",), None, None, frozenset({"rigs", "unit"})), folder=True, write_all=write_rig_files
     ),
     FileFormat(
         "ply",

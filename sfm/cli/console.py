@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sfm.cli.commands.starting import FAILED
 from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
@@ -80,6 +81,16 @@ def print_verdict(verdict: Verdict | Banner) -> None:
     console = Console(highlight=False)
     console.print(Text(verdict.headline, style=f"bold {COLOURS[verdict.level]}"), soft_wrap=True)
     print_remarks(console, verdict.lines)
+
+
+def exit_by(verdict: Verdict | Banner) -> None:
+    """End the command with exit code 1 if its verdict is bad; `print_verdict` says why.
+
+    Raises:
+        SystemExit: the verdict is bad.
+    """
+    if verdict.level == "bad":
+        raise SystemExit(FAILED)
 
 
 def print_remarks(console: Console, lines: Iterable[Line]) -> None:

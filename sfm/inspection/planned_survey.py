@@ -135,12 +135,13 @@ class AchievedPrecision:
     points: int  # number of planned points that were measured
     planned: int  # number of planned points
     ratio: float  # median ratio of a posteriori to predicted sigmas of points
-    error: float  # RMS true error over the predicted RMS sigma, in the datum of the prediction
+    # sum of squares of true errors over that of predicted sigmas, in the datum of the prediction; 1 in the
+    # mean of many seeds, which its root is not
+    error_ratio_squared: float
     sigma_px: float  # a posteriori, of an image coordinate
     predicted_px: float
-    mounts: float | None = (
-        None  # RMS true error of mounts over their a posteriori sigmas; None without mounts
-    )
+    # mean square of true errors of mounts over their a posteriori sigmas; None without mounts
+    mount_ratio_squared: float | None = None
 
 
 def read_plan(folder: Path) -> PlannedSurvey:
@@ -476,7 +477,7 @@ def compare_with_plan(
         int(found.sum()),
         len(plan.points),
         float(np.median(sigma / predicted)),
-        float(np.sqrt((error**2).mean() / (predicted**2).mean())),
+        float((error**2).mean() / (predicted**2).mean()),
         a.sigma0_px,
         plan.sigma_px,
         _mount_error(plan, result.solution, motion.scale),
@@ -484,7 +485,7 @@ def compare_with_plan(
 
 
 def _mount_error(plan: PlannedSurvey, result: Solution, scale: float) -> float | None:
-    """Return the RMS true error of the adjusted mounts over their standard deviations."""
+    """Return the mean square of the true errors of the adjusted mounts over their standard deviations."""
     rig, found, Q = plan.stations.rig, result.estimate.mounts, result.mount_covariance
     if rig is None or found is None or Q is None or not found.free.any():
         return None
@@ -493,4 +494,4 @@ def _mount_error(plan: PlannedSurvey, result: Solution, scale: float) -> float |
     error = unit * values[0] - values[1]
     error[:, 3:] = (error[:, 3:] + np.pi) % (2 * np.pi) - np.pi
     w = error[found.free] / (unit * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)))[found.free]
-    return float(np.sqrt((w**2).mean()))
+    return float((w**2).mean())

@@ -15,7 +15,7 @@ Text in [[ ]] appears only if the remark has all parts that it contains.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 # A value that is further off than this number of standard deviations is wrong. Noise causes an error of this
 # size once in a million coordinates. If it is the root mean square of all errors, the whole result is wrong.
 WRONG_SIGMAS = 5.0
+DIGITS, MAX_DIGITS = 3, 12  # significant digits of a number; more distinguish it from others of its unit
 MIN_PROBABILITY = 1e-3  # smaller probabilities are written as "p < 0.001"
 # A result that shifts by fewer standard deviations stays within the limits that users expect: they contain
 # 99.7 % of normally distributed errors (Pukelsheim 1994, "The three sigma rule", The American Statistician
@@ -149,6 +150,20 @@ def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
     return shown
 
 
+def _digits(number: Quantity, parts: Iterable[tuple[str, ...] | Quantity]) -> int:
+    """Return how many significant digits distinguish a number from all others of its unit in a sentence."""
+    others = [
+        part.value
+        for part in parts
+        if isinstance(part, Quantity) and part.unit == number.unit != "" and part.value != number.value
+    ]
+
+    def distinguished(digits: int) -> bool:
+        return significant(number.value, digits) not in {significant(other, digits) for other in others}
+
+    return next((digits for digits in range(DIGITS, MAX_DIGITS) if distinguished(digits)), MAX_DIGITS)
+
+
 def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: str) -> str:
     """Format one part as the specification of its field asks."""
     part = parts[name]
@@ -159,7 +174,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
         return f"{count:,.0f} {plural(spec, count)}"
     if not isinstance(part, Quantity):
         return listed(_nouns(part, spec[1:]) if spec else part)
-    return _number(part, spec)
+    return _number(part, spec, _digits(part, parts.values()))
 
 
 def _nouns(names: tuple[str, ...], other: str) -> list[str]:
@@ -167,8 +182,8 @@ def _nouns(names: tuple[str, ...], other: str) -> list[str]:
     return [NOUNS.get(name) or f"{other} {name}".lstrip() for name in names]
 
 
-def _number(one: Quantity, spec: str) -> str:
-    """Format a number and its unit, to three significant digits unless the field asks otherwise."""
+def _number(one: Quantity, spec: str, digits: int) -> str:
+    """Format a number and its unit, with so many significant digits unless the field asks otherwise."""
     if not np.isfinite(one.value):
         return "not known"
     if spec == "<":
@@ -176,17 +191,17 @@ def _number(one: Quantity, spec: str) -> str:
     if spec == "%":
         return f"{significant(100 * one.value)} %"
     if spec == "+":
-        text = ("+" if one.value >= 0 else "") + significant(one.value)
+        text = ("+" if one.value >= 0 else "") + significant(one.value, digits)
     elif spec:
         text = format(one.value, spec)
     elif not one.unit and float(one.value).is_integer() and abs(one.value) < 1e15:
         text = f"{one.value:,.0f}"
     else:
-        text = significant(one.value)
+        text = significant(one.value, digits)
     return f"{text} {one.unit}".rstrip()
 
 
-def significant(value: float, digits: int = 3) -> str:
+def significant(value: float, digits: int = DIGITS) -> str:
     """Format a number with significant digits, with an exponent only if it is very large or small.
 
     Args:

@@ -98,7 +98,9 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     found = compare_with_plan(read, "ring14", result)
     assert found.points == found.planned == 20
     # 60 coordinates, correlated through the datum: 10 % of sampling error, and sigma0 of some 200 redundancy
-    assert found.ratio == pytest.approx(1.0, abs=0.25) and found.error == pytest.approx(1.0, abs=0.35)
+    assert found.ratio == pytest.approx(1.0, abs=0.25) and found.error_ratio_squared**0.5 == pytest.approx(
+        1.0, abs=0.35
+    )
     assert found.sigma_px == pytest.approx(found.predicted_px, rel=0.2)
     (tmp_path / "plan" / "points.csv").write_text("id,X\n", encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"points\.csv, line 1: no column Y"):

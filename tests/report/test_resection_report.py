@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.cli.commands.matching import read_task
+from sfm.cli.commands.measuring import resect as resect_command
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.report.single_photographs import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS
@@ -167,3 +168,21 @@ def test_bad_geometry(tmp_path, four):
     for method in METHODS:
         with pytest.raises(GeometryError, match="points 1 and 2 coincide"):
             resect_json(coincident, method)
+
+
+@pytest.mark.parametrize("photograph", [9, 10, 14, 18])
+@pytest.mark.parametrize("method", ["robust", "all"])
+def test_opposite_signs_of_distortion_are_named_where_they_fit_better(photograph, method, capsys):
+    """The camera of lab 2 subtracts its distortion; nothing said so."""
+    table = ROOT / f"datasets/lab2/photograph_{photograph}.csv"
+    for opposite in (False, True):
+        resect_command(
+            table, method=method, camera=ROOT / "datasets/lab2/lab2_camera.csv", opposite_signs=opposite
+        )
+        said = capsys.readouterr().out
+        assert ("the opposite signs of the distortion fit" in said) is not opposite
+
+
+def test_without_distortion_there_are_no_signs(four, capsys):
+    resect_command(four, c=24)
+    assert "opposite" not in capsys.readouterr().out

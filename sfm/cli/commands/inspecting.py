@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from sfm.solution import Solution
 
 PICTURES = "pictures"  # folder of photographs in a result folder
-NOT_KEPT = 1  # exit code if the error limit is exceeded
 MAX_PRINTED = 40  # distances, angles and heights on the terminal; quantities.csv lists all
 if TYPE_CHECKING:
     from sfm.inspection.measure import Measurement
@@ -51,7 +50,7 @@ def measure(
     with loading():
         from adapters.formats.mesh import read_mesh
         from adapters.formats.registry import read_comparable
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.inspection.features_file import read_features_file
         from sfm.inspection.measure import measure_result
@@ -82,6 +81,7 @@ def measure(
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
     print(f"Report: {page}")
+    exit_by(found.verdict)
 
 
 def accept(
@@ -124,7 +124,7 @@ def accept(
     """
     with loading():
         from adapters.formats.result_tables import read_result, read_scale_sources
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.inspection.acceptance import accept_result, read_lengths
         from sfm.report.pages import write_page
@@ -148,8 +148,7 @@ def accept(
     print_verdict(found.verdict)
     print(f"largest error of a length: {found.largest:.4g} {found.unit}")
     print(f"Report: {page}")
-    if found.verdict.level == "bad":
-        raise SystemExit(NOT_KEPT)
+    exit_by(found.verdict)
 
 
 def _write_drawings(found: Measurement, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -175,23 +176,28 @@ def resect(
             resection_text,
         )
         from sfm.textbook.resection.by_method import resect as resect_by
-        from sfm.textbook.resection.by_method import resect_by_all
+        from sfm.textbook.resection.by_method import resect_by_all, signs_warning
 
     with working_on(str(points)):
-        task = read_task(
-            points,
-            c_mm=c,
-            camera_file=camera,
-            start=start,
-            tolerance_mm=tolerance,
-            opposite_signs=opposite_signs,
+        task, other = (
+            read_task(
+                points,
+                c_mm=c,
+                camera_file=camera,
+                start=start,
+                tolerance_mm=tolerance,
+                opposite_signs=signs,
+            )
+            for signs in (opposite_signs, not opposite_signs)
         )
+    warning = signs_warning(task, other)
     if method == "all":
         found = resect_by_all(task)
-        text = comparison_table(found, task.c)
+        text = comparison_table(found, task.c) + (f"\nwarning: {warning}" if warning else "")
         values: object = comparison_json(found, task.c)
     else:
         one = resect_by(task, method)
+        one = replace(one, warning="; ".join(filter(None, (one.warning, warning))))
         text, values = resection_text(one, task.c), resection_json(one, task.c)
     print(json.dumps(values, indent=2, allow_nan=False) if as_json else text)
 

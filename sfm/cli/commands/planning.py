@@ -263,7 +263,7 @@ def network_command(
     Lengths are in the unit of --unit.
     """
     with loading():
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.conventions import METRES
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.planning.designer import StationLimits, design_network
@@ -332,7 +332,8 @@ def network_command(
             )
             found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
     page = write_page(found, out)
-    print_verdict(verdict_of_plan(found))
+    verdict = verdict_of_plan(found)
+    print_verdict(verdict)
     for what, value in figures(found):
         print(f"  {what}: {value}")
     for weak in found.weak[:MAX_WEAK]:
@@ -340,6 +341,7 @@ def network_command(
     if len(found.weak) > MAX_WEAK:
         print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, listed in the page")
     print(f"Report: {page}")
+    exit_by(verdict)
 
 
 def _depth_of_field(
@@ -407,10 +409,11 @@ def simulate_command(
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
     print(f"{found.points} of {found.planned} planned points measured")
     print(f"sigma of points: {found.ratio:.3f} times the predicted (median)")
-    print(f"true errors: {found.error:.3f} times the predicted, RMS")
+    print(f"true errors: {found.error_ratio_squared**0.5:.3f} times the predicted, RMS")
     print(f"sigma of an image coordinate: {found.sigma_px:.4f} px, predicted {found.predicted_px:.4f} px")
-    if found.mounts is not None:
-        print(f"true errors of mounts: {found.mounts:.3f} times their standard deviations, RMS")
+    if found.mount_ratio_squared is not None:
+        rms = found.mount_ratio_squared**0.5
+        print(f"true errors of mounts: {rms:.3f} times their standard deviations, RMS")
     print(f"Report: {out / 'result' / 'report.html'}")
 
 
@@ -441,7 +444,7 @@ def more_command(
 
         from adapters.formats.given_table import read_given
         from adapters.formats.result_tables import read_result
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.planning.plan import further_photographs
         from sfm.report.pages import page_of, write_declared
@@ -470,3 +473,4 @@ def more_command(
     print_verdict(page.verdict)
     print(page.text)
     print(f"Report: {path}")
+    exit_by(page.verdict)

@@ -81,7 +81,7 @@ def compare(
     """
     with loading():
         from adapters.formats.registry import read_comparable
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.comparison.findings import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.open_folders import refuse_foreign_folder
@@ -104,10 +104,12 @@ def compare(
         f"{describe_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
         f"{describe_scale(found)}"
     )
-    print_verdict(verdict_of_comparison(found))
+    verdict = verdict_of_comparison(found)
+    print_verdict(verdict)
     if found.points:
         print(f"largest difference of a point: {largest_difference(found)}")
     print(f"Report: {page}")
+    exit_by(verdict)
 
 
 def convert(
@@ -246,7 +248,7 @@ def epochs(
     Reports the congruency test, the stable points, displacements with their tests, and motions of groups.
     """
     with loading():
-        from sfm.cli.console import print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.epochs.series import analyse_epochs, verdict_of_epochs
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.report.epochs import describe_block, describe_stable
@@ -276,13 +278,15 @@ def epochs(
             together=together,
         )
     page = write_page(found, out)
-    print_verdict(verdict_of_epochs(found))
+    verdict = verdict_of_epochs(found)
+    print_verdict(verdict)
     for pair in found.pairs:
         print(" to ".join(pair.displacements.differences.names))
         print(f"  {describe_stable(pair.displacements)}")
         for block in pair.blocks:
             print(f"  {describe_block(block)}")
     print(f"Report: {page}")
+    exit_by(verdict)
 
 
 def _read_epoch(path: Path) -> Epoch:

@@ -388,7 +388,8 @@ ROWS = (
     Kind(
         "photograph_with_few_accepted",
         "warning",
-        "Fewer than {needed} of its image points were accepted.",
+        "{needed:None|Too few} of its image points {needed:was|were} accepted, at least {needed} "
+        "{needed:is|are} needed.",
         "misidentified points, or a photograph of another object",
         "Check its points, or leave it out.",
     ),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm.adjustment.quality.given_values import MARGIN
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.errors import GeometryError
@@ -63,7 +64,7 @@ class ResectionResult:
     rejected: tuple[str, ...] | None = None  # names of rejected points
     trials: int | None = None  # number of trials of the random sample consensus
     line_fit: tuple[LineFit, ...] = ()  # line fit of each solution, which identifies the true one
-    warning: str = ""  # says that the three points hardly determine the position
+    warning: str = ""  # three points that hardly determine the position, or signs of the distortion
 
 
 @checked_arguments()
@@ -239,6 +240,31 @@ def cylinder_distance(position: FloatArray, points: FloatArray) -> float:
     offset = np.asarray(position) - A - centre
     across = offset - (offset @ normal) / square * normal
     return float(np.linalg.norm(across) / np.linalg.norm(centre) - 1)
+
+
+def signs_warning(task: Task, opposite: Task) -> str:
+    """Return a warning if the opposite signs of the distortion fit clearly better, else an empty string.
+
+    Programs differ in whether they add or subtract distortion, and the numbers do not show it. Both choices
+    have the same unknowns, so that their likelihoods decide, with the margin of other explanations.
+
+    Args:
+        task: image and object points of the photograph.
+        opposite: the same, with the opposite signs of the distortion.
+    """
+    if np.array_equal(task.tangents, opposite.tangents):
+        return ""
+    try:
+        rms, other = (_robust(one).solutions[0].rms for one in (task, opposite))
+    except GeometryError:
+        return ""
+    lead = 2 * task.tangents.size * float(np.log(rms / max(other, np.finfo(float).tiny)))
+    if not lead > MARGIN:
+        return ""
+    return (
+        f"the opposite signs of the distortion fit {rms / other:.3g} times better, RMS "
+        f"{other * task.c:.6f} in place of {rms * task.c:.6f} mm; see --opposite-signs"
+    )
 
 
 def cylinder_warning(position: FloatArray, points: FloatArray) -> str:
