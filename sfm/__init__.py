@@ -9,6 +9,7 @@ The methods underneath are in packages, each with a list of its public names and
 
 - `targets`, `matching`: measurement in photographs.
 - `orientation`, `adjustment`: photographs and points from image points, with covariance and tests.
+- `observations`: observations other than image points, also of one's own.
 - `geometry`, `comparison`, `epochs`: shapes and tolerances, two results of one object, movements.
 - `planning`: the precision that a network will reach, before anything is photographed.
 - `textbook`: methods of the literature that a survey does not need.

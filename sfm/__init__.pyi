@@ -6,7 +6,6 @@ from sfm.adjustment.result import Adjustment as Adjustment
 from sfm.adjustment.solve import adjust as adjust
 from sfm.api import compare as compare
 from sfm.api import distance as distance
-from sfm.api import fit_shape as fit_shape
 from sfm.api import measure as measure
 from sfm.api import network_from_colmap as network_from_colmap
 from sfm.api import read_result as read_result
@@ -16,6 +15,7 @@ from sfm.camera import Camera as Camera
 from sfm.camera import camera_from_values as camera_from_values
 from sfm.camera import project as project
 from sfm.errors import KolinearError as KolinearError
+from sfm.geometry.shapes.fit import fit_shape as fit_shape
 from sfm.network import Estimate as Estimate
 from sfm.network import Network as Network
 from sfm.network import empty_estimate as empty_estimate
@@ -32,6 +32,7 @@ from sfm.survey.inputs.given import ScaleBar as ScaleBar
 from sfm.survey.inputs.survey import CameraSetup as CameraSetup
 from sfm.survey.inputs.survey import Survey as Survey
 from sfm.survey.inputs.survey import read_survey as read_survey
+from sfm.survey.observation_tables import ObservationTable as ObservationTable
 from sfm.targets.detect import Targets as Targets
 from sfm.targets.detect import find_targets as find_targets
 
@@ -42,6 +43,7 @@ from . import conventions as conventions
 from . import epochs as epochs
 from . import geometry as geometry
 from . import matching as matching
+from . import observations as observations
 from . import orientation as orientation
 from . import planning as planning
 from . import targets as targets

@@ -5,7 +5,7 @@ All public names are listed in `sfm/__init__.pyi`. An adapter is imported by the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -18,9 +18,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.arguments import checked_arguments
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
-from sfm.geometry.measured import measured_points
-from sfm.geometry.shapes.fit import ShapeFit
-from sfm.geometry.shapes.fit import fit_shape as fit_points
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.kernels.threads import cores
@@ -220,42 +217,6 @@ def distance(result: SurveyResult | Adjustment | Solution, start: str, end: str)
         raise GeometryError(f"distance: points {start} and {end} are in one place")
     J = np.concatenate([-between, between]) / length
     return length, float(np.sqrt(J @ solution.covariance_of((start, end)) @ J))
-
-
-@checked_arguments()
-def fit_shape(
-    result: SurveyResult | Adjustment | Solution,
-    kind: str,
-    points: Sequence[str] | None = None,
-    *,
-    weights: str = "network",
-    hold: Mapping[str, float | Sequence[float]] | None = None,
-    robust: bool = False,
-    offset: float = 0.0,
-) -> ShapeFit:
-    """Fit a shape to points of a result by orthogonal distances, with the covariance of the network.
-
-    Args:
-        result: result of a survey or an adjustment, or one read from files.
-        kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid (of revolution).
-        points: names or patterns such as `10*`; all points if not given.
-        weights: network (the covariance of the points) or equal.
-        hold: values held fixed: `direction`, `centre` (also `point`, `apex`, `vertex`), `radius`, `diameter`
-            and the like; lengths in the object unit, angles in rad.
-        robust: whether to leave out points that contradict most of the others.
-        offset: distance of the targets from the shape, positive on the side of its normal, object unit.
-
-    Raises:
-        GeometryError: too few points, points that do not determine the shape, or unknown names.
-
-    Example:
-        >>> import sfm
-        >>> sfm.fit_shape(result, "plane", ["1", "2", "3", "4"]).redundancy
-        1
-    """
-    measured = measured_points(solution_of(result, "fit_shape").with_joint_covariance)
-    chosen = None if points is None else measured.matching(points, f"{kind}: points")
-    return fit_points(measured, kind, chosen, weights=weights, hold=hold, robust=robust, offset=offset)
 
 
 @checked_arguments()

@@ -154,8 +154,10 @@ def _fits(value: object, hint: Any) -> bool:
     if hint is bool:
         return isinstance(value, bool | np.bool_)
     origin, inner = typing.get_origin(hint) or hint, typing.get_args(hint)
-    if not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+    if not isinstance(origin, type) or _is_function(origin):
         return origin is typing.Any or callable(value)
+    if getattr(origin, "_is_protocol", False):
+        return all(hasattr(type(value), name) for name in vars(origin) if not name.startswith("_"))
     if origin in SEQUENCES:
         origin = Sequence
     if not isinstance(value, origin) or (isinstance(value, str) and origin is not str):
@@ -208,6 +210,11 @@ def _describe_value(value: object) -> str:
     return f"a {type(value).__name__}{within}"
 
 
+def _is_function(origin: Any) -> bool:
+    """Return whether a type is a protocol of functions."""
+    return bool(getattr(origin, "_is_protocol", False)) and "__call__" in vars(origin)
+
+
 def _type_name(hint: Any) -> str:
     """Return the name of an annotated type for a message."""
     for array, _, _, values in ARRAYS:
@@ -219,7 +226,10 @@ def _type_name(hint: Any) -> str:
         return "None"
     origin, inner = typing.get_origin(hint) or hint, typing.get_args(hint)
     name = getattr(origin, "__name__", str(hint))
-    if name == "Callable" or getattr(origin, "_is_protocol", False):
+    if name == "Callable" or _is_function(origin):
         return "a function"
+    if getattr(origin, "_is_protocol", False):  # described by the first sentence of its docstring
+        sentence = (origin.__doc__ or name).partition(".")[0].replace("`", "")
+        return sentence[:1].lower() + sentence[1:]
     elements = f" of {_type_name(inner[0])}" if name in ("list", "tuple", "Sequence") and inner else ""
     return {"str": "text", "bool": "True or False"}.get(name, name) + elements

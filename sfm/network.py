@@ -22,7 +22,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
 from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
-from sfm.observations.kind import Kind
+from sfm.observations.kind import PHOTOGRAPH, POINT, Kind
 from sfm.observations.pose import ExteriorObservations
 
 __all__ = [
@@ -223,6 +223,41 @@ class Network:
             np.append(bars.sigma, sigma),
         )
         return replace(self, scale_bars=added)
+
+    def with_observations(self, *kinds: Kind) -> Network:
+        """Return the network with further observations, of the kinds of `sfm.observations` or of one's own.
+
+        Args:
+            kinds: observations of one kind each, by index of the points and photographs of the network.
+
+        Raises:
+            GeometryError: a point or photograph that is not in the network, a value that is not finite, a
+                standard deviation that is not positive, or a kind that has a method of its own here.
+
+        Example:
+            >>> import numpy as np
+            >>> from sfm.observations import HeightDifferences
+            >>> ends = np.array([0, 1]), np.array([2, 3])
+            >>> level = HeightDifferences(*ends, np.array([[0.02], [-0.01]]), np.full((2, 1), 1e-4))
+            >>> [kind.name for kind in result.network.with_observations(level).observations]
+            ['height differences']
+        """
+        size = {POINT: len(self.points), PHOTOGRAPH: len(self.images)}
+        for kind in kinds:
+            if isinstance(kind, ObjectPoints | ScaleBars | ExteriorObservations | InteriorObservations):
+                raise GeometryError(f"{kind.name}: not with_observations, expected the field of the network")
+            for block in kind.blocks():
+                outside = block.at[(block.at < 0) | (block.at >= size.get(block.of, np.inf))]
+                if outside.size:
+                    raise GeometryError(
+                        f"{kind.name}: {block.of} {outside.flat[0]}, expected 0 to {size[block.of] - 1}"
+                    )
+            variance = np.einsum("nii->ni", kind.covariances())
+            if not (np.isfinite(kind.values).all() and (variance > 0).all()):
+                raise GeometryError(
+                    f"{kind.name}: finite values and standard deviations above 0 are needed for each"
+                )
+        return replace(self, observations=(*self.observations, *kinds))
 
     def image_index(self, name: str) -> int:
         """Return the index of a photograph; UnknownNameError if no photograph has that name."""

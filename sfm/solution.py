@@ -11,7 +11,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -107,6 +107,7 @@ class Solution:
     # rad, (s, s)
     rig_covariance: FloatArray | None = None
     joint: JointCovariance | None = None  # joint covariance of an adjustment in memory; otherwise None
+    sigma0: float = 1.0  # of unit weight: the covariances are its square times those of the stated weights
 
     @property
     def has_scale(self) -> bool:
@@ -265,6 +266,14 @@ def mount_blocks(covariance: FloatArray, first: int) -> FloatArray:
     """Return the block of each mount in a joint covariance; mounts begin at row `first`, (a, 6, 6)."""
     rows = first + np.arange(len(covariance) - first if len(covariance) else 0).reshape(-1, 6)
     return np.asarray(covariance[rows[:, :, None], rows[:, None]])
+
+
+class Solved(Protocol):
+    """What `run_survey`, `adjust` or `read_result` returns."""
+
+    @property
+    def solution(self) -> Solution:
+        """The solution."""
 
 
 def solution_of(result: Any, what: str) -> Solution:

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, KolinearError
 from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.observations import HeightDifferences
 from sfm.reduced_network import reduce_network, select_determined
 from tests.synthetic import make_network, seed_of
 
@@ -259,3 +261,39 @@ def test_known_points_with_impossible_covariances_are_refused(mixed: list[float]
         sfm.KnownPoints(("a", "b", "c"), xyz, sigma, np.array([[0.0, 0, 0], mixed, [0, 0, 0]]))
     with pytest.raises(KolinearError, match="control point a: "):
         sfm.KnownPoints(("a", "b", "c"), xyz, -sigma)
+
+
+def test_observations_of_ones_own_are_added_and_checked() -> None:
+    network, truth = make_network(seed_of("own observations"), images=5, points=12)
+    ends = np.array([0, 3, 5]), np.array([1, 4, 11])
+    exact = truth.points[ends[1], 2:] - truth.points[ends[0], 2:]
+    levelled = HeightDifferences(*ends, exact, np.full((3, 1), 1e-5))
+    found = adjust(network.with_observations(levelled), truth)
+    assert len(found.network.observations) == 1 and found.expected_defect == 4
+    solved = found.estimate.points
+    np.testing.assert_allclose(solved[ends[1], 2:] - solved[ends[0], 2:], exact, atol=5e-5)
+    wrong = (
+        (replace(levelled, end=np.array([1, 4, 12])), "point 12, expected 0 to 11"),
+        (replace(levelled, sigma=np.array([[1e-5], [0.0], [1e-5]])), "standard deviations above 0"),
+        (replace(levelled, value=np.array([[np.nan], [0.0], [0.0]])), "finite values"),
+        (network.scale_bars, "scale bars: not with_observations"),
+    )
+    for kind, message in wrong:
+        with pytest.raises(GeometryError, match=message):
+            network.with_observations(kind)
+
+
+def test_a_point_with_one_ray_has_no_coordinates_in_a_result() -> None:
+    """Its start value stayed among the results, with a standard deviation that is not known."""
+    network, truth = make_network(seed_of("one ray"), images=5, points=15, visibility=1.0)
+    seen = network.image_points
+    kept = np.ones(len(seen), dtype=bool)
+    kept[np.flatnonzero(seen.point == 3)[1:]] = False
+    network = replace(network, image_points=seen.select(kept))
+    found = adjust(network, truth)
+    assert np.flatnonzero(~found.estimate.determined).tolist() == [3]
+    assert found.undetermined == ("point 4: 1 ray, 2 are needed",)
+    np.testing.assert_array_equal(found.estimate.points[:3], adjust(network, truth).estimate.points[:3])
+    control = ObjectPoints(np.arange(4), truth.points[:4], np.tile(1e-8 * np.eye(3), (4, 1, 1)))
+    known = adjust(replace(network, control=control), truth, datum="control")  # known otherwise
+    assert known.estimate.determined.all()

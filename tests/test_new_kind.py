@@ -14,8 +14,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import FloatArray
 from sfm.network import values_of
-from sfm.observations import TABLES
 from sfm.observations.point_pairs import PointPairs
+from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey
 from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result

@@ -8,7 +8,9 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -27,7 +29,16 @@ from tests.synthetic import make_network, seed_of
 ROOT = Path(sfm.__file__).resolve().parent
 PUBLIC = {
     *("Adjustment", "Camera", "CameraSetup", "Datum", "Estimate", "KnownPoints", "KolinearError", "Network"),
-    *("Observations", "ObservedExterior", "ScaleBar", "Similarity", "Solution", "Survey", "SurveyResult"),
+    *(
+        "Observations",
+        "ObservationTable",
+        "ObservedExterior",
+        "ScaleBar",
+        "Similarity",
+        "Solution",
+        "Survey",
+        "SurveyResult",
+    ),
     *(
         "Targets",
         "adjust",
@@ -411,3 +422,40 @@ def test_summary_of_a_written_result_is_read_back(result: SurveyResult, result_f
     np.testing.assert_array_equal(stored.points.xyz, result.points.xyz)
     np.testing.assert_allclose(stored.points.sigma, result.points.sigma, rtol=1e-12)
     assert json.loads((result_folder / "summary.json").read_text(encoding="utf-8"))["survey"] == result.name
+
+
+NOT_IN_THE_TABLE = {
+    "allow_outside",
+    "source",
+    "copied",
+    "equipment",
+    "diameters",
+    "start_orientations",
+    "start_cameras",
+}
+
+
+def test_the_table_of_the_page_on_python_has_every_part_of_a_survey() -> None:
+    """Each cell is an argument of `sfm.Survey` that is accepted; rigs and tables were missing."""
+    page = (ROOT.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\|[^|]+\| `([a-z_]+=.*)` \|$", page, re.MULTILINE)
+    xyz, sigma = np.zeros((1, 3)), np.full((1, 3), 1e-3)
+    given: dict[str, Any] = {"sfm": sfm, "xyz": xyz, "sigma": sigma, "names": ["1"], "images": ["a.jpg"]}
+    given |= {"points": ["1"], "xy": np.zeros((1, 2))}
+    known, found = dict[str, Any](), set[str]()
+    for row in rows:
+        values = eval(f"dict({row})", dict(given))
+        found |= set(values)
+        known |= {name: value for name, value in values.items() if name in ("name", "unit", "cameras")}
+    assert found | NOT_IN_THE_TABLE == {one.name for one in fields(sfm.Survey)}
+    right = {"name": "right", "images": "r*.png", "c_mm": 24.0}
+    pair = [{**right, "name": "left", "images": "l*.png"}, right]
+    for row in rows:
+        values = eval(f"dict({row})", dict(given))
+        if "rigs" in values or "mounts" in values or "moments" in values:
+            values = {"rigs": [{"name": "pair", "cameras": ["left", "right"], "moment": "order"}], **values}
+            values["cameras"] = pair
+        if "plates" in values:
+            first = {"codes": "asymmetric-grid", "rows": 7, "columns": 5, "pitch": 10.0}
+            values = {"targets": first, **values}
+        sfm.Survey(**{**known, **values})

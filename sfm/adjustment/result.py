@@ -160,6 +160,7 @@ class Adjustment:
             interior_covariance=self.covariance.interior,
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=JointOnDemand(self),
+            sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
         )
 
     @property

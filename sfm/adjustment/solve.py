@@ -85,7 +85,8 @@ def adjust(
 
     Args:
         network: the measurements.
-        estimate: start values; a photograph or point without one (NaN) takes no part and is reported.
+        estimate: start values; a photograph or point without one (NaN) takes no part and is reported. So is
+            a point with one ray that nothing else determines; it has no coordinates (NaN) in the result.
         datum: definition of position, attitude and scale; or only its kind.
         sigma_px: standard deviation of unit weight, px. The network states the weights, so this changes
             sigma0 but not sigma0_px.
@@ -282,9 +283,11 @@ def _result(
         standardised = np.take(
             standardised_residuals(v, complement, layout.observations.whitening), back, axis=0
         )
+    solved = estimate_of(optimum.state, estimate)
+    left_out = ~layout.point_on & (network.rays() > 0)  # a start value is no result
     return Adjustment(
         network=network,
-        estimate=estimate_of(optimum.state, estimate),
+        estimate=replace(solved, points=np.where(left_out[:, None], np.nan, solved.points)),
         converged=optimum.converged,
         iterations=run.iterations,
         datum=run.problem.datum.kind,

@@ -321,7 +321,13 @@ class Common:
 
 @dataclass(frozen=True)
 class Epoch:
-    """One epoch: a result with its given values."""
+    """One epoch: a result with its given values and sigma0, which are those of its solution if not given.
+
+    Example:
+        >>> from sfm.epochs import Epoch
+        >>> Epoch("spring", result.solution).result.covariance is not None
+        True
+    """
 
     name: str
     result: Solution
@@ -331,6 +337,27 @@ class Epoch:
     sigma0: float = 1.0  # sigma0 that scales the covariance of the result
     sigma0_px: float | None = None  # median a posteriori sigma of an image coordinate; None if unknown
     common: Common | None = None  # correlation with the epochs adjusted together with it, if any
+
+    def __post_init__(self) -> None:
+        """Take the joint covariance and the given values of an adjustment from its solution."""
+        result = self.result.solution.with_joint_covariance
+        given = result.network
+        object.__setattr__(self, "result", result)
+        if self.sigma0 == 1.0:
+            object.__setattr__(self, "sigma0", result.sigma0)
+        if not len(self.bars):
+            object.__setattr__(self, "bars", given.scale_bars)
+        if not len(self.control) and result.datum == "control":
+            object.__setattr__(self, "control", given.control)
+        if not self.interior and len(given.interior):
+            object.__setattr__(self, "interior", tuple(_interior_of(result)))
+
+
+def _interior_of(result: Solution) -> Iterator[tuple[str, str, float, float]]:
+    """Yield camera, parameter, value and standard deviation of the observed interior parameters."""
+    seen, cameras = result.network.interior, result.estimate.cameras
+    for a, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
+        yield cameras[a].owner_of(s), cameras[a].names[s], float(value), float(sigma)
 
 
 Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, standard deviation, value

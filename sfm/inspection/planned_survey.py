@@ -25,8 +25,8 @@ from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import Content, Name, Text, csv_text, read_json
 from sfm.files.result_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
 from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
-from sfm.observations import TABLES
 from sfm.observations.pose import MountObservations
+from sfm.observations.tables import TABLES
 from sfm.planning.prediction import simulate_network
 from sfm.planning.stations import Stations
 from sfm.planning.weakness import open_motions

@@ -13,9 +13,9 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
 from sfm.files.result_tables import IN_FILES
-from sfm.observations import TABLES
 from sfm.observations.given import ScaleBars
 from sfm.observations.pose import MountObservations
+from sfm.observations.tables import TABLES
 from sfm.planning import MIN_PIXELS
 from sfm.planning.plan import Plan, verdict_of_plan
 from sfm.planning.prediction import ALPHA, found_displacement

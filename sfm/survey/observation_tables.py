@@ -13,17 +13,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm.adjustment.result import Adjustment, ObservedResiduals
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import listed
 from sfm.distributions import normal_ppf
 from sfm.errors import SurveyFileError
-from sfm.files.csv_tables import CsvTable, read_table
+from sfm.files.csv_tables import CsvTable, array_table, read_table
 from sfm.network import Estimate, Network
-from sfm.observations import TABLES
 from sfm.observations.kind import PHOTOGRAPH, POINT, Group, Kind, RowKind, TableKind
 from sfm.observations.rigid_frames import RigidFrames
+from sfm.observations.tables import TABLES
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import ScaleBar
@@ -40,13 +41,54 @@ MIN_REDUNDANCY = 0.01  # redundancy number below which others hardly check an ob
 
 @dataclass(frozen=True)
 class ObservationTable:
-    """A table of observations of one kind."""
+    """A table of survey observations of one kind.
+
+    Example:
+        >>> import sfm
+        >>> tape = sfm.ObservationTable.from_arrays(
+        ...     "distance", [["1", "2"], ["2", "3"]], [[4.031], [2.718]], [[0.001], [0.001]]
+        ... )
+        >>> tape.name(0), tape.sigma.shape
+        ('distance 1 - 2', (2, 1))
+    """
 
     kind: str  # as in the survey file
     value: FloatArray  # q values without and d with standard deviation, object unit or rad, (n, q + d)
     sigma: FloatArray  # object unit or rad, (n, d)
     table: CsvTable  # has the names of points or photographs
     copies: tuple[str, ...] = ()  # names of observations that the table has more than once; each counts once
+
+    @classmethod
+    def from_arrays(
+        cls,
+        kind: str,
+        names: Sequence[Sequence[str]],
+        values: npt.ArrayLike,
+        sigma: npt.ArrayLike,
+    ) -> ObservationTable:
+        """Return the table of observations from arrays, in the columns and units of its file.
+
+        Args:
+            kind: kind as written in the survey file, such as "distance" or "height difference".
+            names: names in the columns of points or photographs, one row for each observation, (n, t).
+            values: columns of values, object unit or deg, (n, q).
+            sigma: columns of standard deviations, object unit or deg, (n, d).
+
+        Raises:
+            SurveyFileError: an unknown kind, another number of rows or columns, a number that is not finite,
+                or what `read_observation_table` refuses.
+        """
+        of = _kind_of(kind, "survey observations")
+        columns = of.columns()
+        numbers = np.hstack([np.atleast_2d(np.asarray(part, dtype=float)) for part in (values, sigma)])
+        texts = list(zip(*names, strict=True))
+        if numbers.shape[1:] != (len(columns),) or len(texts) != len(of.texts):
+            raise SurveyFileError(
+                f"{kind}: {len(texts)} columns of names and {numbers.shape[-1]} of numbers, needed "
+                f"{listed([*of.texts, *columns])}"
+            )
+        named = dict(zip(of.texts, texts, strict=True))
+        return observation_table(kind, array_table(kind, named, dict(zip(columns, numbers.T, strict=True))))
 
     @property
     def of(self) -> type[TableKind]:
@@ -84,13 +126,19 @@ def read_observation_table(kind: str, path: Path, source: str) -> ObservationTab
     Returns:
         The observations; rows with equal names and numbers are one observation, not repeated measurements.
     """
-    if kind not in TABLES:
-        raise SurveyFileError(f"{source}: kind = '{kind}', needed one of {listed(list(TABLES))}")
-    table = read_table(path, TABLES[kind].texts, TABLES[kind].columns())
+    of = _kind_of(kind, source)
+    table = read_table(path, of.texts, of.columns())
     copies = table.copies
     once = observation_table(kind, table.select(~copies))
     copied = dict.fromkeys(zip(*table.select(copies).texts, strict=True))
     return replace(once, copies=tuple(f"{kind} {' - '.join(names)}" for names in copied))
+
+
+def _kind_of(kind: str, source: str) -> type[TableKind]:
+    """Return a kind by its name in the survey file; SurveyFileError if there is none."""
+    if kind not in TABLES:
+        raise SurveyFileError(f"{source}: kind = '{kind}', needed one of {listed(list(TABLES))}")
+    return TABLES[kind]
 
 
 def observation_table(kind: str, table: CsvTable) -> ObservationTable:

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.epochs.differences import Epoch
+from sfm.epochs.differences import Epoch, epoch_differences
+from sfm.epochs.displacements import find_displacements
 from sfm.epochs.series import EpochSeries, analyse_epochs, remarks_of_pair, verdict_of_epochs
 from sfm.errors import GeometryError
 from sfm.remarks.remark import Remark, kinds_of
 from sfm.report.epochs import describe_stable
 from sfm.report.pages import write_page
 from tests.epochs.scenes import POINTS, epoch
+from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of
 
 
@@ -97,7 +100,7 @@ def test_refusals_are_one_line() -> None:
         analyse_epochs([first, second], groups={"pier": ["P*"]})
     with pytest.raises(GeometryError, match="expected one of rigid, similarity, affine"):
         analyse_epochs([first, second], model="bent")
-    bare = replace(second, result=replace(second.result, covariance=None))
+    bare = replace(second, result=replace(second.result, covariance=None, joint=None))
     with pytest.raises(GeometryError, match=r"epoch 71: the covariance of all points together"):
         analyse_epochs([first, bare])
     again = replace(first, name="copy")
@@ -150,3 +153,17 @@ def test_epochs_with_other_names_and_of_two_objects_are_reported() -> None:
         result = replace(second.result, estimate=replace(estimate, points=points), covariance=covariance)
         verdict = verdict_of_epochs(analyse_epochs([first, replace(second, result=result)]))
         assert kinds_of(verdict.remarks) == (kind,) and verdict.level == "bad"
+
+
+def test_an_epoch_is_a_name_and_a_solution() -> None:
+    """The solution of an adjustment needs no covariance file, and has its bars and control."""
+    network, truth = make_network(seed_of("an epoch"), images=6, points=20)
+    seen, found = network.image_points, []
+    for k in range(2):
+        noise = seed_of(f"noise {k}").normal(0, 0.1, seen.xy.shape)
+        measured = replace(network, image_points=replace(seen, xy=seen.xy + noise))
+        a = adjust(measured.with_scale_bar(network.points[0], network.points[1], 1.0, 1e-4), truth)
+        found.append(Epoch(f"epoch {k}", a.solution))
+        assert len(found[k].bars) == 1 and not len(found[k].control)
+    displacements = find_displacements(epoch_differences(*found))
+    assert displacements.stable.all()

@@ -18,9 +18,9 @@ from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
 from sfm.network import Estimate, Network
-from sfm.observations import TABLES
 from sfm.observations.kind import PHOTOGRAPH, Group, TableKind
 from sfm.observations.rigid_frames import RigidFrames
+from sfm.observations.tables import TABLES
 from sfm.planning.plan import plan_of
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import ScaleBarPlan, WantedPrecision, predict_network

@@ -25,12 +25,13 @@ from sfm.network import (
     ScaleBars,
     values_of,
 )
-from sfm.observations import TABLES, planes_and_lines
+from sfm.observations import planes_and_lines
 from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind, inverse_of_determined
 from sfm.observations.planes_and_lines import Lines, PlumbLines
 from sfm.observations.point_pairs import HeightDifferences, HorizontalDirections, OffsetDistances
 from sfm.observations.pose import MountObservations
 from sfm.observations.rigid_frames import RigidFrames
+from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
 from sfm.report.findings.survey_remarks import findings_of

@@ -21,10 +21,11 @@ from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.geometry.measured import Function, MeasuredPoints
+from sfm.geometry.measured import Function, MeasuredPoints, measured_points
 from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_orthogonal, refine_weighted
 from sfm.geometry.shapes.kinds import KINDS, Kind, Shape
 from sfm.geometry.shapes.start import robust_shape, start_shapes, with_held
+from sfm.solution import Solved, solution_of
 
 WITH_DIAMETER = ("circle", "sphere", "cylinder")
 
@@ -100,7 +101,7 @@ class ShapeFit:
 
 @checked_arguments()
 def fit_shape(
-    points: MeasuredPoints,
+    points: MeasuredPoints | Solved,
     kind: str,
     chosen: Sequence[str] | IntArray | None = None,
     *,
@@ -113,9 +114,9 @@ def fit_shape(
     """Fit a shape to points by orthogonal distances.
 
     Args:
-        points: points of a result.
-        kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid.
-        chosen: names or indices of the points; all if not given.
+        points: result of a survey or an adjustment, or one read from files; or points of any other source.
+        kind: line, plane, circle, ellipse, sphere, cylinder, cone, torus or paraboloid (of revolution).
+        chosen: names, patterns such as `10*`, or indices of the points; all if not given.
         name: name of the shape, for messages; its kind if empty.
         weights: network (the covariance of the points) or equal.
         hold: values held fixed: `direction` (three numbers), position (`point`, `centre`, `apex` or `vertex`,
@@ -124,27 +125,37 @@ def fit_shape(
         offset: signed distance of the targets from the shape, positive on the side of its normal or outside.
 
     Raises:
-        GeometryError: too few points, points that do not determine the shape, or invalid options.
+        GeometryError: too few points, points that do not determine the shape, unknown names, or invalid
+            options.
 
     Source: Ahn (2004), ch. 3; the general case of least squares as in `refine_weighted`.
+
+    Example:
+        >>> import sfm
+        >>> sfm.fit_shape(result, "plane", ["1", "2", "3", "4"]).redundancy
+        1
     """
+    if not isinstance(points, MeasuredPoints):
+        points = measured_points(solution_of(points, "fit_shape").with_joint_covariance)
     if kind not in KINDS:
         raise GeometryError(f"shape '{name or kind}': kind '{kind}', expected one of {', '.join(KINDS)}")
     what = f"{kind} {name}".strip()
-    rows = _rows(points, chosen)
+    rows = _rows(points, chosen, what)
     try:
         return _fit(points, KINDS[kind], rows, name or kind, weights, dict(hold or {}), robust, offset)
     except GeometryError as error:
         raise GeometryError(f"{what}: {error}") from error
 
 
-def _rows(points: MeasuredPoints, chosen: Sequence[str] | IntArray | None) -> IntArray:
+def _rows(points: MeasuredPoints, chosen: Sequence[str] | IntArray | None, what: str) -> IntArray:
     if chosen is None:
         return np.arange(len(points.names))
     if isinstance(chosen, np.ndarray):
         check_indices("fit_shape: chosen", chosen, len(points.names))
         return chosen.astype(np.int64)
-    return np.array([points.index(one) for one in chosen], dtype=np.int64)
+    if all(isinstance(name, str) for name in chosen) and not set(chosen) <= set(points.names):
+        return points.matching(chosen, f"{what}: points")
+    return np.array([points.index(name) for name in chosen], dtype=np.int64)
 
 
 def _fit(

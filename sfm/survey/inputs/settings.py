@@ -14,7 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
-from sfm.observations import TABLES
+from sfm.observations.tables import TABLES
 
 MAX_SHOWN = 60  # characters of a key
 MAX_LISTED = 10  # keys listed in one message
