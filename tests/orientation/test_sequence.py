@@ -7,12 +7,14 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
+from sfm.camera import Camera, camera_from_values, pixel_from_tangents
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.orientation.incremental import sequence
 from sfm.orientation.incremental.sequence import orient
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity
+from sfm.survey.orientation import refine as refine_network
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
 
@@ -306,3 +308,90 @@ def test_camcal_from_its_four_coded_targets(c):
     P = result.estimate.points
     sides = np.linalg.norm(P[[0, 1, 3, 2]] - P[[1, 3, 2, 0]], axis=1)
     np.testing.assert_allclose(sides / sides.mean(), 1, atol=1e-3)
+
+
+def _castle(seed: int, images: int, points: int, gross: float, arc_deg: float) -> tuple[Network, Estimate]:
+    """Four walls photographed from around them, with many wrong matches."""
+    rng = np.random.default_rng(seed)
+    values = (("K1", -1e-3), ("K2", 5e-6))
+    lens = camera_from_values(
+        "lens",
+        "brown",
+        (2000, 1500),
+        (0.005, 0.005),
+        c_mm=10.0,
+        free=("c", "x0", "y0", "K1", "K2"),
+        values=values,
+    )
+    side = rng.integers(0, 4, points)
+    along, height, depth = (
+        rng.uniform(-10, 10, points),
+        rng.uniform(0, 8, points),
+        10 + rng.uniform(0, 1.5, points),
+    )
+    outward = np.array([[0.0, 1, 0], [1, 0, 0], [0, -1, 0], [-1, 0, 0]])[side]
+    xyz = (
+        depth[:, None] * outward
+        + along[:, None] * np.abs(outward[:, [1, 0, 2]])
+        + height[:, None] * [0, 0, 1]
+    )
+    angle = np.radians(np.linspace(0, arc_deg, images) + rng.normal(0, 3, images))
+    radius = rng.uniform(24, 34, images)
+    position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(1, 4, images)])
+    aim = np.array([0.0, 0.0, 4.0]) + rng.normal(0, 1, (images, 3))
+    rotation = np.empty((images, 3, 3))
+    rows, xy = [], []
+    for i, X0 in enumerate(position):
+        z = X0 - aim[i]
+        z /= np.linalg.norm(z)
+        x = np.cross([0.0, 0, 1], z) / np.linalg.norm(np.cross([0.0, 0, 1], z))
+        rotation[i] = np.column_stack([x, np.cross(z, x), z])
+        of_camera = (xyz - X0) @ rotation[i]
+        at = pixel_from_tangents(lens, of_camera[:, :2] / -of_camera[:, 2:])
+        facing = np.einsum("ni,ni->n", (X0 - xyz) / np.linalg.norm(X0 - xyz, axis=1)[:, None], outward) > 0.25
+        shown = facing & (of_camera[:, 2] < 0) & ((at > 0) & (at < (2000, 1500))).all(axis=1)
+        seen = np.flatnonzero(shown & (rng.uniform(size=points) < 0.5))
+        rows.append(np.column_stack([np.full(len(seen), i), seen]))
+        xy.append(at[seen] + rng.normal(0, 0.5, (len(seen), 2)))
+    image, point = np.concatenate(rows).T
+    places = np.concatenate(xy)
+    wrong = rng.uniform(size=len(places)) < gross
+    places[wrong] = rng.uniform(0, 1, (wrong.sum(), 2)) * (2000, 1500)
+    twice = np.bincount(point, minlength=points)[point] >= 2
+    kept, number = np.unique(point[twice], return_inverse=True)
+    covariance = np.tile(0.25 * np.eye(2), (int(twice.sum()), 1, 1))
+    network = Network(
+        tuple(f"{i}.jpg" for i in range(images)),
+        np.zeros(images, dtype=np.int64),
+        tuple(str(j) for j in kept),
+        ImagePoints(image[twice], number, places[twice], covariance),
+    )
+    return network, Estimate((lens,), position, rotation, xyz[kept])
+
+
+def _start_of(truth: Estimate) -> Camera:
+    parameters = np.zeros(len(truth.cameras[0].parameters))
+    parameters[0] = 1.1 * truth.cameras[0].parameters[0]
+    return truth.cameras[0].with_parameters(parameters)
+
+
+def test_a_dropped_photograph_does_not_make_the_network_grow_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It grew three times, 2.1 s for 0.6 s, and ended where it had been."""
+    grown = []
+    grow = sequence._grow
+    monkeypatch.setattr(sequence, "_grow", lambda *given: (grown.append(1), grow(*given))[1])
+    network, truth = _castle(14, images=9, points=350, gross=0.25, arc_deg=90)
+    found = orient(network, [_start_of(truth)], refine=refine_network)
+    assert len(found.failures) <= 1 and len(grown) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_photographs_dropped_early_return_to_the_settled_network(seed: int) -> None:
+    """Of those dropped beside 20 % wrong matches the settled network supports some: of seed 0 all 19 stay."""
+    network, truth = _castle(seed, images=19, points=400, gross=0.2, arc_deg=250)
+    found = orient(network, [_start_of(truth)], refine=refine_network).estimate
+    known = found.determined
+    placed = fit_similarity(found.points[known], truth.points[known]).apply_estimate(found)
+    off = np.linalg.norm(placed.position - truth.position, axis=1)
+    assert np.nanmax(off) < 1.0 and (seed or found.oriented.all())

@@ -8,6 +8,7 @@ against each photograph; photographs without enough support are dropped.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,6 +59,16 @@ class Growth:
         self.fixed = np.zeros(len(network.points), dtype=bool)
         self.fixed[control.point] = (estimate.points[control.point] == control.xyz).all(axis=1)
         self.adjusted = np.zeros(0, dtype=bool)  # image points of the last adjustment, (k,)
+
+    def state(self) -> Growth:
+        """Return a copy that later steps do not change."""
+        kept = copy(self)
+        kept.reasons, kept.dropped, kept.fixed = dict(self.reasons), self.dropped.copy(), self.fixed.copy()
+        return kept
+
+    def restore(self, state: Growth) -> None:
+        """Return to an earlier state."""
+        vars(self).update(vars(state))
 
     # --- views of the measured image points --------------------------------------------------------
 

@@ -34,7 +34,7 @@ from sfm.similarity import reverse_depth
 DOUBTFUL = 30.0  # multiple of the median residual of a solution below which its reversal casts doubt on it
 SMALLER_TOLERANCES = (1 / 3, 1 / 10)  # shares of the first start tolerance, for a solution in doubt
 FAR_WORSE = 3.0  # multiple of the median residual from which a photograph may not belong to the others
-CONTRADICTING = "photograph_against_the_others"
+CONTRADICTING, MIRRORED = "photograph_against_the_others", "photograph_mirrored"
 BOUND = 6.0  # multiple of the median residual of the best solution to which residuals are limited
 MIN_OTHERS = 3  # oriented photographs needed to judge another one
 WORSE = 1.5  # multiple of the typical median residual from which a photograph is tested turned over
@@ -76,6 +76,19 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
     return changed
 
 
+def reinstate_dropped(growth: Growth) -> bool:
+    """Resect the dropped photographs again in the settled network; return whether any fits.
+
+    A photograph may be dropped before its neighbours, the points beside it or the interior orientation are
+    known well. Settling again drops it again if the others do not support it.
+    """
+    mirrored = [i for i, reason in growth.reasons.items() if reason.kind == MIRRORED]
+    dropped = np.setdiff1d(np.flatnonzero(growth.dropped), mirrored).tolist()
+    returned = [i for i in dropped if growth.resect([i])]
+    growth.dropped[returned] = False
+    return bool(returned)
+
+
 def _is_mirrored(growth: Growth, i: int) -> bool:
     """Return whether a photograph fits the others far better turned over; if so, record it as the reason.
 
@@ -89,7 +102,7 @@ def _is_mirrored(growth: Growth, i: int) -> bool:
     mirrored &= turned.fitting >= as_it_is.fitting
     if mirrored:
         stated = (before, "px") if np.isfinite(before) else None
-        growth.reasons[i] = remark("photograph_mirrored", before=stated, turned=(after, "px"))
+        growth.reasons[i] = remark(MIRRORED, before=stated, turned=(after, "px"))
     return mirrored
 
 

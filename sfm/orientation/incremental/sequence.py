@@ -37,6 +37,7 @@ from sfm.orientation.incremental.poor_photographs import (
     bounded_costs,
     casts_doubt,
     judge_misfits,
+    reinstate_dropped,
     reversed_growth,
     worst_photographs,
 )
@@ -54,6 +55,10 @@ Judge = Callable[[Estimate], float]
 MIN_POINTS = 4  # fewest points of a photograph: P3P always fits three, the fourth checks the result
 START_TOLERANCE = 0.03  # share of the photograph's diagonal: residuals of unknown distortion after resection
 FINAL_TOLERANCE_PX = 4.0  # no image point is excluded below this here; the adjustment tests further
+# Share of oriented photographs from which a dropped one casts no doubt on the others. Of 40 simulated castles
+# of 9 photographs with 25 % wrong matches, the solution is wrong in one of those with fewer, and in none with
+# more; growing again takes three times as long.
+MOST = 0.75
 MIN_RIVALS = 3  # oriented photographs; with two, other knowledge decides, see `best_start`
 GROWTH = 1.25  # growth in the number of photographs after which the network is adjusted again
 MAX_ROUNDS = 200
@@ -141,6 +146,11 @@ def orient(
     def settle_misfits(growth: Growth) -> None:
         if judge_misfits(growth, refine):
             _settle(growth, refine, final_tolerance_px)
+        before = growth.state()
+        if reinstate_dropped(growth):
+            _settle(growth, refine, final_tolerance_px)
+            if growth.estimate.oriented.sum() <= before.estimate.oriented.sum():
+                growth.restore(before)
 
     if not has_given_values(network, estimate):
         return grow(estimate)
@@ -206,7 +216,7 @@ def _best_of_rivals(
     """Return the solution with the smallest residuals among the first one and, if it is in doubt, its rivals.
 
     A solution is in doubt if its reversal in depth fits almost as well, if it leaves residuals beyond the
-    final tolerance, or if a photograph had to be dropped.
+    final tolerance, or if photographs had to be dropped and many are not oriented.
 
     Args:
         growth: network with the first solution.
@@ -224,7 +234,8 @@ def _best_of_rivals(
     found, first = [(growth, start)], growth.residuals_px()
     none_dropped = np.zeros(len(oriented), dtype=bool)
     other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
-    loose = bool((growth.tolerance_px > final_tolerance_px).any() or growth.dropped.any())
+    split = growth.dropped.any() and oriented.mean() < MOST
+    loose = bool((growth.tolerance_px > final_tolerance_px).any() or split)
     if not loose and not casts_doubt(first, other_side.residuals_px()):
         return growth, start
     rivals = [other_side]
