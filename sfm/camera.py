@@ -16,10 +16,14 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS, MODELS, WIDE_ANGLE, Role, number_of, observe
 from sfm.errors import SurveyFileError
-from sfm.kernels.compiling import compiled
+from sfm.kernels.compiling import compiled, inlined, kernel
 
-FIXED_POINT_STEPS = 100
+STEPS, HALVINGS = 100, 20  # of Newton's method, and of one of its steps
 PIXEL_TOLERANCE = 1e-10
+PLACES = 16  # between the axis and a ray at which the distortion is tested for a fold
+# Width of a ring, as a part of its radius, that is no fold: a zero of the denominator of `full_opencv` that
+# the numerator cancels, as it nearly does in many fits (a ring of 1e-5 of the radius in one to a mild lens).
+RING = 1e-3
 CURVATURE_STEP = 1e-3  # tangents, one or a few pixels
 # In tangents; the error of Newton's method after such a step is its square, or rounding.
 STEP_TOLERANCE = 1e-11
@@ -276,12 +280,15 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
         xy_px: pixel coordinates, shape (k, 2), px.
 
     Returns:
-        u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where the model has no inverse.
+        u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where no ray within the monotone range of
+        a model that distorts the ideal point has the pixel. Models that correct the measured point give a
+        ray to every pixel.
 
     Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera (`sfm.distortion`).
     """
     xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
-    return _tangents(camera.index, camera.linear_frame, camera.parameters, xy)
+    corrects = MODELS[camera.model].corrects
+    return _tangents(camera.index, camera.linear_frame, camera.parameters, corrects, xy)
 
 
 def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
@@ -292,10 +299,11 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
         uv: u = -U/W and v = -V/W (image axes, y up), shape (k, 2).
 
     Returns:
-        Pixel coordinates, shape (k, 2), px; NaN where the distortion folds over.
+        Pixel coordinates, shape (k, 2), px; NaN beyond the monotone range, where the distortion folds over.
     """
     rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
-    return _pixels(camera.index, camera.linear_frame, camera.parameters, rays)
+    corrects = MODELS[camera.model].corrects
+    return _pixels(camera.index, camera.linear_frame, camera.parameters, corrects, rays)
 
 
 def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -377,49 +385,170 @@ def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
 
 
 @compiled
-def _tangents(model: int, frame: FloatArray, p: FloatArray, xy: FloatArray) -> FloatArray:
-    """Return the tangents by Newton's method; one step is exact for correction models, linear in u and v."""
-    residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+def _tangents(model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: FloatArray) -> FloatArray:
+    """Return the tangents of pixels; correction models are linear in them, so that one step is exact."""
+    residual, J, Jp, at = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS)), np.empty(2)
     uv = np.empty_like(xy)
     for i in range(len(xy)):
-        u, v = 0.0, 0.0
-        solved = False
-        for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, xy[i, 0], xy[i, 1], u, v, residual, Ju, Jp)
-            det = Ju[0, 0] * Ju[1, 1] - Ju[0, 1] * Ju[1, 0]
-            du = (Ju[1, 1] * residual[0] - Ju[0, 1] * residual[1]) / det
-            dv = (Ju[0, 0] * residual[1] - Ju[1, 0] * residual[0]) / det
-            u -= du
-            v -= dv
-            if (
-                abs(du) + abs(dv) < STEP_TOLERANCE * (1.0 + abs(u) + abs(v))
-                or abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE
-            ):
-                solved = True
-                break
-        uv[i, 0] = u if solved else np.nan
-        uv[i, 1] = v if solved else np.nan
+        if corrects:
+            at[0] = at[1] = 0.0
+            observe(model, frame, p, xy[i, 0], xy[i, 1], 0.0, 0.0, residual, J, Jp)
+            _newton_step(residual, J, at)
+        else:
+            _solve(model, frame, p, False, xy[i], residual, J, Jp, at)
+        uv[i] = at
     return uv
 
 
 @compiled
-def _pixels(model: int, frame: FloatArray, p: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return the pixels by fixed-point iteration x <- x + residual(x), a contraction for usual distortion."""
-    residual, Ju, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+def _pixels(model: int, frame: FloatArray, p: FloatArray, corrects: bool, uv: FloatArray) -> FloatArray:
+    """Return the pixels of tangents; models that distort the ideal point give them directly."""
+    residual, J, Jp, at = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS)), np.empty(2)
     xy = np.empty_like(uv)
     for i in range(len(uv)):
-        x, y = frame[0], frame[1]
-        solved = False
-        for _ in range(FIXED_POINT_STEPS):
-            observe(model, frame, p, x, y, uv[i, 0], uv[i, 1], residual, Ju, Jp)
-            x += residual[0]
-            y += residual[1]
-            if abs(residual[0]) + abs(residual[1]) < PIXEL_TOLERANCE:
-                solved = True
-                break
-        xy[i, 0] = x if solved else np.nan
-        xy[i, 1] = y if solved else np.nan
+        if corrects:
+            _solve(model, frame, p, True, uv[i], residual, J, Jp, at)
+        elif _is_monotone(model, frame, p, uv[i], residual, J, Jp, at):
+            at[0], at[1] = frame[0], frame[1]
+            for _ in range(2):  # the second step removes the rounding of large coordinates
+                observe(model, frame, p, at[0], at[1], uv[i, 0], uv[i, 1], residual, J, Jp)
+                at += residual
+        else:
+            at[:] = np.nan
+        xy[i] = at
     return xy
+
+
+@kernel
+def _solve(
+    model: int, frame: FloatArray, p: FloatArray, corrects: bool, known: FloatArray,
+    residual: FloatArray, J: FloatArray, Jp: FloatArray, at: FloatArray,
+) -> None:  # fmt: skip
+    """Find the pixel of known tangents (correction models), or the tangents of a known pixel, in `at`.
+
+    Newton's method begins on the axis. Its steps are halved until they stay within the monotone range and
+    reduce the residual, so that it finds the only solution there; NaN if there is none.
+    """
+    x_axis, y_axis = _axis(frame, p, corrects)
+    at[0], at[1] = x_axis, y_axis
+    _linearise(model, frame, p, corrects, known, x_axis, y_axis, residual, J, Jp)
+    axis = J[0, 0], J[0, 1], J[1, 0], J[1, 1]
+    for _ in range(STEPS):
+        length = np.hypot(residual[0], residual[1])
+        before_x, before_y = at[0], at[1]
+        total = abs(residual[0]) + abs(residual[1])
+        _newton_step(residual, J, at)
+        dx, dy = at[0] - before_x, at[1] - before_y
+        near = STEP_TOLERANCE * (1.0 + abs(at[0]) + abs(at[1]))
+        if abs(dx) + abs(dy) < near or total < PIXEL_TOLERANCE:
+            return
+        accepted = False
+        for _ in range(HALVINGS):
+            at[0], at[1] = before_x + dx, before_y + dy
+            accepted = _stays_monotone(
+                model, frame, p, corrects, known, axis, before_x, before_y, at, residual, J, Jp
+            ) and (np.hypot(residual[0], residual[1]) < length)
+            if accepted:
+                break
+            dx, dy = dx / 2.0, dy / 2.0
+        if not accepted:
+            break
+    at[0] = at[1] = np.nan
+
+
+@kernel
+def _is_monotone(
+    model: int, frame: FloatArray, p: FloatArray, uv: FloatArray,
+    residual: FloatArray, J: FloatArray, Jp: FloatArray, at: FloatArray,
+) -> bool:  # fmt: skip
+    """Return whether the distortion of the ideal point is monotone from the axis to the tangents (u, v)."""
+    _linearise(model, frame, p, False, frame, 0.0, 0.0, residual, J, Jp)
+    axis = J[0, 0], J[0, 1], J[1, 0], J[1, 1]
+    left = np.hypot(uv[0], uv[1])
+    x, y, reached = 0.0, 0.0, 0.0
+    while reached < left:  # in steps that double, since rays near 90 degrees have large tangents
+        reached = min(2.0 * reached + 1.0, left)
+        at[0], at[1] = uv[0] * (reached / left), uv[1] * (reached / left)
+        if not _stays_monotone(model, frame, p, False, frame, axis, x, y, at, residual, J, Jp):
+            return False
+        x, y = at[0], at[1]
+    return bool(left < np.inf)
+
+
+@kernel
+def _stays_monotone(
+    model: int, frame: FloatArray, p: FloatArray, corrects: bool, known: FloatArray,
+    axis: tuple[float, float, float, float], x: float, y: float, at: FloatArray,
+    residual: FloatArray, J: FloatArray, Jp: FloatArray,
+) -> bool:  # fmt: skip
+    """Return whether the model is monotone from (x, y) to `at`; fill its residual and derivatives there.
+
+    It advances from place to place, and its derivatives keep the orientation that they have on the axis.
+    """
+    x_axis, y_axis = _axis(frame, p, corrects)
+    dx, dy = at[0] - x, at[1] - y
+    part = np.hypot(dx, dy) / np.hypot(at[0] - x_axis, at[1] - y_axis)
+    # without a bound a step back to the axis would be checked at any number of places
+    places = 1 + int(PLACES * min(part, 1.0))
+    xx, xy, yx, yy = axis
+    ahead_x, ahead_y = xx * dx + xy * dy, yx * dx + yy * dy
+    if places > 1:  # in a shorter step the advance may be less than rounding
+        _linearise(model, frame, p, corrects, known, x, y, residual, J, Jp)
+    for k in range(1, places + 1):
+        before = residual[0] * ahead_x + residual[1] * ahead_y
+        f = k / places
+        _linearise(model, frame, p, corrects, known, x + f * dx, y + f * dy, residual, J, Jp)
+        if k < places and not _has_orientation(J, axis):
+            f -= RING * f
+            _linearise(model, frame, p, corrects, known, x + f * dx, y + f * dy, residual, J, Jp)
+        advances = places == 1 or residual[0] * ahead_x + residual[1] * ahead_y > before
+        if not (advances and _has_orientation(J, axis)):
+            return False
+    return True
+
+
+@inlined
+def _has_orientation(J: FloatArray, axis: tuple[float, float, float, float]) -> bool:
+    """Return whether the inverse derivatives on the axis, times J, have positive determinant and trace."""
+    xx, xy, yx, yy = axis
+    orientation = xx * yy - xy * yx
+    determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) / orientation
+    trace = (yy * J[0, 0] - xy * J[1, 0] - yx * J[0, 1] + xx * J[1, 1]) / orientation
+    return determinant > 0.0 and trace > 0.0
+
+
+@kernel
+def _linearise(
+    model: int, frame: FloatArray, p: FloatArray, corrects: bool, known: FloatArray, x: float, y: float,
+    residual: FloatArray, J: FloatArray, Jp: FloatArray,
+) -> None:  # fmt: skip
+    """Fill the residual of the unknown (x, y) with the known, and its derivatives by the unknown.
+
+    Correction models move with the measured point as they do, with the opposite sign, with the principal
+    point, which is their second and third parameter.
+    """
+    if corrects:
+        observe(model, frame, p, x, y, known[0], known[1], residual, J, Jp)
+        for k in range(2):
+            J[k, 0], J[k, 1] = -Jp[k, 1] * frame[2], Jp[k, 2] * frame[3]
+    else:
+        observe(model, frame, p, known[0], known[1], x, y, residual, J, Jp)
+
+
+@inlined
+def _axis(frame: FloatArray, p: FloatArray, corrects: bool) -> tuple[float, float]:
+    """Return the unknown on the axis: the principal point (px) of correction models, else tangents of 0."""
+    if corrects:
+        return frame[0] + p[1] / frame[2], frame[1] - p[2] / frame[3]
+    return 0.0, 0.0
+
+
+@inlined
+def _newton_step(residual: FloatArray, J: FloatArray, at: FloatArray) -> None:
+    """Move `at` by a step of Newton's method."""
+    det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+    at[0] -= (J[1, 1] * residual[0] - J[0, 1] * residual[1]) / det
+    at[1] -= (J[0, 0] * residual[1] - J[1, 0] * residual[0]) / det
 
 
 def corner_shift(camera: Camera, s: int, sigma: float) -> float:

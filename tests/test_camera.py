@@ -17,7 +17,7 @@ from sfm.camera import (
     project,
     tangents_from_pixel,
 )
-from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, Parameter, Role, one_of
+from sfm.distortion.models import ALL, MAX_PARAMETERS, MODELS, Model, Parameter, Role, observe, one_of
 from sfm.errors import SurveyFileError
 from tests.synthetic import DISTORTION, FREE, PIXEL_MM, SIZE_PX, seed_of
 
@@ -108,6 +108,89 @@ def test_rays_and_pixels_are_inverse(model: str) -> None:
     xy = seed_of("inverse").uniform((0, 0), SIZE_PX, (200, 2))
     uv = tangents_from_pixel(camera, xy)
     assert np.abs(pixel_from_tangents(camera, uv) - xy).max() < 1e-9
+
+
+def strong_lens(model: str, rng: np.random.Generator) -> Camera:
+    """A lens whose distortion moves the corner by tens of percent, of either sign, with all other effects."""
+    c_mm, half = float(rng.uniform(4.0, 9.0)), np.hypot(*np.array(SIZE_PX) * PIXEL_MM) / 2
+    camera = camera_from_values("strong", model, SIZE_PX, PIXEL_MM, c_mm=c_mm)
+    reach = half if camera.in_mm else half / c_mm
+    p, powers = camera.parameters.copy(), {Role.RADIAL: 0, Role.DENOMINATOR: 0}
+    for s, parameter in enumerate(MODELS[model].parameters):
+        share, role = rng.uniform(-0.4, 0.4), parameter.role
+        if parameter.name in ("omega", "alpha", "beta"):
+            p[s] = {"omega": 0.9, "alpha": 0.5, "beta": 1.0}[parameter.name] * (1 + share)
+        elif role in powers:
+            powers[role] += 1
+            p[s] = share * (0.3 if role is Role.DENOMINATOR else 1.0) / reach ** (2 * powers[role])
+        elif role in (Role.DECENTRING, Role.PRISM):
+            p[s] = share / 20 / reach
+        elif role in (Role.AFFINITY, Role.SHEAR):
+            p[s] = share / 20
+        elif role in (Role.X0, Role.Y0):
+            p[s] += share * (0.3 if camera.in_mm else 30.0)
+    return camera.with_parameters(p)
+
+
+def edge(camera: Camera, towards: np.ndarray, far: float) -> float:
+    """Part of the way from the axis to `far` at which derivatives first lose the orientation of the axis."""
+    J, Jp, r = np.empty((2, 2)), np.empty((2, MAX_PARAMETERS)), np.empty(2)
+    corrects = MODELS[camera.model].corrects
+    axis = camera.principal_point_px - 0.5 if corrects else np.zeros(2)
+
+    def derivatives(at: np.ndarray) -> np.ndarray:
+        xy, uv = (at, np.zeros(2)) if corrects else (np.zeros(2), at)
+        observe(camera.index, camera.linear_frame, camera.parameters, *xy, *uv, r, J, Jp)
+        return np.array(Jp[:, 1:3] if corrects else J)
+
+    inverse = np.linalg.inv(derivatives(axis))
+    for part in np.linspace(0, 1, 101)[1:]:
+        turned = inverse @ derivatives(axis + part * far * towards)
+        if not (np.isfinite(turned).all() and np.linalg.det(turned) > 0 and np.trace(turned) > 0):
+            return float(part)
+    return np.inf
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rays_and_pixels_of_strong_lenses_are_inverse_up_to_the_fold_and_end_there(model: str) -> None:
+    rng = seed_of(f"strong {model}")
+    corrects = MODELS[model].corrects
+    back = 0
+    for _ in range(8):
+        camera = strong_lens(model, rng)
+        axis = camera.principal_point_px - 0.5 if corrects else np.zeros(2)
+        far = np.hypot(*SIZE_PX) * 0.7 if corrects else 2.0
+        for angle in rng.uniform(0, 2 * np.pi, 5):
+            towards = np.array([np.cos(angle), np.sin(angle)])
+            at = edge(camera, towards, far)
+            inside = axis + np.outer(rng.uniform(0.0, min(at - 0.02, 1.0), 5) * far, towards)
+            if corrects:
+                again = pixel_from_tangents(camera, tangents_from_pixel(camera, inside))
+            else:
+                again = tangents_from_pixel(camera, pixel_from_tangents(camera, inside))
+            assert again == pytest.approx(inside, abs=1e-9, rel=1e-9)
+            back += len(inside)
+            if at >= 0.95:
+                continue
+            beyond = axis + np.outer(rng.uniform(at + 0.02, 1.0, 5) * far, towards)
+            if corrects:  # their rays turn back; whatever has them is a pixel before the fold
+                again = pixel_from_tangents(camera, tangents_from_pixel(camera, beyond))
+                known = np.isfinite(again[:, 0])
+                reached = np.linalg.norm(again[known] - axis, axis=1)
+                assert (reached < (at + 0.02) * far).all()
+            else:
+                assert np.isnan(pixel_from_tangents(camera, beyond)).all()
+    assert back == 200
+
+
+@pytest.mark.parametrize("share", [0.25, 0.4, 0.7])
+def test_barrel_distortion_of_any_share_has_pixels_in_the_corners(share: float) -> None:
+    """A fixed-point iteration diverges where 3 K1 r^2 reaches 1, and with it a third of a wide lens."""
+    K1 = share / np.hypot(2.368, 1.776) ** 2
+    camera = camera_from_values("wide", "brown", (640, 480), (0.0074, 0.0074), c_mm=3.9, values=(("K1", K1),))
+    xy = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [320.0, 0.0]])
+    assert pixel_from_tangents(camera, tangents_from_pixel(camera, xy)) == pytest.approx(xy, abs=1e-9)
+    assert np.isfinite(corner_shift(camera, 3, 1e-4))
 
 
 def test_rays_are_found_where_a_model_is_badly_conditioned() -> None:

@@ -1,7 +1,8 @@
 """Choice of free interior parameters where the survey states none: those that its network determines.
 
 A lens that is held at nominal values bends the network. Parameters that a network does not determine cost
-precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2. The worst determined parameter
+precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2, and on calibration plates also
+P1, P2 and b1, which otherwise bias c and the principal point. The worst determined parameter
 is held, one after the other, until the network determines all the others better than they are known of any
 camera. Then the test of held parameters frees others that the image points demand. Three photographs fit many
 values of c, each with another shape of the object. For three photographs c is therefore an observation, with
@@ -26,6 +27,7 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.inputs.calibration import plate_family
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
@@ -38,7 +40,9 @@ C_SIGMA = 0.1
 RATIO_SIGMA = 1e-3  # sigma of the ratio of two focal lengths, which is the ratio of the sides of a pixel
 MIN_RAYS, MIN_IMAGE_POINTS = 2, 4  # needed by a point, and by a photograph, to take part in the decision
 ROUNDS = 3  # of the test of held parameters
-FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")  # order of holding if precision does not decide
+# Order of holding if precision does not decide; the others follow from the last of the model to the first.
+FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")
+OF_PLATES = (Role.DECENTRING, Role.AFFINITY)  # roles of further candidates on calibration plates
 
 Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey states them
 
@@ -71,7 +75,9 @@ def choose_free_parameters(
     silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
-    names: Chosen = [set(one.may_be_free) if a in silent else None for a, one in enumerate(survey.cameras)]
+    names: Chosen = [
+        _candidates(survey, one) if a in silent else None for a, one in enumerate(survey.cameras)
+    ]
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
     images, points = select_supported(
@@ -113,6 +119,12 @@ def choose_free_parameters(
         for one in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
     return FreeParameters(cameras, _with_free(estimate, names), tuple(remarks))
+
+
+def _candidates(survey: Survey, settings: CameraSettings) -> set[str]:
+    """Return the parameters of a camera that may be free."""
+    further = MODELS[settings.model].names_of(*OF_PLATES) if plate_family(survey.targets) is not None else ()
+    return {*settings.may_be_free, *further}
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:
@@ -174,7 +186,8 @@ def _hold_undetermined(
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
-            for name in sorted((one for one in chosen or () if (a, index(one)) not in observed), key=_rank):
+            free = [one for one in chosen or () if (a, index(one)) not in observed]
+            for name in sorted(free, key=lambda one: (_rank(one), -index(one))):
                 now = np.inf if adjusted is None else _corner_shift(adjusted, a, name)
                 if now > reach:
                     worst, reach = (a, name), now

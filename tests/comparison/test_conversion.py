@@ -81,6 +81,23 @@ def test_stated_misfit_is_what_an_independent_grid_finds(model: str) -> None:
     assert np.hypot(*found.T).max() <= converted.max_px * 1.01
 
 
+@pytest.mark.parametrize("share", [0.05, 0.15, 0.24, 0.35])
+def test_a_fraction_fitted_to_a_lens_has_no_pole_in_the_photograph(share: float) -> None:
+    """A common factor of numerator and denominator is to spare; its zero would have no pixel around it."""
+    K1, K2 = 0.96 * share / 8.8, 0.04 * share / 8.8**2
+    lens = camera_from_values(
+        "right", "brown", (640, 480), (0.0074, 0.0074), c_mm=3.95,
+        values=(("x0", 0.05), ("K1", K1), ("K2", K2), ("P1", -7e-5), ("P2", -3e-4), ("b1", -6e-4)),
+    )  # fmt: skip
+    converted = convert_camera(lens, "full_opencv")
+    p = dict(zip(converted.camera.names, converted.camera.parameters, strict=True))
+    poles = np.roots([p["k6"], p["k5"], p["k4"], 1.0])
+    corner = (tangents_from_pixel(lens, np.array([[0.0, 0.0], [639.0, 479.0]])) ** 2).sum(axis=1).max()
+    real = poles[np.abs(poles.imag) < 1e-12].real
+    assert not ((real > 0) & (real < corner)).any()
+    assert converted.rms_px < 0.2
+
+
 def test_series_alone_gives_the_signs() -> None:
     """On a weak lens the neglected terms vanish: 10 px of distortion leave less than 0.1 px."""
     weak = camera_from_values(

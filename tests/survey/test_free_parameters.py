@@ -15,6 +15,7 @@ from sfm.conventions import FloatArray
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
 from sfm.survey.inputs.cameras import split_cameras
+from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -92,6 +93,21 @@ def test_a_point_whose_ray_is_rejected_holds_no_camera(given: bool) -> None:
         wrong = replace(wrong, control=ObjectPoints(np.array([7]), truth.points[7:8], np.zeros((1, 3, 3))))
     free = chosen(wrong, truth, extend=False).cameras[0].free
     assert free == chosen(network, truth, extend=False).cameras[0].free != ()
+
+
+@pytest.mark.parametrize("model", ["brown", "opencv"])
+def test_on_a_plate_decentring_and_affinity_are_candidates(model: str) -> None:
+    """As in a draft of a plate; without a plate they are freed only where the residuals demand them."""
+    network, truth = make_network(seed_of("plate"), images=14, points=54, planar=True, model=model)
+    camera = CameraSetup(name="a", images="*.jpg", model=model)
+    names = {"brown": {"P1", "P2", "b1"}, "opencv": {"p1", "p2"}}[model]
+    targets = TargetSettings(codes="checkerboard", rows=6, columns=9, pitch=30.0)
+    for survey, expected in (
+        (Survey(name="s", cameras=(camera,), targets=targets), names),
+        (Survey(name="s", cameras=(camera,)), set()),
+    ):
+        found = choose_free_parameters(survey, network, truth, extend=False)
+        assert set(found.cameras[0].free) & names == expected
 
 
 def test_what_a_network_does_not_determine_is_held() -> None:
