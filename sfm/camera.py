@@ -514,7 +514,7 @@ def _has_orientation(J: FloatArray, axis: tuple[float, float, float, float]) -> 
     orientation = xx * yy - xy * yx
     determinant = (J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]) / orientation
     trace = (yy * J[0, 0] - xy * J[1, 0] - yx * J[0, 1] + xx * J[1, 1]) / orientation
-    return determinant > 0.0 and trace > 0.0
+    return bool(determinant > 0.0 and trace > 0.0)
 
 
 @kernel

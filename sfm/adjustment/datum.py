@@ -379,6 +379,9 @@ def with_further(
         equations: normal equations with these null vectors.
         layout: order of the unknowns.
         datum: kind and sound points; constraints on points are inner ones, except in a minimal datum.
+
+    Raises:
+        GeometryError: unknowns have become so large that their squares overflow.
     """
     if further.shape[1] == 0 and not equations.blocks.held.any():
         return motions
@@ -402,7 +405,12 @@ def with_further(
     on_reduced[:, carried:] = N[:, carried:] / scale**2
     on_points[..., :carried] /= np.sqrt((on_points[..., :carried] ** 2).sum(axis=(0, 1)))
     # N meets the constraints on the motions, so B'H of all columns is block triangular
-    inverse = np.linalg.inv(_product(on_points, on_reduced, moved, N))
+    try:
+        inverse = np.linalg.inv(_product(on_points, on_reduced, moved, N))
+    except np.linalg.LinAlgError:
+        raise GeometryError(
+            "datum: the network has diverged, and nothing fixes what it leaves open"
+        ) from None
     across = _product(on_points, on_reduced, motions.points, motions.reduced)
     d, e = len(motions.inverse), len(inverse)
     whole = np.zeros((d + e, d + e))

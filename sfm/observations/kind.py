@@ -304,9 +304,11 @@ def is_observed(variance: FloatArray) -> BoolArray:
 def inverse_of_observed(covariance: FloatArray) -> FloatArray:
     """Return the inverse covariances of the observed components, 0 elsewhere, (n, d, d)."""
     weight = np.zeros(covariance.shape)
-    for p, Q in enumerate(covariance):
-        on = is_observed(np.diagonal(Q))
-        weight[p][np.ix_(on, on)] = np.linalg.inv(Q[np.ix_(on, on)])
+    on = is_observed(np.diagonal(covariance, axis1=1, axis2=2))
+    for components in np.unique(on, axis=0):
+        rows = np.flatnonzero((on == components).all(axis=1))
+        at = np.ix_(rows, components, components)
+        weight[at] = np.linalg.inv(covariance[at])
     return weight
 
 

@@ -199,7 +199,8 @@ def predict_network(
 
     Raises:
         GeometryError: no photograph or point can be determined, for example with all photographs from one
-            position; a bar has an unknown point; or points are off a line that is observed.
+            position; a camera of a rig sees nothing; a bar has an unknown point; or points are off a line
+            that is observed.
 
     Source: Grafarend (1974), Boll. Geod. Sci. Affini 33 (zero- and first-order design); Fraser (1984).
     """
@@ -211,6 +212,12 @@ def predict_network(
         raise GeometryError(
             f"plan: {len(photographs)} of {len(stations)} photographs show {MIN_POINTS} or more points that "
             "two of them share, needed 2 photographs: see distance, incidence and depth of field"
+        )
+    blind = np.setdiff1d(stations.camera, stations.camera[photographs])
+    if len(blind):
+        raise GeometryError(
+            f"plan: camera {cameras[blind[0]].name} shows no points that another photograph shows; see the "
+            "angles of its mount"
         )
     place = np.full(len(planned.names), -1, dtype=np.int64)
     place[points] = np.arange(len(points))

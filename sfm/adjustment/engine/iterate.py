@@ -247,19 +247,19 @@ def _solve(
         return None
     try:
         motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.blocks.held))
-    except GeometryError:  # the datum points have moved together during the iteration
+        if last is not None:
+            found = _step(p, equations, last, motions)
+            if found.within(tolerance):
+                return found
+        for coarse in (True, False) if single else (False,):
+            factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
+            if factored is None:
+                continue
+            found = _step(p, equations, factored, motions)
+            if not (coarse and found.within(SINGLE_TOLERANCE)):
+                return found
+    except GeometryError:  # the datum points have moved together, or the network has diverged
         return None
-    if last is not None:
-        found = _step(p, equations, last, motions)
-        if found.within(tolerance):
-            return found
-    for coarse in (True, False) if single else (False,):
-        factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
-        if factored is None:
-            continue
-        found = _step(p, equations, factored, motions)
-        if not (coarse and found.within(SINGLE_TOLERANCE)):
-            return found
     return None
 
 

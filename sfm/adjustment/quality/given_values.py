@@ -139,6 +139,21 @@ class Kept:
         coordinate = int(on.sum()) * self._sf(largest, 1) if on.any() else np.inf
         return min(1.0, 3 * together, 3 * single, 3 * coordinate)
 
+    def may_fit(self, level: float, fall: float, rank: int) -> bool:
+        """Return whether the test of all differences together lets them fit after a decrease of chi-square.
+
+        It is a part of `probability` that needs no further inverse.
+
+        Args:
+            level: probability that correct values are rejected.
+            fall: decrease of chi-square.
+            rank: decrease of its degrees of freedom, less than `dof`.
+        """
+        if self.model.estimated:
+            return True
+        together = 3 * self._sf(max(self.chi2 - fall, 0.0), self.dof - rank)
+        return together >= level * (1 - RANK)  # up to rounding
+
     def _sf(self, chi2: float, dof: int) -> float:
         """Return the probability of a larger chi-square, whose network part has an estimated variance factor.
 
@@ -237,8 +252,8 @@ class GivenModel:
             level: probability that correct values are rejected.
             without: values left out.
         """
-        fits = self.kept(without).probability() >= level
-        return fits and (not self.estimated or self.at_worst.kept(without).probability() >= level)
+        at_worst = self.at_worst.kept(without) if self.estimated else None
+        return _fits(self.kept(without), at_worst, level)
 
     def confirms_rest(self, out: tuple[int, ...]) -> bool:
         """Return whether the values without some confirm one another.
@@ -315,6 +330,12 @@ class GivenModel:
         return float(tried[best]), float((z2 / start).sum() - cost[best])
 
 
+def _fits(kept: Kept, at_worst: Kept | None, level: float) -> bool:
+    """Return whether values fit, and, with standard deviations that are unknown, with the largest too."""
+    fits = kept.probability() >= level
+    return fits and (at_worst is None or at_worst.probability() >= level)
+
+
 @dataclass(frozen=True)
 class Judgement:
     """The errors found in given values, if any."""
@@ -376,7 +397,8 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         gain = -np.inf
     of_wrong, of_factor = np.inf, cost - gain
     if removed is not None:  # errors of values without standard deviations count as scatter
-        of_wrong = _score(model, removed.values, scatter=not model.stated.any())
+        kept = model.kept(removed.values)
+        of_wrong = _score(model, removed.values, kept, scatter=not model.stated.any())
     if min(of_wrong, of_factor) >= 0:
         some = _suspects(model, level)
         return replace(found, doubtful=some, one_wrong=_one_is_wrong(model, some))
@@ -410,7 +432,7 @@ def misfit_of(model: GivenModel, found: Judgement) -> float:
         return model.at_worst.kept().chi2 if model.estimated else found.misfit
     model = model.at_worst if model.estimated else model
     others = model.part(~np.isin(model.item, found.wrong)).kept().chi2
-    return others + _cost_of(model, found.wrong)
+    return others + _cost_of(model, found.wrong, model.kept(found.wrong))
 
 
 @dataclass(frozen=True)
@@ -441,25 +463,26 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
             kept = model.kept(out)
         if kept.dof < 1:
             break
-        found.append(WrongValues(out, _score(model, out)))
+        found.append(WrongValues(out, _score(model, out, kept)))
     return tuple(found)
 
 
-def _score(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
+def _score(model: GivenModel, out: tuple[int, ...], kept: Kept, *, scatter: bool = True) -> float:
     """Return the change of -2 ln likelihood without some values, plus the cost of their errors and choice."""
-    return _cost_of(model, out, scatter=scatter) - (model.kept().chi2 - model.kept(out).chi2)
+    return _cost_of(model, out, kept, scatter=scatter) - (model.kept().chi2 - kept.chi2)
 
 
-def _cost_of(model: GivenModel, out: tuple[int, ...], *, scatter: bool = True) -> float:
+def _cost_of(model: GivenModel, out: tuple[int, ...], kept: Kept, *, scatter: bool = True) -> float:
     """Return the cost of the errors of some values and of their choice.
 
     Args:
         model: model of all values.
         out: wrong values.
+        kept: the differences without them.
         scatter: whether their errors have one distribution, as with a factor; otherwise each error is a
             separate parameter.
     """
-    every, kept, m = model.kept(), model.kept(out), len(model.v)
+    every, m = model.kept(), len(model.v)
     q = every.dof - kept.dof
     of_errors = cost_of_scatter(q, every.chi2 - kept.chi2, m) if scatter else q * cost_of_parameter(m)
     return of_errors + 2 * log(comb(model.items, len(out)))
@@ -488,8 +511,9 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     these are not more likely by the margin, either part may be wrong.
     """
     kept = model.kept()
+    at_worst = model.at_worst.kept() if model.estimated else None
     out: tuple[int, ...] = ()
-    while out == () or not model.fits(level, out):
+    while out == () or not _fits(kept, at_worst, level):
         if 2 * (len(out) + 1) >= model.items:
             return None
         fall, rank = kept.decreases()
@@ -497,6 +521,7 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
         gain[list(out)] = -np.inf
         out = (*out, int(np.argmax(gain)))
         kept = kept.without(out[-1])
+        at_worst = None if at_worst is None else at_worst.without(out[-1])
         if kept.dof < 1:
             return None
     misfit = dict(_misfits_like(model, out))
@@ -506,7 +531,7 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     rest, others = model.kept(out), model.part(np.isin(model.item, out)).kept()
     if others.dof > 0 and others.chi2 - rest.chi2 < cost * (others.dof - rest.dof) + MARGIN:
         like = set(range(model.items))
-    return WrongValues(out, _score(model, out), tuple(sorted(like - set(out))))
+    return WrongValues(out, _score(model, out, rest), tuple(sorted(like - set(out))))
 
 
 def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], float]]:
@@ -515,19 +540,49 @@ def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tup
     These are all sets, or, if there are too many, those that differ in one value.
     """
     k, items = len(out), range(model.items)
-    every = comb(len(items), k) <= MAX_SETS
-    for others in combinations(items, k - 1) if every else combinations(sorted(out), k - 1):
-        kept = model.kept(others)
+    left_out: Iterator[tuple[tuple[int, ...], Kept]]
+    if comb(len(items), k) <= MAX_SETS:
+        left_out = ((others, model.kept(others)) for others in combinations(items, k - 1))
+    else:
+        left_out = _each_but_one(model.kept(), (), tuple(sorted(out)))
+    for others, kept in left_out:
         fall, rank = kept.decreases()
         for one in items:
             if one not in others and rank[one] < kept.dof:
                 yield tuple(sorted((*others, one))), kept.chi2 - float(fall[one])
 
 
+def _each_but_one(
+    kept: Kept, without: tuple[int, ...], some: tuple[int, ...]
+) -> Iterator[tuple[tuple[int, ...], Kept]]:
+    """Yield the differences without all but one of some values, for each of them, in n ln n updates.
+
+    Args:
+        kept: the differences without the values `without`.
+        without: values left out already.
+        some: further values, one or more.
+    """
+    if len(some) == 1:
+        yield without, kept
+        return
+    half = len(some) // 2
+    for stay, go in ((some[half:], some[:half]), (some[:half], some[half:])):
+        rest = kept
+        for value in go:
+            rest = rest.without(value)
+        yield from _each_but_one(rest, (*without, *go), stay)
+
+
 def _suspects(model: GivenModel, level: float) -> tuple[int, ...]:
     """Return the values that may be wrong: those without which the others fit, otherwise all."""
-    each = [(one, model.kept((one,))) for one in range(model.items)]
-    alone = [one for one, kept in each if kept.dof > 0 and model.fits(level, (one,))]
+    every = model.kept()
+    fall, rank = every.decreases()
+    alone = [
+        one
+        for one in range(model.items)
+        if rank[one] < every.dof and every.may_fit(level, float(fall[one]), int(rank[one]))
+        if model.fits(level, (one,))
+    ]
     return tuple(alone) if len(alone) > 1 else tuple(range(model.items))
 
 

@@ -20,11 +20,10 @@ from sfm.observations.pose import MountObservations
 from sfm.survey.inputs.given import (
     ANGLES,
     AXES,
-    MAX_EXTENT_PER_SIGMA,
-    MIN_SIGMA,
     SIGMAS_OF_ANGLES,
     SIGMAS_OF_AXES,
     columns_of,
+    refuse_tiny_sigmas,
 )
 from sfm.survey.inputs.settings import RigSettings
 
@@ -193,14 +192,8 @@ def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) ->
     table.refuse(sigma, sigma < 0, columns, "0 (fixed) or more")
     known = value[np.isfinite(value[:, :3]).all(axis=1), :3]
     extent = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
-    least = np.array([max(MIN_SIGMA, extent / MAX_EXTENT_PER_SIGMA)] * 3 + [MIN_SIGMA] * 3)
-    table.refuse(
-        sigma,
-        (sigma > 0) & (sigma < least),
-        columns,
-        f"at least {least[0]:.3g} (of angles {MIN_SIGMA:g} deg), or 0 for a fixed value: coordinates and "
-        "sigmas are in the object unit, angles in degrees",
-    )
+    of_angles = "; angles in degrees, 0 for a fixed value"
+    refuse_tiny_sigmas(table, sigma, columns, np.repeat([extent, 0.0], 3), or_else=of_angles)
     angles = value[:, 3:]
     table.refuse(angles, np.abs(angles) > FULL_TURN, ANGLES, f"degrees, at most {FULL_TURN:g}")
     fixed = sigma[:, 3:] == 0

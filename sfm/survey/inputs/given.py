@@ -20,7 +20,7 @@ from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header,
 from sfm.reduced_network import CORRELATION_LIMIT, possible_covariances
 
 MIN_SIGMA = 1e-9  # less than an atom in any unit used here
-MAX_EXTENT_PER_SIGMA = 1e6  # no control is known to better than a millionth of its extent
+MAX_EXTENT_PER_SIGMA = 1e6  # no length or position is known to better than a millionth of its extent
 CHECKS = ("checkX", "checkY", "checkZ")  # of control: 1 for a coordinate that is only a check
 COVARIANCES = ("cXY", "cXZ", "cYZ")  # of control, object unit^2
 AXES, ANGLES = ("X", "Y", "Z"), ("omega_deg", "phi_deg", "kappa_deg")
@@ -232,6 +232,27 @@ def read_control(path: Path) -> KnownPoints:
     return _known_points(table, len(covariances))
 
 
+def refuse_tiny_sigmas(
+    table: CsvTable, sigma: FloatArray, columns: tuple[str, ...], size: FloatArray, *, or_else: str = ""
+) -> None:
+    """Raise SurveyFileError for a standard deviation that no measurement has.
+
+    Args:
+        table: table of the standard deviations.
+        sigma: standard deviations, in the units of the table, those of 0 are left to the caller, (n, d).
+        columns: names of their columns.
+        size: lengths, or extents of positions, that the standard deviations belong to, in the unit of the
+            table; 0 for angles, (n, d) or (d,).
+        or_else: what may be given in place of a standard deviation, for the error message.
+    """
+    least = np.broadcast_to(np.maximum(MIN_SIGMA, np.abs(size) / MAX_EXTENT_PER_SIGMA), sigma.shape)
+    tiny: BoolArray = (sigma > 0) & (sigma < least)
+    for k, c in np.argwhere(tiny)[:1]:
+        of = ", a millionth of the length or extent" if least[k, c] > MIN_SIGMA else ""
+        needed = f"at least {least[k, c]:.3g}{of}: values and sigmas in one unit{or_else}"
+        table.refuse(sigma, tiny, columns, needed)
+
+
 def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
     """Return the points of a table that may have sigmas, `covariances` columns of covariances, and checks."""
     xyz, sigma, mixed, check = np.split(table.values, (3, 6, 6 + covariances), axis=1)
@@ -245,13 +266,7 @@ def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
     sigma = np.where(unknown, np.inf, sigma)
     table.refuse(sigma, sigma < 0, SIGMAS_OF_AXES, "0 (fixed) or more")
     extent = max(float(np.ptp(axis[np.isfinite(axis)])) for axis in xyz.T if np.isfinite(axis).any())
-    table.refuse(
-        sigma,
-        (sigma > 0) & (sigma * MAX_EXTENT_PER_SIGMA < extent),
-        SIGMAS_OF_AXES,
-        f"at least a millionth of the extent of the points, {extent:g}: coordinates and sigmas in one unit; "
-        "0 for a fixed coordinate",
-    )
+    refuse_tiny_sigmas(table, sigma, SIGMAS_OF_AXES, np.full(3, extent), or_else="; 0 for a fixed coordinate")
     check = np.nan_to_num(check) if check.size else np.zeros_like(xyz)
     table.refuse(check, (check != 0) & (check != 1), CHECKS, "0, 1 or nothing")
     table.refuse(check, (check == 1) & unknown, CHECKS, "0 or nothing for a coordinate that is not known")
