@@ -73,6 +73,7 @@ class Refit:
     shift: float  # largest change of a coordinate, in standard deviations stated without the alternative
     rms: float  # root mean square of these changes
     before: tuple[FloatArray, ...] = ()  # parameters of the earlier alternatives
+    finished: bool = True  # whether the rounds ended before the largest number of adjustments
 
 
 def refit(
@@ -80,6 +81,8 @@ def refit(
     one: Alternative,
     start: Adjustment,
     before: Sequence[tuple[Alternative, FloatArray]] = (),
+    *,
+    most: int = ROUNDS * HALVINGS,
 ) -> Refit | None:
     """Adjust with an alternative; None if the adjustment does not converge.
 
@@ -88,17 +91,20 @@ def refit(
         one: the alternative.
         start: adjustment to start from, of image points without the effect of earlier alternatives.
         before: earlier alternatives with their parameters, which are adjusted jointly.
+        most: number of adjustments after which no further round begins.
     """
     every = (*(other for other, _ in before), one)
     ends = np.cumsum([0, *(len(beta) for _, beta in before), len(one.gain.beta)])
     beta = np.concatenate([*(beta for _, beta in before), one.gain.beta])
     current, step = start, np.concatenate([np.zeros(int(ends[-2])), one.gain.beta])
     D = _side_by_side(every, current, columns_of(current))
+    taken, finished = 0, True
     for number in range(ROUNDS):
         found = _stepped(plain, D, current, beta - step, step)
         if found is None:
             return None
-        current, beta = found
+        current, beta, adjustments = found
+        taken += adjustments
         columns = columns_of(current)
         D = _side_by_side(every, current, columns)
         try:
@@ -106,23 +112,23 @@ def refit(
         except np.linalg.LinAlgError:
             return None
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
-        if gain.value < LAST_GAIN or number == ROUNDS - 1:
+        finished = gain.value < LAST_GAIN or number == ROUNDS - 1
+        if finished or taken >= most:
             break
         step = gain.beta
         beta = beta + step
     gained = log_likelihood(current) - log_likelihood(start)
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
-    return Refit(
-        *(current, parts[-1], gained, *shifts_of(plain, start, current, one, parts[-1])), tuple(parts[:-1])
-    )
+    shift, rms = shifts_of(plain, start, current, one, parts[-1])
+    return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
 
 
 def _stepped(
     plain: Adjustment, D: FloatArray, start: Adjustment, beta: FloatArray, step: FloatArray
-) -> tuple[Adjustment, FloatArray] | None:
-    """Return the adjustment after a step of the parameters, halved while v'Pv grows, and the parameters."""
+) -> tuple[Adjustment, FloatArray, int] | None:
+    """Return the adjustment after a step, halved while v'Pv grows, the parameters, and how many it took."""
     xy, best = plain.network.image_points.xy, None
-    for _ in range(HALVINGS):
+    for taken in range(1, HALVINGS + 1):
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
         try:
             found = adjust(
@@ -140,10 +146,10 @@ def _stepped(
         if found is not None and found.converged:
             found = replace(found, error_correlation=plain.error_correlation)  # the best known one
             if log_likelihood(found) > log_likelihood(start) - LAST_GAIN:
-                return found, beta + step
+                return found, beta + step, taken
             best = best or (found, beta + step)
         step = step / 2
-    return best
+    return None if best is None else (*best, HALVINGS)
 
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
