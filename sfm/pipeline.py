@@ -13,6 +13,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.orientation.incremental.sequence import Orientation
@@ -57,26 +60,37 @@ def run_survey(
         KolinearError: the survey cannot be run; the message states the remedy.
     """
     clock = StageClock(progress)
-    with _with_survey_name(survey), own_threads(jobs):
+    reached: list[str] = []
+    with _stating_progress(survey, reached), own_threads(jobs):
         survey, measured = _measure(survey, images_dir, jobs, store, clock)
-        survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock)
+        survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock, reached)
         copies = find_copies(solution.adjustment)
         if copies:
             measured = without_copies(measured, copies)
-            survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock)
+            survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock, reached)
         compared = compare_solution(solution, others, clock, files=measured.files)
         return assemble_result(survey, measured, start, matched, solution, compared, clock)
 
 
 def _solve(
-    survey: Survey, measured: Measurements, jobs: int, clock: StageClock
+    survey: Survey, measured: Measurements, jobs: int, clock: StageClock, reached: list[str]
 ) -> tuple[Survey, Measurements, Orientation, Correspondences, SolvedSurvey]:
-    """Orient, match and adjust the image points; orientation may change the survey and the image points."""
+    """Orient, match and adjust the image points; orientation may change the survey and the image points.
+
+    `reached` receives what each stage reached, for the message of a stage that cannot go on.
+    """
+    network = measured.network
+    seen = len(np.unique(network.image_points.image))
+    measured_points = counted(len(network.image_points), "image point")
+    reached[:] = [f"{measured_points} in {seen} of {counted(len(network.images), 'photograph')}"]
     with clock.stage("orientation"):
         survey, measured, start = orient_with_models(survey, measured)
         measured, start = agree_on_turns(survey, measured, start)
+    oriented = f"{start.estimate.oriented.sum()} of {len(start.estimate.oriented)} photographs oriented"
+    reached.append(f"{oriented}, {counted(int(start.estimate.determined.sum()), 'object point')}")
     with clock.stage("matching"):
         matched = find_correspondences(survey, measured, start, jobs=jobs)
+    reached.append(f"{counted(len(matched.network.image_points), 'image point')} matched")
     with clock.stage("adjustment"):
         solution = solve_survey(survey, matched)
     return survey, measured, start, matched, solution
@@ -111,9 +125,10 @@ def _measure(
 
 
 @contextmanager
-def _with_survey_name(survey: Survey) -> Iterator[None]:
-    """Add the name of the survey to the message of a GeometryError."""
+def _stating_progress(survey: Survey, reached: list[str]) -> Iterator[None]:
+    """Add to the message of a GeometryError the name of the survey, and how far the survey came."""
     try:
         yield
     except GeometryError as error:
-        raise GeometryError(f"survey {survey.name}: {error}") from error
+        so_far = f"; reached before: {'; '.join(reached)}" if len(reached) > 1 else ""
+        raise GeometryError(f"survey {survey.name}: {error}{so_far}") from error

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from sfm.adjustment.datum import Datum, ResolvedDatum, motions_of
+from sfm.adjustment.datum import Datum, ResolvedDatum, motions_of, without_far_points
 from sfm.adjustment.engine.cofactors import (
     MAX_FIXED_VARIANCE,
     Cofactors,
@@ -207,7 +207,7 @@ def marginal_of(adjustment: Adjustment, *, datum: Datum | None = None, cross: bo
     use_control = adjustment.datum == "control"
     resolved = ResolvedDatum(adjustment.datum, adjustment.datum_points)
     if datum is not None:
-        resolved = datum.resolve(adjustment.network)
+        resolved = _resolved(datum, adjustment)
     if (resolved.kind == "control") != use_control:
         raise GeometryError(
             "datum: adding or removing control is another adjustment, not an S-transformation"
@@ -255,8 +255,13 @@ def change_datum(adjustment: Adjustment, datum: Datum | str) -> Adjustment:
     with own_threads():
         m = marginal_of(adjustment, datum=datum, cross=False)
         changed = _with_covariance(m)
-    kind, points = datum.resolve(adjustment.network)
+    kind, points = _resolved(datum, adjustment)
     return replace(changed, datum=kind, datum_points=points)
+
+
+def _resolved(datum: Datum, adjustment: Adjustment) -> ResolvedDatum:
+    """Return a datum on the points of an adjustment."""
+    return without_far_points(datum.resolve(adjustment.network), adjustment.estimate.points)
 
 
 @checked_arguments()

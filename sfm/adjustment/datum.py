@@ -13,7 +13,8 @@ points, it is fixed by an inner constraint on the scaled reduced unknowns. The r
 depend on how the solver held the null vectors.
 
 A point without accepted rays, or with parallel rays, carries no datum. Its open directions keep their values,
-whatever the rest of the network does.
+whatever the rest of the network does. A point far behind all others, which its rays hardly place, does not
+carry it either, unless the caller names it.
 
 Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 4.4.3; Baarda (1973), S-transformations and
 criterion matrices; Papo and Perelmuter (1980); Foerstner and Wrobel (2016), sec. 4.5.
@@ -47,6 +48,9 @@ TINY = float(np.finfo(float).tiny)
 SCALE_OPEN = 1e-3  # share of the scale in an open motion; it is 0 or 1 except for rounding
 MIN_EFFECT = 1e-9  # relative effect on an observed unknown above which it takes part in the datum
 KINDS = ("free", "minimal", "control")
+# Median distances from the middle of the points beyond which a point carries no datum. Two points 1,000 of
+# them behind 40 others, seen from a base of 2, made the others 2,000 times less precise.
+FAR = 300.0
 
 
 class ResolvedDatum(NamedTuple):
@@ -115,6 +119,23 @@ class Datum:
         return ResolvedDatum(self.kind, mask)
 
 
+def without_far_points(datum: ResolvedDatum, points: FloatArray) -> ResolvedDatum:
+    """Return the datum without points far behind all others; unchanged if points are named, or none is far.
+
+    Args:
+        datum: kind and points.
+        points: coordinates of all object points, NaN for unknown ones, (n, 3).
+    """
+    if datum.points is not None:
+        return datum
+    known = np.isfinite(points).all(axis=1)
+    if known.sum() < 2 * MIN_CARRIERS:
+        return datum
+    away = np.abs(points - np.median(points[known], axis=0)).max(axis=1)
+    near = np.asarray(away <= FAR * np.median(away[known]))
+    return datum if near[known].all() else datum._replace(points=near)
+
+
 @dataclass(frozen=True)
 class Motions:
     """Null vectors H of the normal equations and datum constraints B, split like the unknowns.
@@ -176,13 +197,25 @@ def motions_of(
     Raises:
         GeometryError: the chosen datum points cannot carry the datum.
     """
-    poses, mounts, points = free_motions(layout, state)
+    try:
+        return _motions_of(layout, observed, state, datum, layout.point_on)
+    except GeometryError:
+        if datum.points is None:
+            raise
+    return _motions_of(layout, observed, state, datum, layout.point_on & datum.points)  # others may be far
+
+
+def _motions_of(
+    layout: Unknowns, observed: tuple[ObservedKind, ...], state: State, datum: ResolvedDatum, cloud: BoolArray
+) -> Motions:
+    """Return the motions, with rotations and scale about the points of a cloud, (n,)."""
+    poses, mounts, points = free_motions(layout, state, cloud)
     H = np.zeros((layout.reduced, 7))
     H[: layout.pose_free.size] = poses.reshape(-1, 7)
     mounted = layout.mount_column >= 0
     H[layout.mount_column[mounted]] = mounts[mounted]
     H[layout.kept_start :] = points[layout.kept].reshape(-1, 7)
-    seen = _seen_by_datum(layout, observed, state, H, mounts[~mounted & layout.rigged], points)
+    seen = _seen_by_datum(layout, observed, state, H, mounts[~mounted & layout.rigged], points, cloud)
     if len(seen):
         # without the full U, which would have a column for every row, three per control point
         _, singular, Vt = np.linalg.svd(seen, full_matrices=len(seen) < 7)
@@ -231,7 +264,9 @@ def carriers(layout: Unknowns, datum: ResolvedDatum) -> BoolArray:
     return free if datum.points is None else free & datum.points
 
 
-def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+def free_motions(
+    layout: Unknowns, state: State, cloud: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the seven similarity motions as changes of poses, mounts and points.
 
     Rotations and scale refer to the centre of the network and are divided by its size, so that all seven
@@ -240,11 +275,12 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     Args:
         layout: order of the unknowns.
         state: values at which the motions are evaluated.
+        cloud: points whose centre and size these are, (n,); all that are adjusted if not given.
 
     Returns:
         Changes of X, w of poses (poses, 6, 7), of X, w of mounts (a, 6, 7), and of X of points (n, 3, 7).
     """
-    centre, size = _extent(layout, state)
+    centre, size = _extent(state, layout.point_on if cloud is None else cloud)
     poses, points = np.zeros((len(state.rig_from_object), 6, 7)), np.zeros((len(state.points), 3, 7))
     _fill_motions(state.pose_position, centre, size, poses)
     _fill_motions(state.points, centre, size, points)
@@ -254,9 +290,9 @@ def free_motions(layout: Unknowns, state: State) -> tuple[FloatArray, FloatArray
     return poses, mounts, points
 
 
-def _extent(layout: Unknowns, state: State) -> tuple[FloatArray, float]:
-    """Return centre and size of the points that take part in the adjustment."""
-    cloud = state.points[layout.point_on]
+def _extent(state: State, on: BoolArray) -> tuple[FloatArray, float]:
+    """Return centre and size of points, such as those that take part in the adjustment, (n,)."""
+    cloud = state.points[on]
     centre = cloud.sum(axis=0) / len(cloud)
     # root mean square distance from the centre, as in `mean_distance`
     return centre, max(float(np.sqrt(((cloud - centre) ** 2).sum(axis=1).mean())), TINY)
@@ -315,6 +351,7 @@ def _seen_by_datum(
     H: FloatArray,
     fixed_mounts: FloatArray,
     points: FloatArray,
+    cloud: BoolArray,
 ) -> FloatArray:
     """Return the effect of the motions on fixed unknowns and observations, one row for each, (rows, 7)."""
     if layout.all_free and not observed:
@@ -338,7 +375,7 @@ def _seen_by_datum(
             at = H
             if met is not state.points:
                 at, kept = H.copy(), np.zeros((len(layout.kept), 3, 7))
-                _fill_motions(met[layout.kept], *_extent(layout, state), kept)
+                _fill_motions(met[layout.kept], *_extent(state, cloud), kept)
                 at[layout.kept_start :] = kept.reshape(-1, 7)
             moved = J @ at[columns]
         rows.append(moved[np.diagonal(one.weight, axis1=1, axis2=2) > 0])

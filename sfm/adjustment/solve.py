@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.covariance import LocalNetwork, local_of
-from sfm.adjustment.datum import Datum
+from sfm.adjustment.datum import Datum, without_far_points
 from sfm.adjustment.engine.cofactors import (
     Cofactors,
     cofactors,
@@ -124,7 +124,8 @@ def adjust(
     if method not in METHODS:
         raise GeometryError(f"adjustment: method '{method}', expected one of {', '.join(METHODS)}")
     use_control = datum.kind == "control"
-    local = local_of(network, estimate, datum.resolve(network))
+    resolved = without_far_points(datum.resolve(network), estimate.points)
+    local = local_of(network, estimate, resolved)
     k = len(network.image_points)
     given = np.asarray(image_sigma_factor, dtype=float)
     if given.shape not in ((), (k,)) or not (np.isfinite(given) & (given > 0)).all():
@@ -172,7 +173,8 @@ def predict(
     check_network(network, estimate)
     check_number("sigma_px", sigma_px, 0.0)
     use_control = datum.kind == "control"
-    local = local_of(network, estimate, datum.resolve(network))
+    resolved = without_far_points(datum.resolve(network), estimate.points)
+    local = local_of(network, estimate, resolved)
     factor = np.ones(len(network.image_points))
     layout, state = unknowns_of(
         local.network, local.estimate, use_control=use_control, image_sigma_factor=factor

@@ -26,7 +26,7 @@ from enum import IntEnum
 import numpy as np
 
 from sfm.arguments import checked_arguments
-from sfm.camera import Camera, pixel_jacobian, project, tangents_from_pixel
+from sfm.camera import Camera, pixel_jacobian, project
 from sfm.conventions import AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.planning.planned_object import PlannedObject, hidden_points
@@ -60,9 +60,6 @@ class DepthOfField:
 
 MAX_INCIDENCE_DEG = 60.0  # of a ray to the normal; beyond it targets are measured badly or not at all
 MIN_DIAMETER_PX = 5.0  # shorter axis of the smallest target that is measured
-SAME_RAY = (
-    1e-6  # difference of tangents of one ray; a distortion polynomial folds distant rays back into the format
-)
 BORDER_PX = 2.0  # between a target and the edge of the photograph
 
 
@@ -192,9 +189,6 @@ def _photograph(
     border = BORDER_PX
     within = (xy > border).all(axis=1) & (xy < (width - 1 - border, height - 1 - border)).all(axis=1)
     inside = np.asarray(within)
-    looked_at = np.flatnonzero(inside)
-    back = tangents_from_pixel(camera, xy[looked_at]) - UVW[looked_at, :2] / -UVW[looked_at, 2:]
-    inside[looked_at] = np.abs(back).max(axis=1, initial=0.0) < SAME_RAY  # NaN also fails
     visibility = np.where(inside, Visibility.SEEN, Visibility.OUTSIDE).astype(np.uint8)
     ray = position - planned.xyz
     ray /= np.maximum(

@@ -226,7 +226,7 @@ def test_the_score_of_wrong_values() -> None:
     fall = T - one.kept((1, 3)).chi2
     of_scatter = cost + 2 * (1 + np.log(fall / 2)) + 2 * np.log(10)
     assert found.score == pytest.approx(of_scatter - fall, rel=1e-9)
-    by_each = given_values._score(one, (1, 3), scatter=False)
+    by_each = given_values._score(one, (1, 3), one.kept((1, 3)), scatter=False)
     assert by_each == pytest.approx(2 * cost + 2 * np.log(10) - fall, rel=1e-9)
     assert one.kept((1, 3)).chi2 == pytest.approx(2 / 3)
     assert given_values._wrong_values(bars(0.0, 300.0), 0.001, cost) is None
@@ -538,3 +538,35 @@ def test_only_strains_that_points_show_are_looked_for() -> None:
     for one in shown:
         assert np.abs(one[:, 2]).max() < 1e-9 and np.abs(one[:, :, 2]).max() < 1e-9
     assert np.abs(np.trace(shown[2], axis1=1, axis2=2)).max() < 1e-9  # the scale is no strain
+
+
+@pytest.mark.parametrize("wrong", [0, 30])
+def test_the_effort_of_a_judgement_grows_slowly_with_the_values(
+    wrong: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each set of wrong values was updated from the beginning: the square of their number."""
+    count = 0
+    update = given_values.Kept.without
+
+    def counted(self: given_values.Kept, one: int) -> given_values.Kept:
+        nonlocal count
+        count += 1
+        return update(self, one)
+
+    monkeypatch.setattr(given_values.Kept, "without", counted)
+    rng = seed_of("many values")
+    v = rng.normal(size=160) * (1.5 if wrong == 0 else 1.0)
+    v[:wrong] += 30.0 * rng.choice([-1, 1], wrong)
+    judged = judge_values(bars(*v), 0.001)
+    assert judged.wrong == tuple(range(wrong)) if wrong else judged.factor > 1.2
+    assert count < 1000  # the square of 80 or of 30 is more
+
+
+def test_a_value_is_suspected_where_its_update_would_let_the_others_fit() -> None:
+    """What the test of all together excludes needs no update; the values found are the same."""
+    model = bars(0.0, 0.2, -0.1, 9.0, 0.1, 0.0)
+    fit = tuple(k for k in range(6) if model.fits(0.001, (k,)))
+    assert fit == (3,)
+    every = model.kept()
+    fall, rank = every.decreases()
+    assert [k for k in range(6) if every.may_fit(0.001, float(fall[k]), int(rank[k]))] == [3]

@@ -370,15 +370,19 @@ def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
         for kind in ("object", "camera")
         for k in range(5)
     ]
-    tried: list[object] = []
+    tried: list[tuple[object, int]] = []
     monkeypatch.setattr(hypotheses, "columns_of", lambda _: None)
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
     monkeypatch.setattr(hypotheses, "is_significant", lambda *_: True)
     monkeypatch.setattr(hypotheses, "log_likelihood_gain", lambda *_: 0.0)
-    monkeypatch.setattr(hypotheses, "refit", lambda _, one, *__: tried.append(one))
+    monkeypatch.setattr(hypotheses, "refit", lambda _, one, *__, most: tried.append((one, most)))
     monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda *_: SimpleNamespace(redundancy=1))
-    assert hypotheses._best(SimpleNamespace(), ()) is None  # type: ignore[arg-type]
-    assert tried == [*every[:2], *every[5:7]]
+    for photographs, least, most in ((20, 24, np.inf), (300, 1, 4)):  # the work on many is bounded
+        plain = SimpleNamespace(network=SimpleNamespace(images=("a",) * photographs))
+        tried.clear()
+        assert hypotheses._best(plain, ()) is None  # type: ignore[arg-type]
+        assert [one for one, _ in tried] == [*every[:2], *every[5:7]]
+        assert all(least <= adjustments <= most for _, adjustments in tried)
 
 
 def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does() -> None:
@@ -534,8 +538,9 @@ def test_a_parameter_of_all_photographs_is_tried_with_what_its_errors_in_common_
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
     monkeypatch.setattr(hypotheses, "is_significant", lambda one, count: True)
     monkeypatch.setattr(hypotheses, "reported", refitted)
+    plain = SimpleNamespace(network=SimpleNamespace(images=("a",)))
     with pytest.raises(StopIteration):
-        hypotheses._best(SimpleNamespace(), ())  # type: ignore[arg-type]
+        hypotheses._best(plain, ())  # type: ignore[arg-type]
 
 
 def test_control_counts_by_its_variance_over_that_of_unit_weight() -> None:

@@ -19,8 +19,10 @@ from sfm.adjustment.engine.solvers.fronts import fronts_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import rank_defect
+from sfm.adjustment.solve import adjust
+from sfm.camera import project
 from sfm.network import Estimate, ImagePoints, Network
-from tests.synthetic import seed_of
+from tests.synthetic import make_network, seed_of
 from tests.synthetic_blocks import aerial, in_sigmas, lens, run
 
 MOTIONS = 7
@@ -159,3 +161,42 @@ def test_steps_in_the_datum_meet_its_constraints(steps: tuple[int, ...]) -> None
     motions = Motions(H, P, B, on_reduced, inverse)
     x, X = motions.transform(rng.standard_normal((6, *steps)), rng.standard_normal((4, 3, *steps)))
     np.testing.assert_allclose(on_reduced.T @ x + np.tensordot(B, X, ((0, 1), (0, 1))), 0.0, atol=1e-12)
+
+
+def street(away: float) -> tuple[Network, Estimate]:
+    """Parallel photographs with a base of 2 of a block of points, and two points far behind it."""
+    rng = seed_of(f"street {away}")
+    network, seen = make_network(rng, images=8, points=40, free=())
+    near = seen.points * [1.2, 1.2, 0.8]
+    points = np.vstack([near, [[0.1 * away, 0.05 * away, -away], [-0.1 * away, 0.07 * away, -away]]])
+    position = np.column_stack([np.linspace(-1, 1, 8), rng.uniform(-0.2, 0.2, 8), rng.uniform(3.8, 4.2, 8)])
+    truth = replace(seen, position=position, rotation=np.tile(np.eye(3), (8, 1, 1)), points=points)
+    rows = []
+    for i in range(8):
+        xy = project(truth.cameras[0], position[i], np.eye(3), points)
+        inside = np.isfinite(xy).all(1) & (xy > 0).all(1) & (xy < truth.cameras[0].size_px).all(1)
+        rows += [(i, j, *(xy[j] + rng.normal(0, 0.1, 2))) for j in np.flatnonzero(inside)]
+    image, point, *xy = np.array(rows).T
+    measured = ImagePoints(
+        image.astype(int),
+        point.astype(int),
+        np.stack(xy, axis=1),
+        np.tile(0.01 * np.eye(2), (len(image), 1, 1)),
+    )
+    names = (*network.points, "far 1", "far 2")
+    return replace(network, points=names, image_points=measured), truth
+
+
+@pytest.mark.parametrize("away", [1e3, 1e5, 1e9])
+def test_points_far_behind_all_others_carry_no_datum(away: float) -> None:
+    """They turned and scaled the whole network by their own errors, until nothing could fix it any more."""
+    network, truth = street(away)
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    near = network.image_points.point < 40
+    alone = replace(network, points=network.points[:40], image_points=network.image_points.select(near))
+    b = adjust(alone, replace(truth, points=truth.points[:40]), datum=Datum("free"), reject="none")
+    assert a.converged and a.expected_defect == 7
+    sigma, expected = (np.sqrt(np.trace(one.covariance.points[:40], axis1=1, axis2=2)) for one in (a, b))
+    assert (sigma < 1.2 * expected).all()
+    assert a.datum_points is not None and a.datum_points.tolist() == [True] * 40 + [False] * 2
+    assert b.datum_points is None

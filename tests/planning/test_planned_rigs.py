@@ -12,7 +12,7 @@ import pytest
 import sfm
 from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
-from sfm.conventions import angles_from_rotation
+from sfm.conventions import angles_from_rotation, rotation_from_vector
 from sfm.distributions import chi2_ppf
 from sfm.errors import GeometryError
 from sfm.files.plain_text import csv_text
@@ -92,6 +92,19 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
     (mount,) = found["rigs"][0]["mounts"]
     assert 0 < mount["base"]["sigma"] < 1e-4 and found["photographs"] == 12
     assert "plan_without_scale" not in {one["kind"] for one in found["remarks"]}
+
+
+def test_a_camera_of_a_rig_that_sees_nothing_is_named() -> None:
+    plate = shape_object("plate", (1.0, 0.7), 30)
+    _, truth = make_rig(seed_of("motions"))
+    assert truth.mounts is not None
+    away = truth.mounts.rotation.copy()
+    away[1] = rotation_from_vector(np.array([0.0, 1.4, 0.0]))
+    stations = arrangement("ring:5", plate, truth.cameras[0]).with_rig(
+        replace(truth.mounts, rotation=away), truth.cameras
+    )
+    with pytest.raises(GeometryError, match="plan: camera camera 2 shows no points that another photograph"):
+        predict_network(plate, truth.cameras, stations, Seeing(sigma_px=0.1))
 
 
 def test_the_rig_condition_has_a_gain() -> None:

@@ -682,3 +682,41 @@ def test_directions_may_be_counted_from_anywhere(orientation: float) -> None:
     value = np.arctan2(away[:, 0], away[:, 1]) - orientation + 1e-5 * rng.standard_normal(8)
     directions = HorizontalDirections("station", np.arange(9), value[:, None], np.full((8, 1), 1e-5))
     assert np.abs(directions.fit(X).difference).max() < 1e-4
+
+
+@pytest.mark.parametrize("kind", TABLES)
+def test_a_standard_deviation_that_no_measurement_has_is_refused(kind: str, tmp_path: Path) -> None:
+    of = TABLES[kind]
+    names = [["s", "a"], ["s", "b"], ["s", "c"]]
+    if len(of.texts) == 3:
+        names = [["s", "a", "b"], ["s", "b", "c"], ["s", "c", "a"]]
+    if "group" not in of.texts and "from" in of.texts and len(of.texts) == 2 and not issubclass(of, Group):
+        names = [["a", "b"], ["b", "c"], ["c", "a"]]
+    if len(of.texts) == 1:
+        names = [["a"], ["b"], ["c"]]
+    columns = of.columns()
+    d = min(len(of.components), len(columns))
+    for sigma, refused in (("1e-3", False), ("1e-300", True), ("1e-10", True)):
+        rows = [
+            [*texts, *(f"{k + 1.5}" for _ in columns[:-d]), *([sigma] * d)] for k, texts in enumerate(names)
+        ]
+        file = tmp_path / "t.csv"
+        file.write_text("\n".join(",".join(row) for row in [[*of.texts, *columns], *rows]) + "\n", "utf-8")
+        if refused:
+            with pytest.raises(SurveyFileError, match=r"needed at least .*values and sigmas in one unit"):
+                read_observation_table(kind, file, "survey.toml")
+        else:
+            read_observation_table(kind, file, "survey.toml")
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_a_plumb_line_through_points_that_are_apart_ends_no_adjustment(seed: int) -> None:
+    """In one of 14 networks a point ran away until its square overflowed, and the inverse was singular."""
+    network, truth = make_network(seed_of(f"plumb {seed}"), images=12, points=50)
+    given = np.arange(6)
+    control = ObjectPoints(given, truth.points[given], np.tile(1e-8 * np.eye(3), (6, 1, 1)))
+    line = PlumbLines("v", np.array([20, 21]), np.zeros((2, 2)), np.full((2, 2), 2e-4))
+    free = np.isin(truth.cameras[0].names, ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2"))
+    start = replace(truth, cameras=(replace(truth.cameras[0], free=free),))
+    observed = replace(network, control=control, observations=(line,))
+    adjust(observed, start, datum=Datum("control"), reject="tau")
