@@ -24,9 +24,9 @@ from scipy.linalg import block_diag
 
 from sfm.adjustment.datum import Datum, ResolvedDatum, motions_of, without_far_points
 from sfm.adjustment.engine.cofactors import (
-    MAX_FIXED_VARIANCE,
     Cofactors,
     cofactors,
+    largest_fixed,
     marginal_covariance,
     without_held,
 )
@@ -144,8 +144,8 @@ class Marginal:
         cofactor += H @ Q.G @ H.T
         if self.correlated is not None:
             cofactor += self.correlated.joint(unknowns, np.asarray(points))
-        limiting = np.diagonal(Q.limiting[points], axis1=1, axis2=2).ravel()
-        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= MAX_FIXED_VARIANCE * limiting)
+        largest = largest_fixed(self.optimum, self.layout, Q)[points].ravel()
+        fixed = u + np.flatnonzero(np.diagonal(cofactor)[u:] <= largest)
         cofactor[fixed] = 0.0
         cofactor[:, fixed] = 0.0
         cofactor *= self.adjustment.sigma0**2

@@ -21,11 +21,12 @@ from sfm.adjustment.engine.cofactors import (
     marginal_covariance,
     without_held,
 )
-from sfm.adjustment.engine.collinearity import residuals
+from sfm.adjustment.engine.collinearity import State, residuals
 from sfm.adjustment.engine.iterate import (
     METHODS,
     TOLERANCE,
     Optimum,
+    Problem,
     optimum_at,
     problem_of,
 )
@@ -144,6 +145,8 @@ def adjust(
         optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha, without=without[layout.order])
         Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
         result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
+        if not optimum.converged:
+            result = _with_open_start(result, local, problem, state, weight)
         return local.back(
             replace(result, image_sigma_factor=factor, test_alpha=_level_of(reject, alpha, result.test_alpha))
         )
@@ -206,6 +209,24 @@ def _mask_of(rejected: BoolArray | None, k: int) -> BoolArray:
     if rejected.all():
         raise GeometryError(f"rejected: all {counted(k, 'image point')}, expected fewer")
     return rejected
+
+
+def _with_open_start(
+    result: Adjustment, local: LocalNetwork, problem: Problem, start: State, weight: FloatArray
+) -> Adjustment:
+    """Return an adjustment that did not converge with the rank defect of its start, if that is larger.
+
+    What nothing determines drifts with the noise of the image points, such as c of nadir photographs, until
+    the normal equations are regular by chance.
+    """
+    optimum = optimum_at(problem, start, weight)
+    if optimum is None or (defect := rank_defect(optimum, problem.layout)) <= result.defect:
+        return result
+    allowed = 0 if problem.datum.kind == "control" else 7
+    undetermined = undetermined_of(
+        optimum, problem.layout, local.network, local.estimate, weight, allowed_motions=allowed
+    )
+    return replace(result, defect=defect, undetermined=undetermined)
 
 
 def _small_weight_remarks(layout: Unknowns, weight: FloatArray, network: Network) -> tuple[Remark, ...]:

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.covariance import change_datum
+from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
-from sfm.conventions import BoolArray, rotation_from_angles
+from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.observations.point_pairs import CoordinateDifferences
 from tests.synthetic import C_MM, PIXEL_MM, SIZE_PX, make_network, seed_of
 
 FREE = Datum("free")
@@ -146,3 +147,70 @@ def test_missing_start_values_are_named(missing: str) -> None:
     name = "photograph image 4" if missing == "image" else "point 4"
     assert a.undetermined == (f"{name}: no start value",)
     assert a.converged
+
+
+def noisy(
+    name: str, position: FloatArray, rotation: FloatArray, points: FloatArray, free: tuple[str, ...]
+) -> tuple[Network, Estimate]:
+    """Return the network of photographs at these stations, with noise of 0.1 px."""
+    rng = seed_of(name)
+    camera = camera_from_values("A", "brown", SIZE_PX, PIXEL_MM, c_mm=C_MM, free=free)
+    rows = []
+    for i, (X0, R) in enumerate(zip(position, rotation, strict=True)):
+        xy = project(camera, X0, R, points)
+        inside = np.isfinite(xy).all(axis=1) & (xy > 0).all(axis=1) & (xy < SIZE_PX).all(axis=1)
+        rows += [(i, j, *(xy[j] + rng.normal(0, 0.1, 2))) for j in np.flatnonzero(inside)]
+    image, point, *xy_px = np.array(rows).T
+    m, n = len(position), len(points)
+    network = Network(
+        tuple(str(i) for i in range(m)),
+        np.zeros(m, dtype=np.int64),
+        tuple(str(j) for j in range(n)),
+        ImagePoints(
+            image.astype(int), point.astype(int), np.stack(xy_px, axis=1),
+            np.tile(0.01 * np.eye(2), (len(rows), 1, 1)),
+        ),
+    )  # fmt: skip
+    return network, Estimate((camera,), position, rotation, points)
+
+
+@pytest.mark.parametrize("case", ["nadir", "pair", "panorama"])
+def test_what_drifts_until_the_adjustment_ends_unconverged_is_named(case: str) -> None:
+    """The noise makes the normal equations regular by chance: 7 of 7, and nothing undetermined."""
+    rng = seed_of(f"degenerate {case}")
+    count = {"nadir": 6, "pair": 2, "panorama": 8}[case]
+    position = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.full(count, 4.0)])
+    rotation = np.tile(np.eye(3), (count, 1, 1))
+    points = rng.uniform(-1, 1, (40, 3)) * [1, 1, 0.3]
+    free: tuple[str, ...] = ("c", "x0", "y0")
+    if case == "pair":
+        position, free = np.array([[-0.6, 0, 4.0], [0.6, 0, 4.0]]), ("c", "x0", "y0", "K1", "P1", "P2")
+    if case == "panorama":
+        position, free = np.zeros((count, 3)), ()
+        rotation = np.stack([rotation_from_angles(0, phi, 0) for phi in np.linspace(-0.2, 0.2, count)])
+        points = points * [1, 1, 1] - [0, 0, 4]
+    network, truth = noisy(case, position, rotation, points, free)
+    a = adjust(network, truth, datum=FREE)
+    assert not a.converged
+    assert a.defect > 7 and a.undetermined
+    expected = "its rays are parallel" if case == "panorama" else "of camera A"
+    assert all(expected in one for one in a.undetermined)
+    # directions alike in all photographs shear the object with x0 and y0; a panorama has no scale to lose
+    of_cameras = {"nadir": 3, "pair": 4, "panorama": -1}[case]
+    assert a.defect == 7 + of_cameras + (len(points) if case == "panorama" else 0)
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-9, 1e-11])
+def test_a_point_that_survey_observations_fix_better_than_rays_has_their_sigma(sigma: float) -> None:
+    """Below 3e-5 of the sigma of its rays it was 0, as of a coordinate that the datum fixes."""
+    network, truth = make_network(seed_of("precise"), images=8, points=30, free=())
+    fixed = np.arange(4)
+    control = ObjectPoints(fixed, truth.points[fixed], np.zeros((4, 3, 3)))
+    ends = np.array([0, 0]), np.array([10, 11])
+    to_fixed = CoordinateDifferences(*ends, truth.points[10:12] - truth.points[0], np.full((2, 3), sigma))
+    a = adjust(replace(network, control=control, observations=(to_fixed,)), truth, datum=Datum("control"))
+    stated = np.sqrt(np.diagonal(a.covariance.points[10])) / a.sigma0
+    assert stated == pytest.approx(np.full(3, sigma), rel=1e-2)
+    assert (np.diagonal(a.covariance.points[0]) == 0).all()  # fixed control
+    joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.array([10]))
+    assert np.sqrt(np.diagonal(joint)) / a.sigma0 == pytest.approx(np.full(3, sigma), rel=1e-2)

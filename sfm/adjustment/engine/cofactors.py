@@ -25,8 +25,9 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.kernels.compiling import kernel
 from sfm.observations.pose import exterior_jacobian
 
-# Ratio of a variance to its limiting value below which the datum fixes the coordinate.
-MAX_FIXED_VARIANCE = 1e-9
+# Ratio of a variance to its limiting value below which the datum fixes the coordinate. Survey observations
+# of a point may be that much better than its rays; there, it is the ratio to the variance in any datum.
+MAX_FIXED_VARIANCE, MAX_ROUNDING = 1e-9, 1e-13
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,7 @@ def marginal_covariance(
     H, P = optimum.motions.reduced, optimum.motions.points
     F, G = cofactors.F_reduced, cofactors.G
     points = _in_datum(cofactors.points, P, cofactors.F_points, G)
-    fixed = np.diagonal(points, axis1=1, axis2=2) <= MAX_FIXED_VARIANCE * np.diagonal(
-        cofactors.limiting, axis1=1, axis2=2
-    )
+    fixed = np.diagonal(points, axis1=1, axis2=2) <= largest_fixed(optimum, layout, cofactors)
     points[fixed] = 0.0
     np.swapaxes(points, 1, 2)[fixed] = 0.0
     first = layout.pose_free.size
@@ -118,6 +117,24 @@ def marginal_covariance(
         variance * cofactors.limiting,
         variance * rigs,
     )
+
+
+def largest_fixed(optimum: Optimum, layout: Unknowns, cofactors: Cofactors) -> FloatArray:
+    """Return the variance up to which a coordinate is one that the datum fixes, for sigma0 = 1, (n, 3).
+
+    It is 0 where the observations fix position, attitude and scale.
+
+    Args:
+        optimum: undamped normal equations and their factor.
+        layout: order of the unknowns.
+        cofactors: cofactors at the optimum.
+    """
+    if not len(optimum.motions.inverse):
+        return np.zeros((len(cofactors.points), 3))
+    largest = MAX_FIXED_VARIANCE * np.diagonal(cofactors.limiting, axis1=1, axis2=2)
+    kept = np.diagonal(cofactors.points[layout.kept], axis1=1, axis2=2)
+    largest[layout.kept] = MAX_ROUNDING * np.maximum(kept, 0.0)
+    return largest
 
 
 def hat_complement(
