@@ -24,6 +24,7 @@ from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey, solve_survey
 from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
 from sfm.survey.board_turns import agree_on_turns
+from sfm.survey.clock_offsets import agree_on_clocks
 from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
@@ -85,6 +86,7 @@ def _solve(
     reached[:] = [f"{measured_points} in {seen} of {counted(len(network.images), 'photograph')}"]
     with clock.stage("orientation"):
         survey, measured, start = orient_with_models(survey, measured)
+        survey, measured, start = agree_on_clocks(survey, measured, start)
         measured, start = agree_on_turns(survey, measured, start)
     oriented = f"{start.estimate.oriented.sum()} of {len(start.estimate.oriented)} photographs oriented"
     reached.append(f"{oriented}, {counted(int(start.estimate.determined.sum()), 'object point')}")

@@ -34,6 +34,7 @@ ORIGIN_DECIMALS = 3  # of the degrees of an origin: 0.001 deg are 111 m
 MAX_HEIGHT_M = 100_000.0  # a larger number is not the height of a camera
 BELOW = (1, 3)  # GPSAltitudeRef: below sea level, below the reference of EXIF 3.0
 MIN_SIGMA_M = 0.001  # no receiver on a camera is better; smaller numbers have another unit or mean unknown
+MAX_SIGMA_M = 10_000.0  # the width of a cell of a telephone network; a larger number means unknown
 VOID = "V"  # GPSStatus of a receiver without a fix
 # Default standard deviations of a telephone under open sky, to the east, to the north and of the height, m.
 # Source: van Diggelen and Enge (2015), ION GNSS+, for the plane; heights are twice as uncertain.
@@ -306,6 +307,8 @@ def _degrees(value: Any, hemisphere: Any, letters: str, most: float) -> float:
     numbers = [_number(one) for one in parts]
     if not 1 <= len(numbers) <= 3 or not all(one >= 0 for one in numbers):
         return math.nan
+    if not all(one <= 60 for one in numbers[1:]):  # 60 is what rounding makes of 59.9999
+        return math.nan
     degrees = sum(one / 60**k for k, one in enumerate(numbers))
     sign = {letters[0]: 1, letters[1]: -1}.get(_letter(hemisphere))
     return sign * degrees if sign and degrees <= most else math.nan
@@ -327,8 +330,8 @@ def _number(value: Any) -> float:
 
 
 def _sigma(value: float) -> float:
-    """Return a standard deviation, NaN if it is too small; writers use 0 for unknown."""
-    return value if value >= MIN_SIGMA_M else math.nan
+    """Return a standard deviation, NaN if no receiver has it; writers use 0 or a huge number for unknown."""
+    return value if MIN_SIGMA_M <= value <= MAX_SIGMA_M else math.nan
 
 
 Image.init()

@@ -28,6 +28,8 @@ from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 # size once in a million coordinates. If it is the root mean square of all errors, the whole result is wrong.
 WRONG_SIGMAS = 5.0
 DIGITS, MAX_DIGITS = 3, 12  # significant digits of a number; more distinguish it from others of its unit
+# Square of the largest over the smallest length that a survey may state: no number of a survey is larger.
+LARGEST_SAID = (1e12 / 1e-9) ** 2
 MIN_PROBABILITY = 1e-3  # smaller probabilities are written as "p < 0.001"
 # A result that shifts by fewer standard deviations stays within the limits that users expect: they contain
 # 99.7 % of normally distributed errors (Pukelsheim 1994, "The three sigma rule", The American Statistician
@@ -184,7 +186,7 @@ def _nouns(names: tuple[str, ...], other: str) -> list[str]:
 
 def _number(one: Quantity, spec: str, digits: int) -> str:
     """Format a number and its unit, with so many significant digits unless the field asks otherwise."""
-    if not np.isfinite(one.value):
+    if not abs(one.value) <= LARGEST_SAID:
         return "not known"
     if spec == "<":
         return probability(one.value)

@@ -275,7 +275,7 @@ def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Est
                 )
             relative = [_relative(estimate, position[k], rotation[k], i, j) for k, (i, j) in pairs[b]]
             position[b] = np.median([t for t, _ in relative], axis=0)
-            rotation[b] = _middle(np.array([R for _, R in relative]))
+            rotation[b] = middle_rotation(np.array([R for _, R in relative]))
             free[b], names[b] = True, rig
             known.append(b)
             left.remove(b)
@@ -299,7 +299,7 @@ def _relative(
     return np.asarray(of_rig.T @ (estimate.position[j] - origin)), of_rig.T @ estimate.rotation[j]
 
 
-def _middle(R: FloatArray) -> FloatArray:
+def middle_rotation(R: FloatArray) -> FloatArray:
     """Return the mean of the rotations nearest to their median rotation, (3, 3)."""
     angle = np.arccos(np.clip((np.einsum("iab,jab->ij", R, R) - 1) / 2, -1.0, 1.0))
     middle = R[int(np.argmin(np.median(angle, axis=1)))]

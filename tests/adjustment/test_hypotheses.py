@@ -561,3 +561,11 @@ def test_control_counts_by_its_variance_over_that_of_unit_weight() -> None:
     np.testing.assert_allclose(weight, expected)
     np.testing.assert_allclose(slope, [[0, 0, 0], [0.01 * expected[1, 0, 0], 0, 0]], rtol=1e-9)
     assert fixed.tolist() == [[False] * 3, [False, True, False]]
+
+
+@pytest.mark.parametrize("gain", [-1e9, -1.0, 0.0, 50.0])
+def test_a_loss_is_no_evidence_between_photographs(gain: float) -> None:
+    """The logarithm of a negative number was a warning on the terminal."""
+    spread = score.Spread(factor=3.0, redundancy=20, among=5)
+    found = spread.evidence(gain, 2, 100)
+    assert np.isfinite(found) and (found > 0) == (gain > 0)

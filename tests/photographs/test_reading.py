@@ -187,6 +187,8 @@ def test_hemispheres_and_heights(
         {2: "52 north"},
         {2: (52.0, -30.0, 0.0)},
         {2: (91.0, 0.0, 0.0)},
+        {2: (52.0, 99.0, 0.0)},
+        {4: (13.0, 24.0, 61.0)},
         {4: (181.0, 0.0, 0.0)},
         {1: None},
         {3: "?"},
@@ -208,6 +210,8 @@ def test_standard_deviations_that_receivers_state() -> None:
     assert sigma({31: 4.7}) == pytest.approx((4.7, 4.7, np.nan), nan_ok=True)
     assert np.isnan(sigma({31: 1e-9})).all() and np.isnan(sigma({31: -5.0})).all()
     assert sigma({31: 4.7}, DJI) == (0.011, 0.012, 0.025)
+    huge = b"<drone-dji:RtkStdHgt>1e300</drone-dji:RtkStdHgt>"
+    assert sigma({31: 4.7}, huge) == pytest.approx((4.7, 4.7, np.nan), nan_ok=True)
     zero = b"<drone-dji:RtkStdLon>0.0</drone-dji:RtkStdLon><drone-dji:RtkStdHgt>0.03</drone-dji:RtkStdHgt>"
     assert sigma({31: IFDRational(0, 0)}, zero) == pytest.approx((np.nan, np.nan, 0.03), nan_ok=True)
 

@@ -234,3 +234,22 @@ def test_regular_intervals_with_clocks_that_differ_are_refused(tmp_path: Path) -
     survey = survey_of(tmp_path, 0.5)
     with pytest.raises(SurveyFileError, match="by 3590 s or 3600 s, and as many photographs agree"):
         moments_from_exif(survey, find_photographs(survey))
+
+
+def test_a_second_offset_of_clocks_that_fits_as_well_is_named(tmp_path: Path) -> None:
+    """Clocks one interval off, and the first photograph missing: as they are, eight agree, wrongly."""
+    times = 10.0 * np.arange(9)
+    photographed(tmp_path, "left", times.tolist())
+    photographed(tmp_path, "right", (times[1:] - 10.0).tolist())
+    survey = survey_of(tmp_path, 0.5)
+    _, (found,) = moments_from_exif(survey, find_photographs(survey))
+    assert found.kind == "clocks_unsure" and found.severity == "warning"
+    assert found.number("ahead") == pytest.approx(-10.0)
+
+
+def test_a_photograph_that_one_camera_misses_in_the_middle_leaves_the_clocks_sure(tmp_path: Path) -> None:
+    times = 10.0 * np.arange(9)
+    photographed(tmp_path, "left", times.tolist())
+    photographed(tmp_path, "right", np.delete(times, 4).tolist())
+    survey = survey_of(tmp_path, 0.5)
+    assert moments_from_exif(survey, find_photographs(survey))[1] == ()

@@ -481,7 +481,7 @@ class Spread:
             return grows
         if not self.among:
             return log_likelihood_gain(gain / self.factor, redundancy)
-        f = self.ratio(gain, q, redundancy)
+        f = max(self.ratio(gain, q, redundancy), 0.0)  # a loss is no evidence
         return min(grows, float(self.redundancy / 2 * np.log1p(f * q / self.redundancy)))
 
 

@@ -133,6 +133,15 @@ ROWS = (
         "Check in the report that photographs of the same moment show the same scene.",
     ),
     Kind(
+        "clocks_unsure",
+        "warning",
+        "The EXIF times of camera {camera} agree with those of {reference} as they are, and as well if its "
+        "clock is {ahead} ahead.",
+        "photographs at regular intervals, of which one camera misses the first or last",
+        "Check in the report that photographs of the same moment show the same scene; if not, give the "
+        "moments by an expression, 'order' or a table.",
+    ),
+    Kind(
         "photographs_uneven",
         "warning",
         "The photographs differ in precision (Bartlett's test, {p:<}): sigma0 of {photograph} is {ratio} "

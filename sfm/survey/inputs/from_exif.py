@@ -91,30 +91,44 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
             possible.
     """
     moments, remarks = dict(survey.moments), []
+    other_moments = dict(survey.moments)
+    unsure = False
     for rig in survey.rigs:
         if rig.moment != "exif":
             continue
         cameras = {one.name: one for one in survey.cameras}
         of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
-        corrected = dict(of_rig[0])
+        corrected, otherwise = dict(of_rig[0]), dict(of_rig[0])
         for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
             ahead, *others = _clock_offset(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
-            if others:
+            if others and ahead:
                 raise SurveyFileError(
                     f"{survey.source}: rig {rig.name}: the clock of camera {camera} is ahead of that of "
                     f"{rig.cameras[0]} by {ahead:g} s or {others[0]:g} s, and as many photographs agree; set "
                     "the times, or name the moments by an expression, 'order' or a table"
                 )
+            second = min(others, key=abs, default=ahead)
             corrected |= {name: taken - timedelta(seconds=ahead) for name, taken in times.items()}
-            if ahead:
-                found = remark("clock_differs", camera=camera, reference=rig.cameras[0], ahead=(ahead, "s"))
-                remarks.append(found)
-        start = datetime.min
-        for name, taken in sorted(corrected.items(), key=lambda one: one[1]):
-            if taken - start > timedelta(seconds=rig.tolerance_s):
-                start = taken
-            moments[name] = start.isoformat(sep=" ")
-    return (replace(survey, moments=moments) if moments else survey), tuple(remarks)
+            otherwise |= {name: taken - timedelta(seconds=second) for name, taken in times.items()}
+            unsure = unsure or bool(others)
+            if ahead or others:
+                kind = "clocks_unsure" if others else "clock_differs"
+                remarks.append(remark(kind, camera=camera, reference=rig.cameras[0], ahead=(second, "s")))
+        moments |= _named_moments(corrected, rig.tolerance_s)
+        other_moments |= _named_moments(otherwise, rig.tolerance_s)
+    if not moments:
+        return survey, tuple(remarks)
+    return replace(survey, moments=moments, other_moments=other_moments if unsure else {}), tuple(remarks)
+
+
+def _named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str, str]:
+    """Return the moment of each photograph, named by the time of its first photograph."""
+    moments, start = {}, datetime.min
+    for name, taken in sorted(times.items(), key=lambda one: one[1]):
+        if taken - start > timedelta(seconds=tolerance_s):
+            start = taken
+        moments[name] = start.isoformat(sep=" ")
+    return moments
 
 
 def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[str, datetime]:
@@ -137,7 +151,7 @@ def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[st
 
 
 def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> list[float]:
-    """Return the possible offsets of a clock from that of the reference camera, s; 0 if that fits as well.
+    """Return the possible offsets of a clock from the reference camera's, s; 0 first if that fits as well.
 
     Most pairs of photographs agree at the correct offset. With photographs at regular intervals several
     offsets are possible, and nothing shows which is correct.
@@ -149,14 +163,16 @@ def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s:
     ahead = np.sort((b[:, None] - a).ravel())
     last = np.searchsorted(ahead, ahead + 2 * tolerance_s, side="right")
     count = last - np.arange(len(ahead))
-    if count.max() <= (np.abs(ahead) <= tolerance_s).sum():
-        return [0.0]
     found: list[float] = []
     for k in np.flatnonzero(count == count.max()):
         middle = float(ahead[k] + ahead[last[k] - 1]) / 2
         if not found or middle - found[-1] > tolerance_s:
             found.append(middle)
-    return found
+    if count.max() > (np.abs(ahead) <= tolerance_s).sum():
+        return found
+    if len(reference) == len(times) == count.max():  # every photograph has its partner
+        return [0.0]
+    return [0.0, *(one for one in found if abs(one) > 2 * tolerance_s)]
 
 
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:

@@ -116,6 +116,7 @@ class Survey:
     rigs: tuple[RigSettings, ...] = ()  # cameras that are mounted on one frame
     mounts: tuple[ObservedExterior, ...] = ()  # given mounts of cameras of rigs, by their names
     moments: Mapping[str, str] = field(default_factory=dict)  # moments of photographs from tables
+    other_moments: Mapping[str, str] = field(default_factory=dict)  # by a second offset of EXIF clocks
     scale_bars: tuple[ScaleBar, ...] = ()
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     copied: tuple[str, ...] = ()  # observations that a table has more than once

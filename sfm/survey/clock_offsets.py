@@ -1,0 +1,86 @@
+"""Clocks of a rig that fit at two offsets: the cameras on it must keep their relative orientation.
+
+Photographs at regular intervals, of which one camera misses the first or last, have as many partners at two
+offsets of the clocks. Photographs are oriented one by one, so that the relative rotations of the cameras at
+all moments show which offset is right: those of wrong moments differ by the motion of the rig.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.conventions import IntArray
+from sfm.distributions import f_isf
+from sfm.network import Estimate
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.remarks.remark import remark
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.orientation import orient_with_models
+from sfm.survey.rigs import middle_rotation, with_moments
+
+ALPHA = 0.001  # probability of changing the offset although both fit equally
+MIN_MOMENTS = 3  # of two cameras, whose relative rotations are compared
+
+
+def agree_on_clocks(
+    survey: Survey, measured: Measurements, start: Orientation
+) -> tuple[Survey, Measurements, Orientation]:
+    """Take the second offset of clocks that fit at two, if the cameras then agree better on their mounts.
+
+    Args:
+        survey: may have the moments by a second offset.
+        measured: image points, with the moment of each photograph.
+        start: orientation with these moments.
+
+    Returns:
+        Survey, image points and orientation with the moments that agree, and a remark on the offset if these
+        are the other ones.
+    """
+    if not survey.other_moments or measured.network.moment is None:
+        return survey, measured, start
+    other = replace(survey, moments=survey.other_moments, other_moments={})
+    network = with_moments(other, replace(measured.network, moment=None))
+    assert network.moment is not None
+    now, count = rotation_spread(measured.network.camera, measured.network.moment, start.estimate)
+    then, of_other = rotation_spread(network.camera, network.moment, start.estimate)
+    dof = 3 * (min(count, of_other) - 1)
+    if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(ALPHA, dof, dof):
+        return survey, measured, start
+    said = tuple(
+        remark("clock_differs", **one.subjects, ahead=one.numbers["ahead"])
+        if one.kind == "clocks_unsure"
+        else one
+        for one in measured.remarks
+    )
+    measured = replace(measured, network=network, remarks=said)
+    return orient_with_models(other, measured)
+
+
+def rotation_spread(camera: IntArray, moment: IntArray, estimate: Estimate) -> tuple[float, int]:
+    """Return the median square of the differences of relative rotations from their middle, and their number.
+
+    Args:
+        camera: index of the camera of each photograph, (m,).
+        moment: index of its moment, (m,).
+        estimate: has photographs oriented one by one.
+
+    Returns:
+        The largest median of two cameras, rad^2, and the smallest number of moments that two cameras share.
+    """
+    largest, fewest = 0.0, len(camera)
+    cameras = np.unique(camera).tolist()
+    oriented = np.flatnonzero(estimate.oriented)
+    of = {(int(camera[i]), int(moment[i])): int(i) for i in oriented}
+    for b in cameras[1:]:
+        pairs = [(i, of[b, when]) for (a, when), i in of.items() if a == cameras[0] and (b, when) in of]
+        fewest = min(fewest, len(pairs))
+        if not pairs:
+            continue
+        relative = np.array([estimate.rotation[i].T @ estimate.rotation[j] for i, j in pairs])
+        along = np.einsum("iab,ab->i", relative, middle_rotation(relative))
+        angle = np.arccos(np.clip((along - 1) / 2, -1.0, 1.0))
+        largest = max(largest, float(np.median(angle**2)))
+    return largest, fewest
