@@ -146,6 +146,7 @@ def test_missing_start_values_are_named(missing: str) -> None:
     a = adjust(network, replace(truth, position=position, points=points), datum=FREE)
     name = "photograph image 4" if missing == "image" else "point 4"
     assert a.undetermined == (f"{name}: no start value",)
+    assert a.defect == 7 + (6 if missing == "image" else 3)  # before, the defect was the expected one
     assert a.converged
 
 

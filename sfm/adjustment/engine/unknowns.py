@@ -402,7 +402,7 @@ def _hold_undetermined(
     held += [f"point {network.points[j]}: no start value" for j in np.flatnonzero(~point_on)]
     needs_points = pose_free.any(axis=1) & ~pose_known
     needs_rays = point_free.any(axis=1) & ~point_known.all(axis=1)
-    defect = 0
+    defect = int(pose_free[~pose_on].sum() + point_free[~point_on].sum())
     while True:
         active = pose_on[pose] & point_on[k.point]
         every = bool(active.all())
