@@ -158,7 +158,7 @@ def test_common_problem_drops_what_does_not_take_part() -> None:
         reduced.image_points.covariance, np.tile(0.01 * np.eye(2), (len(reduced.image_points), 1, 1))
     )
     assert start.cameras[0].model == "full_opencv"
-    assert conversions[0].max_px < 0.05
+    assert conversions[0].max_px < 0.06
     assert freed == ()
 
 

@@ -248,8 +248,8 @@ def refuse_tiny_sigmas(
     least = np.broadcast_to(np.maximum(MIN_SIGMA, np.abs(size) / MAX_EXTENT_PER_SIGMA), sigma.shape)
     tiny: BoolArray = (sigma > 0) & (sigma < least)
     for k, c in np.argwhere(tiny)[:1]:
-        of = "a millionth of the length or extent, " if least[k, c] > MIN_SIGMA else ""
-        needed = f"at least {of}{least[k, c]:.3g}: values and sigmas in one unit{or_else}"
+        of = ", a millionth of the length or extent" if least[k, c] > MIN_SIGMA else ""
+        needed = f"at least {least[k, c]:.3g}{of}: values and sigmas in one unit{or_else}"
         table.refuse(sigma, tiny, columns, needed)
 
 
