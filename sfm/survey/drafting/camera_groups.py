@@ -1,26 +1,34 @@
 """Groups of photographs of a folder that one camera took, with the camera data from their EXIF tags.
 
-Photographs with the same make, model, serial number, lens, focal length and size form a group. Missing pixel
-sizes and focal lengths are assumed, and the draft states so.
+Photographs with the same make, model, serial number, lens, focal length and size form a group. It is divided
+by the cameras that the names of the photographs propose, unless serial numbers or times of exposure
+contradict them. Missing pixel sizes and focal lengths are assumed, and the draft states so.
 """
 
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import escape
+from pathlib import PurePosixPath
+
+import numpy as np
 
 from sfm.photographs.exif import Metadata
 from sfm.remarks.remark import Remark, remark
+from sfm.survey.drafting.camera_names import NamedCameras, cameras_in_names
+from sfm.survey.inputs.settings import RigSettings
 
 FOCAL_PER_SIDE = 1.2  # assumed focal length over the longer side of the photograph
 FULL_FRAME_MM = 36.0  # assumed longer side of the sensor
 # Makers name fisheye lenses "EF8-15mm f/4L FISHEYE USM", "AF Fisheye Nikkor 16mm f/2.8D" or "7.5mm Fish-eye".
 FISHEYE_NAME = re.compile("fish-?eye", re.IGNORECASE)
 MIN_IN_GROUP = 2  # photographs of a camera; one with fewer is left out if another camera has so many
+# Photographs of one moment differ by the tolerance of a rig, and by the whole seconds that EXIF data state.
+MAX_APART_S = float(RigSettings.model_fields["tolerance_s"].default) + 1.0
 
 SensorWidth = Callable[[str, str], float | None]
 """width of the sensor (mm) of a camera by make and model; None where it is unknown"""
@@ -44,30 +52,43 @@ class CameraGroup:
 
 
 @dataclass(frozen=True)
+class ProposedRig:
+    """Cameras that seem to be mounted on one frame, because the names of their photographs pair up."""
+
+    cameras: tuple[str, ...]  # their names; the first is the reference
+    moment: str  # of `[[rig]]`
+    moments: int  # with a photograph of more than one camera
+    example: tuple[str, ...]  # photographs of one moment
+
+
+@dataclass(frozen=True)
 class Grouping:
     """The cameras of a folder, and photographs that a survey cannot use."""
 
     cameras: tuple[CameraGroup, ...]  # the camera with most photographs first
     left_out: tuple[tuple[str, str], ...]  # name, reason
+    rig: ProposedRig | None = None
 
 
 def group_photographs(
     metadata: dict[str, Metadata], sensor_width: SensorWidth = lambda make, model: None
 ) -> Grouping:
-    """Return the cameras that took the photographs.
+    """Return the cameras that took the photographs, and the rig that they may be mounted on.
 
-    Photographs with the same make, model, serial number, lens, focal length and size belong together. If no
-    file states the maker, the part of the file name before its last number identifies the camera.
+    Photographs with the same make, model, serial number, lens, focal length and size belong together, unless
+    their names propose several cameras, see `cameras_in_names`.
 
     Args:
         metadata: metadata of every readable photograph, by its file name.
         sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
     """
-    groups: dict[tuple[object, ...], list[str]] = {}
-    by_name = not any(one.make for one in metadata.values())
+    named = cameras_in_names(sorted(metadata))
+    if named is not None and (_is_one_camera(named, metadata) or _are_apart(named, metadata)):
+        named = None
+    groups: dict[tuple[object, ...], list[str]] = defaultdict(list)
     for name, one in sorted(metadata.items()):
-        key = (one.make, one.model, one.serial, one.lens, _rounded(one.focal_mm), one.size_px)
-        groups.setdefault((*key, _name_before_number(name) if by_name else ""), []).append(name)
+        part = named.camera.get(name, "") if named is not None else ""
+        groups[*_camera_data(one), part].append(name)
     largest = max((len(names) for names in groups.values()), default=0)
     kept, left_out = [], []
     for names in sorted(groups.values(), key=lambda names: (-len(names), names)):
@@ -75,13 +96,66 @@ def group_photographs(
             kept.append(names)
         else:
             left_out += [(name, _reason_left_out(metadata[name], metadata[kept[0][0]])) for name in names]
-    labels = _labels([metadata[names[0]] for names in kept])
+    parts = [named.camera.get(names[0], "") if named is not None else "" for names in kept]
+    labels = _labels([metadata[names[0]] for names in kept], parts)
     return Grouping(
         tuple(
             _group(label, tuple(names), metadata, sensor_width)
             for label, names in zip(labels, kept, strict=True)
         ),
         tuple(left_out),
+        None if named is None else _rig(named, dict(zip(labels, kept, strict=True))),
+    )
+
+
+def _camera_data(one: Metadata) -> tuple[object, ...]:
+    """Return what tells cameras and their settings apart."""
+    return one.make, one.model, one.serial, one.lens, _rounded(one.focal_mm), one.size_px
+
+
+def _is_one_camera(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
+    """Return whether serial numbers show that one camera took what the names give to several."""
+    of: dict[object, set[str]] = defaultdict(set)
+    for name, part in named.camera.items():
+        one = metadata[name]
+        if one.serial:
+            of[one.make, one.model, one.serial].add(part)
+    return any(len(some) > 1 for some in of.values())
+
+
+def _are_apart(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
+    """Return whether the times of exposure contradict that the cameras take photographs together.
+
+    The clocks of cameras differ by a constant. A camera that is carried on has no constant difference.
+    """
+    of: dict[str, dict[str, float]] = defaultdict(dict)
+    for name, part in named.camera.items():
+        taken = metadata[name].taken
+        if taken is not None:
+            of[part][named.moment[name]] = taken.timestamp()
+    reference, *others = sorted(of.values(), key=len, reverse=True) or [{}]
+    for times in others:
+        ahead = np.array([times[one] - reference[one] for one in times if one in reference])
+        if len(ahead) > 1 and (np.abs(ahead - np.median(ahead)) > MAX_APART_S).mean() > 0.5:
+            return True
+    return False
+
+
+def _rig(named: NamedCameras, cameras: Mapping[str, Sequence[str]]) -> ProposedRig | None:
+    """Return the rig of named cameras; None if a camera is not one group, or few photographs pair up."""
+    of = {label: names for label, names in cameras.items() if names[0] in named.camera}
+    parts = [named.camera[names[0]] for names in of.values()]
+    if len(of) < 2 or len(set(parts)) < len(parts) or not named.pattern:
+        return None
+    together: dict[str, list[str]] = defaultdict(list)
+    for label in sorted(of):
+        for name in of[label]:
+            together[named.moment[name]].append(name)
+    shared = [tuple(names) for names in together.values() if len(names) > 1]
+    if 2 * sum(map(len, shared)) <= sum(map(len, of.values())):
+        return None
+    return ProposedRig(
+        tuple(sorted(of)), named.pattern, len(shared), max(shared, key=lambda names: len(names))
     )
 
 
@@ -166,24 +240,22 @@ def _reason_left_out(one: Metadata, main: Metadata) -> str:
         )
     if _rounded(one.focal_mm) != _rounded(main.focal_mm):
         return f"the only one with c = {one.focal_mm or 0:g} mm, the others have {main.focal_mm or 0:g} mm"
-    return f"the only one of camera {one.make or ''} {one.model or ''} {one.serial or ''}".rstrip()
+    camera = " ".join(filter(None, (one.make, one.model, one.serial)))
+    return f"the only one of camera {camera}" if camera else "the only one whose name is like this"
 
 
 def _rounded(focal: float | None) -> float | None:
     return None if focal is None else float(f"{focal:.3g}")
 
 
-def _name_before_number(name: str) -> str:
-    """Return the part of a name before its last number; "" if it contains a date."""
-    found = re.fullmatch(r"(.*?)\d+(\D*)", name)
-    prefix = found[1] if found else ""
-    return "" if re.search(r"(19|20)\d{6}", prefix) else prefix
-
-
-def _labels(firsts: list[Metadata]) -> list[str]:
-    """Return unique names of the cameras."""
-    words = [re.sub(r"[^A-Za-z0-9]+", "-", one.model or "").strip("-").lower() for one in firsts]
-    plain = [word or "unnamed" for word in words]
+def _labels(firsts: Sequence[Metadata], parts: Sequence[str]) -> list[str]:
+    """Return unique names of the cameras: the part of the file names that stands for each, or the model."""
+    models = [_word(one.model or "") for one in firsts]
+    plain = [
+        part if part and not part.isdigit() else "-".join(filter(None, (model or (part and "camera"), part)))
+        for model, part in zip(models, map(_word, _without_common(parts)), strict=True)
+    ]
+    plain = [name or "unnamed" for name in plain]
     total, seen = Counter(plain), Counter[str]()
     labels = []
     for name in plain:
@@ -192,16 +264,38 @@ def _labels(firsts: list[Metadata]) -> list[str]:
     return labels
 
 
+def _word(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-").lower()
+
+
+def _without_common(parts: Sequence[str]) -> list[str]:
+    """Return paths of folders without the folders that all of them have."""
+    split = [PurePosixPath(part).parts for part in parts]
+    differing = [j for j in range(min(map(len, split), default=0)) if len({one[j] for one in split}) > 1]
+    return [
+        "/".join(one[j] for j in differing) if differing else part
+        for one, part in zip(split, parts, strict=True)
+    ]
+
+
 def _globs(names: tuple[str, ...], everything: tuple[str, ...]) -> tuple[str, ...]:
     """Return a glob that matches only these photographs, else their names."""
-    first, last = min(names), max(names)
-    start = 0
-    while start < min(len(first), len(last)) and first[start] == last[start]:
-        start += 1
-    prefix = first[:start].rstrip("0123456789") if start < len(first) else first
+    prefix = _common_start(names).rstrip("0123456789") if len(names) > 1 else names[0]
+    suffix = _common_start([name[::-1] for name in names])[::-1].lstrip("0123456789")
     endings = {name.rpartition(".")[2] for name in names}
-    if len(endings) == 1:
-        glob = f"{escape(prefix)}*.{escape(endings.pop())}"
-        if {name for name in everything if fnmatchcase(name, glob)} == set(names):
+    for ending in (f".{endings.pop()}" if len(endings) == 1 else "", suffix):
+        glob = f"{escape(prefix)}*{escape(ending)}"
+        if ending and {name for name in everything if _matches(name, glob)} == set(names):
             return (glob,)
     return tuple(escape(name) for name in sorted(names))
+
+
+def _common_start(names: Sequence[str]) -> str:
+    first, last = min(names), max(names)
+    length = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
+    return first[:length]
+
+
+def _matches(name: str, glob: str) -> bool:
+    """Return whether a glob matches a name, folder by folder as when files are searched."""
+    return name.count("/") == glob.count("/") and fnmatchcase(name, glob)

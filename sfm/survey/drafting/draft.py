@@ -11,17 +11,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
+from typing import NoReturn
 
 import numpy as np
 
 from sfm.display import agreeing, counted
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.files.globs import why_no_folder
+from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.drafting.camera_groups import CameraGroup, Grouping, SensorWidth, group_photographs
+from sfm.survey.drafting.camera_groups import (
+    CameraGroup,
+    Grouping,
+    ProposedRig,
+    SensorWidth,
+    group_photographs,
+)
+from sfm.survey.drafting.camera_names import IN_ORDER
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -29,7 +37,10 @@ from sfm.survey.orientation import FISHEYE
 from sfm.targets.codes.plates import BOARDS, FAMILIES, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+DEPTHS = ("*", "*/*")  # where photographs are searched; the first that has some is used
 COMMENT_WIDTH = 100  # characters
+MOMENT_IN_NAMES = "in brackets: what photographs of one moment have in common"
+MOMENTS = {IN_ORDER: "the first photographs of all cameras are of one moment, and so on"}
 FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
 FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
@@ -62,7 +73,8 @@ def draft_survey(
     """Draft a survey file for the photographs in a folder.
 
     Args:
-        folder: contains the photographs; subfolders are not searched.
+        folder: contains the photographs. Its subfolders are searched if it contains none itself, and are used
+            if they contain the photographs of the cameras of a rig.
         sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
         pitch: distance of neighbouring dots or crossings if there is a plate, mm; assumed if not given.
         store: stores the targets that the trial measures.
@@ -74,6 +86,8 @@ def draft_survey(
     """
     metadata, unreadable = _metadata(folder)
     grouping = group_photographs(metadata, sensor_width)
+    if grouping.rig is None and any("/" in name for name in metadata):
+        _refuse_folder(folder)
     used = [name for camera in grouping.cameras for name in camera.photographs]
     if len(used) < 2:
         raise GeometryError(
@@ -97,32 +111,45 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
     """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
-    every = sorted(folder.iterdir())
-    files = [
-        path for path in every if (path.suffix.lower() in SUFFIXES or conversion_of(path)) and path.is_file()
-    ]
+    files = next((files for depth in DEPTHS if (files := _files(folder, depth))), [])
     if all(conversion_of(path) for path in files):
-        content = (
-            f"it contains {', '.join(as_plain(path.name) for path in every[:MAX_SHOWN])}"
-            if every
-            else "it is empty"
-        )
-        content += f": {conversion_of(files[0])}" if files else ""
-        content += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
-        raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
+        _refuse_folder(folder, files)
     metadata, unreadable = {}, []
     for path in files:
-        if not is_plain(path.name):
-            unreadable.append((as_plain(path.name), "its name has control or invisible characters"))
+        name = path.relative_to(folder).as_posix()
+        if not is_plain(name):
+            unreadable.append((as_plain(name), "its name has control or invisible characters"))
             continue
         if not (path.resolve().is_relative_to(folder.resolve()) or is_home_file(path)):
-            unreadable.append((path.name, "a link out of the folder, and not to a file in your home folder"))
+            unreadable.append((name, "a link out of the folder, and not to a file in your home folder"))
             continue
         try:
-            metadata[path.name] = read_metadata(path)
+            metadata[name] = read_metadata(path)
         except PhotographError as error:
-            unreadable.append((path.name, str(error).removeprefix(f"{path.name}: ")))
+            unreadable.append((name, str(error).removeprefix(f"{path.name}: ")))
     return metadata, tuple(unreadable)
+
+
+def _files(folder: Path, pattern: str) -> list[Path]:
+    """Return the photographs and raw files of a folder, and of its subfolders as the pattern asks."""
+    return [
+        path
+        for path in find_files(folder, pattern, hidden=pattern == DEPTHS[0])
+        if path.suffix.lower() in SUFFIXES or conversion_of(path)
+    ]
+
+
+def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
+    """Refuse a folder without photographs of its own, whose subfolders are not those of a rig."""
+    every = sorted(folder.iterdir())
+    content = (
+        f"it contains {', '.join(as_plain(path.name) for path in every[:MAX_SHOWN])}"
+        if every
+        else "it is empty"
+    )
+    content += f": {conversion_of(raw[0])}" if raw else ""
+    content += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
+    raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
 
 
 def _has_photographs(folder: Path) -> bool:
@@ -149,6 +176,8 @@ def _text(
     ]
     for camera in grouping.cameras:
         lines += ["", *_camera_lines(camera, _free_parameters(trial))]
+    if grouping.rig is not None:
+        lines += ["", *_rig_lines(grouping.rig)]
     if left_out:
         lines += ["", "# Left out:"]
         lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
@@ -194,6 +223,17 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
         *_model_lines(camera, free),
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
+
+
+def _rig_lines(rig: ProposedRig) -> list[str]:
+    return [
+        f"# Names pair up: {counted(rig.moments, 'moment')}, as {as_plain(' and '.join(rig.example))}.",
+        "# Check that the cameras are fixed to one another and triggered together; else remove this section.",
+        "[[rig]]",
+        'name = "rig"',
+        f"cameras = {json.dumps(list(rig.cameras))}  # the first is the reference",
+        f"moment = {_quoted(rig.moment)}  # {MOMENTS.get(rig.moment, MOMENT_IN_NAMES)}",
+    ]
 
 
 def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
@@ -310,6 +350,14 @@ def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[t
         )
         for camera in grouping.cameras
     ]
+    if grouping.rig is not None:
+        found.append(
+            (
+                "rig",
+                f"{' and '.join(grouping.rig.cameras)}, {counted(grouping.rig.moments, 'moment')} by the "
+                "names; check that the cameras are fixed to one another, else remove [[rig]]",
+            )
+        )
     if trial.plate is not None:
         found.append(("targets", "; ".join(map(_described, trial.plates))))
         found += [("left out", f"{_described(plate)} ({why})") for plate, why in trial.left_out]
