@@ -34,6 +34,7 @@ Pitch = Annotated[
         "survey file.  [default: assumed]",
     ),
 ]
+RINGS_PICTURE = "-rings.png"  # after the name of a drafted survey file
 SURVEY_FILE = "survey.toml"  # name in a folder of photographs
 SurveyFile = Annotated[
     Path, typer.Argument(metavar="SURVEY.toml", help="Survey file; its paths are relative to its folder.")
@@ -453,6 +454,10 @@ def _write_draft(draft: Draft, photographs: Path, file: Path) -> None:
     from sfm.remarks.verdict import lines_of
     from sfm.report.output import path_from
 
+    picture = file.with_name(f"{file.stem}{RINGS_PICTURE}")
+    if draft.rings:
+        with whole_file(picture) as part:
+            part.write_bytes(draft.rings)
     stated = PHOTOGRAPHS + json.dumps(path_from(file.parent, photographs))
     with whole_file(file) as part:
         try:
@@ -466,4 +471,6 @@ def _write_draft(draft: Draft, photographs: Path, file: Path) -> None:
         print(as_plain(f"{mark} {line.text} {line.remedy}".rstrip()), file=sys.stderr)
     for name, why in draft.left_out:
         print(as_plain(f"  left out: {name}: {why}"), file=sys.stderr)
+    if draft.rings:
+        print(f"Rings that were not read: {picture}", file=sys.stderr)
     print(f"Survey file: {file}", file=sys.stderr)

@@ -49,6 +49,23 @@ DRAFTS = (
         "Add coded targets.",
     ),
     Kind(
+        "circles_in_rows",
+        "warning",
+        "A photograph has {circles:circle}, in up to {rows} rows and {columns} columns, but no two "
+        "photographs show the same whole plate: texture orients the photographs.",
+        "a plate of dots that is cut by the border or covered, or targets without codes",
+        "If it is a plate, state its rows and columns as the survey file shows; or add coded targets.",
+    ),
+    Kind(
+        "rings_not_read",
+        "warning",
+        "{ringed} of {dots} dots of {photograph} have rings that no known family of codes reads: texture "
+        "orients the photographs.",
+        "codes of another family, or rings of other proportions; too small, blurred or mirrored",
+        "Compare the picture beside the survey file with the families; give a table of codes, or use other "
+        "targets.",
+    ),
+    Kind(
         "plate_pitch_assumed",
         "note",
         "The pitch of the plate is assumed to be {pitch}.",

@@ -13,6 +13,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import NoReturn
 
+import cv2
 import numpy as np
 
 from sfm.display import agreeing, counted
@@ -34,7 +35,7 @@ from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targe
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
-from sfm.targets.codes.plates import BOARDS, FAMILIES, PLATES, PlateFamily
+from sfm.targets.codes.plates import BOARDS, FAMILIES, GRIDS, PLATES, PlateFamily
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 DEPTHS = ("*", "*/*")  # where photographs are searched; the first that has some is used
@@ -49,6 +50,7 @@ SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings a
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
 MAX_SHOWN = 8  # names listed on a line
+SHOWN_ROWS, SHOWN_COLUMNS = 4, 6  # dots in a picture of unread rings
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class Draft:
     found: tuple[tuple[str, str], ...]  # (subject, finding), for the terminal
     remarks: tuple[Remark, ...]  # points for a person to check
     left_out: tuple[tuple[str, str], ...]  # (photograph, reason)
+    rings: bytes = (
+        b""  # PNG picture of dots with rings that no family of codes reads, empty without such dots
+    )
 
 
 def draft_survey(
@@ -94,7 +99,7 @@ def draft_survey(
             f"{folder}: {counted(len(used), 'photograph')} of one camera, at least 2 are needed"
             + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:MAX_SHOWN])
         )
-    trial = try_targets([folder / name for name in used], store=store, progress=progress)
+    trial = try_targets([folder / name for name in used], folder=folder, store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
     positions = sum(metadata[one].position is not None for one in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
@@ -104,6 +109,7 @@ def draft_survey(
         _findings(grouping, trial, positions),
         _remarks(grouping, trial, pitch),
         left_out,
+        _rings_picture(trial),
     )
 
 
@@ -259,8 +265,33 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
     tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"
     lines = [tried, *kinds]
     if trial.codes == "none":
-        return [*lines, "# No coded targets: points of natural texture take their place.", "[tie_points]"]
+        lines += ["# No coded targets: points of natural texture take their place.", "[tie_points]"]
+        return lines + (_lattice_lines(trial.lattice, pitch) if trial.lattice and not trial.ringed else [])
     return [*lines, "[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
+
+
+def _lattice_lines(lattice: tuple[int, int], pitch: float | None) -> list[str]:
+    """Return commented lines for circles in rows and columns that may be a plate."""
+    rows, columns = lattice
+    return [
+        f"# Circles are in up to {rows} rows and {columns} columns. If they are a plate, correct these lines",
+        "# and put them in place of [tie_points]:",
+        "# [targets]",
+        f"# codes = {_quoted(next(iter(GRIDS)))}  # or {', '.join(list(GRIDS)[1:])}",
+        f"# rows = {rows}",
+        f"# columns = {columns}",
+        f"# pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots in a row",
+    ]
+
+
+def _rings_picture(trial: TargetTrial) -> bytes:
+    """Return a picture of the dots with unread rings of the photograph that has most; empty without any."""
+    if not trial.ringed:
+        return b""
+    crops = list(max(trial.ringed, key=lambda one: len(one.crops)).crops[: SHOWN_ROWS * SHOWN_COLUMNS])
+    crops += [np.full_like(crops[0], 255)] * (-len(crops) % SHOWN_COLUMNS)
+    rows = [np.hstack(crops[k : k + SHOWN_COLUMNS]) for k in range(0, len(crops), SHOWN_COLUMNS)]
+    return cv2.imencode(".png", np.vstack(rows))[1].tobytes()
 
 
 def _kinds_of_codes() -> str:
@@ -388,7 +419,15 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
         remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
         remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
-    if trial.codes == "none" and trial.circles >= MIN_TARGETS:
+    if trial.ringed:
+        most = max(trial.ringed, key=lambda one: len(one.crops))
+        remarks.append(
+            remark("rings_not_read", photograph=most.photograph, dots=most.dots, ringed=len(most.crops))
+        )
+    elif trial.codes == "none" and trial.lattice is not None:
+        rows, columns = trial.lattice
+        remarks.append(remark("circles_in_rows", circles=round(trial.circles), rows=rows, columns=columns))
+    elif trial.codes == "none" and trial.circles >= MIN_TARGETS:
         remarks.append(remark("circles_without_codes", circles=round(trial.circles)))
     return tuple(remarks)
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.kernels.sampling import as_grey
@@ -28,9 +29,12 @@ from sfm.targets.codes.concentric import read_resolved
 from sfm.targets.codes.dot_plates import find_lattice
 from sfm.targets.codes.plate_search import (
     KALIBR_TAGS,
-    MIN_DOTS_OF_PLATE,
+    MANY_DOTS,
+    SEARCHED_PX,
     Part,
     checkerboard_of_parts,
+    has_interrupted_ring,
+    lattice_size,
     part_of_checkerboard,
     search_april_grids,
     search_charuco,
@@ -39,13 +43,14 @@ from sfm.targets.codes.plate_search import (
     shows_a_lattice,
 )
 from sfm.targets.codes.plates import PlateFamily, code_family, group_plates
-from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily, read_codes
+from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, UNCODED, CodeFamily, read_codes
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,
     TagFamily,
     corner_name,
     read_dictionaries,
     smallest_dictionary,
+    tag_family,
 )
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.measure import shape_from_axes
@@ -56,9 +61,29 @@ MIN_READABLE = 2  # photographs
 MIN_CODES = 2  # of a family in one picture; chance seldom reads so many
 MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 LOOK_PX = 900  # longer side of the pictures for a first look
+# Longer side of the picture in which few small circles are searched, and their smallest diameter in it. In
+# 24 million px of texture this takes 1 to 2 s a photograph, at full size 5 to 15 s.
+FEW_PX, FEW_DIAMETER_PX = 1800, 6.0
 # Pixels of a photograph over pixels of such a picture beyond which a first look saves time.
 MIN_PIXEL_RATIO = 3.0
+CROP_PX, CROP_RADII = 160, 6.0  # side of the picture of a dot with its ring; half of it in radii of the dot
+Tags = dict[str, tuple[IntArray, FloatArray]]  # of a photograph, by dictionary, see `read_dictionaries`
+NO_TAGS = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
 MIN_TARGETS = 12  # circles in a photograph; chance seldom finds so many
+
+
+@dataclass(frozen=True)
+class Ringed:
+    """Dots of a photograph with interrupted rings around them, as codes have."""
+
+    photograph: str
+    crops: tuple[AnyArray, ...]  # pictures of these dots, uint8, each (CROP_PX, CROP_PX)
+    dots: int  # circles of the photograph, with such rings or without
+
+    @property
+    def are_most(self) -> bool:
+        """Whether most dots have rings, and they are enough for two families of codes."""
+        return len(self.crops) >= MIN_REPEATED and 2 * len(self.crops) > self.dots
 
 
 @dataclass(frozen=True)
@@ -75,6 +100,8 @@ class TargetTrial:
     plates: tuple[PlateFamily, ...] = ()  # calibration plates; the others are seen with the first
     left_out: tuple[tuple[PlateFamily, str], ...] = ()  # (plate that cannot be used with the first, reason)
     unreadable: tuple[tuple[str, str], ...] = ()  # (photograph that could not be decoded, reason)
+    lattice: tuple[int, int] | None = None  # most rows and columns of circles, if they are no known plate
+    ringed: tuple[Ringed, ...] = ()  # photographs most of whose dots have rings that no family reads
 
     @property
     def plate(self) -> PlateFamily | None:
@@ -83,7 +110,11 @@ class TargetTrial:
 
 
 def try_targets(
-    paths: Sequence[Path], *, store: MeasuredStore | None = None, progress: Progress = SILENT
+    paths: Sequence[Path],
+    *,
+    folder: Path | None = None,
+    store: MeasuredStore | None = None,
+    progress: Progress = SILENT,
 ) -> TargetTrial:
     """Return the targets that photographs show.
 
@@ -92,6 +123,7 @@ def try_targets(
 
     Args:
         paths: photographs in their order; those that cannot be decoded are skipped.
+        folder: folder to which their names are relative; only the names of the files if not given.
         store: stores the measurements, so that the survey need not repeat them.
         progress: receives every photograph and family.
 
@@ -99,8 +131,9 @@ def try_targets(
         GeometryError: fewer than two of them can be decoded.
     """
     progress.stage("trial", TRIED + 5)
-    tried, photographs, unreadable = _read_spread(paths, progress)
-    names = tuple(path.name for path in tried)
+    tried, photographs, unreadable = _read_spread(paths, folder, progress)
+    names = tuple(_name_in(folder, path) for path in tried)
+    tagged = ""
     if min(one.size for one in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
         greys = [_as_bytes(photograph) for photograph in photographs]
         looks = [_look(grey) for grey in greys]
@@ -108,7 +141,8 @@ def try_targets(
         if not any(look.shows_targets for look in looks) and board is None:
             circles = float(np.median([look.circles for look in looks]))
             return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
-    plain = [_measure(path, "none", store) for path in tried]
+        tagged, _ = _shared_family([look.tags for look in looks])
+    plain = [_measure(path, tagged or "none", store) for path in tried]  # with tags: not measured twice
     counts: dict[str, tuple[int, ...]] = {}
     for families in (RINGS, NECKLACES):  # necklaces have no parity, and also read rings of other families
         if all(len(codes) < MIN_REPEATED for codes in counts.values()):
@@ -118,16 +152,25 @@ def try_targets(
     progress.advance("rings")
     best, measured = max(counts, key=lambda family: len(counts[family])), plain
     plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
+    ringed: tuple[Ringed, ...] = ()
     if len(counts[best]) < MIN_REPEATED:
         refused = {name for name, _ in unreadable}
-        more = [paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED) if paths[k].name not in refused]
+        more = [
+            paths[k]
+            for k in _spread_evenly(len(paths), PLATES_TRIED)
+            if _name_in(folder, paths[k]) not in refused
+        ]
         read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
         tags, plates = _tags_and_boards(read_already, more, progress)
         if not plates and tags:
-            measured = [_measure(path, tags, store) for path in tried]
-            counts[tags], best = _repeated_codes([one.code for one in measured]), tags
-        else:
-            dots = _dot_plate(plain, [path for path in more if path not in tried], store)
+            measured = plain if tags == tagged else [_measure(path, tags, store) for path in tried]
+            counts[tags] = _repeated_codes([one.code for one in measured])
+            best = max(counts, key=lambda family: len(counts[family]))
+        if plates or len(counts[best]) < MIN_REPEATED:  # else these are tags
+            ringed = tuple(map(_ringed, names, read_already.values(), plain))
+            dots = None
+            if not any(one.are_most for one in ringed):
+                dots = _dot_plate(plain, [path for path in more if path not in tried], store)
             seen = zip(read_already.values(), plain, strict=True)
             if dots is None or not plates:
                 plates = plates if dots is None else (dots,)
@@ -136,7 +179,7 @@ def try_targets(
             else:
                 left_out = ((dots, "no photograph tried shows it with the first plate"),)
         progress.advance("plates of dots")
-        if not plates and not tags:
+        if not plates and len(counts[best]) < MIN_REPEATED:
             read = [read_resolved(photograph) for photograph in photographs]
             counts |= {family: _repeated_codes([one[family] for one in read]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
@@ -151,12 +194,14 @@ def try_targets(
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
-        float(np.median([np.isfinite(one.axes_covariance[:, 0, 0]).sum() for one in measured])),
+        float(np.median([_is_circle(one).sum() for one in measured])),
         _blur(measured),
         names,
         plates,
         left_out,
         unreadable,
+        None if coded or plates else _largest_lattice(plain),
+        () if coded or plates else tuple(one for one in ringed if one.are_most),
     )
 
 
@@ -187,13 +232,48 @@ def _side_by_side(
     return tuple(used), tuple(left_out)
 
 
+def _is_circle(targets: Targets) -> BoolArray:
+    """Return which targets are circles, and not corners of tags, (k,)."""
+    return np.asarray(np.isfinite(targets.axes_covariance[:, 0, 0]))
+
+
 def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray:
     """Return the codes of measured targets in a family of rings, negative without a code, (k,)."""
     rings = code_family(family)
     assert isinstance(rings, CodeFamily)
-    levels = np.column_stack([targets.background, targets.contrast])
-    shape = shape_from_axes(targets.semi_axes, targets.angle)
-    return read_codes(as_grey(photograph), targets.xy, shape, levels, rings, blur_px=targets.blur)[0]
+    circle = _is_circle(targets)
+    levels = np.column_stack([targets.background, targets.contrast])[circle]
+    shape = shape_from_axes(targets.semi_axes[circle], targets.angle[circle])
+    blur = targets.blur[circle]
+    code = np.full(len(targets), UNCODED)
+    code[circle] = read_codes(as_grey(photograph), targets.xy[circle], shape, levels, rings, blur_px=blur)[0]
+    return code
+
+
+def _ringed(name: str, grey: AnyArray, targets: Targets) -> Ringed:
+    """Return the dots of a photograph (uint8) that have interrupted rings around them."""
+    circle = _is_circle(targets)
+    xy, shape = targets.xy[circle], shape_from_axes(targets.semi_axes[circle], targets.angle[circle])
+    scale = 255 / scale_of(grey) if grey.dtype != np.uint8 else 1.0
+    levels = scale * np.column_stack([targets.background, targets.contrast])[circle]
+    rows = np.flatnonzero(has_interrupted_ring(grey, xy, shape, levels))
+    side = CROP_RADII * np.sqrt(targets.semi_axes[circle].prod(axis=1))
+    crops = tuple(
+        cv2.warpAffine(
+            grey,
+            np.array([[s, 0, CROP_PX / 2 - s * x], [0, s, CROP_PX / 2 - s * y]]),
+            (CROP_PX, CROP_PX),
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        for (x, y), s in zip(xy[rows], CROP_PX / 2 / side[rows], strict=True)
+    )
+    return Ringed(name, crops, int(circle.sum()))
+
+
+def _largest_lattice(photographs: Sequence[Targets]) -> tuple[int, int] | None:
+    """Return the rows and columns of the largest lattice of circles; None without one of a plate's size."""
+    sizes = [size for one in photographs if (size := lattice_size(one.xy[_is_circle(one)])) is not None]
+    return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
 def _tags_and_boards(
@@ -203,7 +283,7 @@ def _tags_and_boards(
 
     Tags on a checkerboard show that it is a ChArUco board.
     """
-    none, tried = (np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))), list(read_already.values())
+    tried = list(read_already.values())
     others = [_as_bytes(read_photograph(path)) for path in more if path not in read_already]
     grids = search_april_grids(tried, others)  # first, since modules of tags may look like squares
     if grids:
@@ -215,16 +295,27 @@ def _tags_and_boards(
     if any(read):
         read += [read_dictionaries(photograph) for photograph in others]
     progress.advance("tags")
-    repeated = {
-        family: _shared_numbers([one.get(family, none)[0] for one in read]) for family in LARGEST_DICTIONARIES
-    }
-    family = max(repeated, key=lambda name: len(repeated[name]))
-    if not len(repeated[family]):
+    family, largest = _shared_family(read)
+    if not family:
         return "", boards
-    seen = [one.get(family, none) for one in read]
-    family = smallest_dictionary(family, repeated[family])
+    seen = [one.get(largest, NO_TAGS) for one in read]
     charuco = search_charuco([*tried, *others], family, seen)
     return family, boards if charuco is None else (charuco,)
+
+
+def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:
+    """Return the dictionary with most tags that two photographs have, and the largest one that contains it.
+
+    Where two dictionaries read as many tags, the smaller one is right: chance reads fewer of its tags.
+    """
+    repeated = {
+        family: _shared_numbers([one.get(family, NO_TAGS)[0] for one in read])
+        for family in LARGEST_DICTIONARIES
+    }
+    largest = max(repeated, key=lambda name: (len(repeated[name]), -tag_family(name).count))
+    if not len(repeated[largest]):
+        return "", ""
+    return smallest_dictionary(largest, repeated[largest]), largest
 
 
 def _shared_numbers(photographs: Sequence[IntArray]) -> IntArray:
@@ -239,7 +330,8 @@ def _dot_plate(
     """Return the plate of dots that photographs show; `others` are measured if one has a lattice."""
 
     def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
-        return targets.xy, np.sqrt(targets.semi_axes.prod(axis=1)), targets.polarity
+        circle = _is_circle(targets)
+        return targets.xy[circle], np.sqrt(targets.semi_axes[circle].prod(axis=1)), targets.polarity[circle]
 
     seen = [circles(one) for one in plain]
     if any(shows_a_lattice(xy) for xy, _, _ in seen):
@@ -263,37 +355,44 @@ class _Look:
 
     shows_targets: bool  # codes, plates, or many circles
     circles: int
+    tags: Tags = field(default_factory=dict)
     board: Part | None = None  # part of a checkerboard; not searched for if there are targets
 
 
 def _look(grey: AnyArray) -> _Look:
-    """Look for targets where they are found fast: in the whole reduced picture, and in its full-size middle.
+    """Look for targets where they are found fast: in two reduced pictures, and in the full-size middle.
 
-    The targets of a photograph have about the same size. The reduced picture shows large targets. Small
-    targets are many, so the middle shows some of them.
+    The reduced picture shows large targets, and the middle some of many small ones. Few small targets may be
+    anywhere: tags are read in the whole photograph, circles in the less reduced picture. There chance finds
+    circles too, and only codes or a lattice of them count.
     """
     height, width = grey.shape
     top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
     whole, middle = reduce_photograph(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
-    circles = 0
-    for picture in (whole, np.ascontiguousarray(middle)):
-        targets = find_targets(picture)
+    for picture in (whole, grey):
+        tags = read_dictionaries(picture)
+        if any(len(number) >= MIN_CODES for number, _ in tags.values()):
+            return _Look(True, 0, tags)
+    circles, less = 0, reduce_photograph(grey, FEW_PX)[0]
+    for picture in (whole, np.ascontiguousarray(middle), less):
+        targets = find_targets(picture, **({"min_diameter_px": FEW_DIAMETER_PX} if picture is less else {}))
         circles = max(circles, len(targets))
+        many = shows_a_lattice(targets.xy) if picture is less else len(targets) >= MIN_TARGETS
         rings = (*RINGS, *NECKLACES)
         if (
-            len(targets) >= MIN_TARGETS
+            many
             or any((_ring_codes(family, picture, targets) >= 0).sum() >= MIN_CODES for family in rings)
-            or any(len(number) >= MIN_CODES for number, _ in read_dictionaries(picture).values())
             or any(len(codes) for codes in read_resolved(picture).values())
         ):
-            return _Look(True, circles)
+            return _Look(True, circles, tags)
     part = part_of_checkerboard(grey)
-    board = part is not None and part[0][0] * part[0][1] >= MIN_DOTS_OF_PLATE
-    return _Look(board or len(read_april_tags(whole, KALIBR_TAGS)[0]) >= MIN_CODES, circles, part)
+    board = part is not None and part[0][0] * part[0][1] >= MANY_DOTS
+    searched, _ = reduce_photograph(grey, SEARCHED_PX)
+    return _Look(board or len(read_april_tags(searched, KALIBR_TAGS)[0]) >= MIN_CODES, circles, tags, part)
 
 
 def _read_spread(
-    paths: Sequence[Path], progress: Progress
+    paths: Sequence[Path], folder: Path | None, progress: Progress
 ) -> tuple[list[Path], list[AnyArray], tuple[tuple[str, str], ...]]:
     """Return photographs spread over the folder, their pixels, and the undecodable ones with the reason."""
     tried: dict[int, AnyArray] = {}
@@ -305,9 +404,9 @@ def _read_spread(
             try:
                 tried[k] = read_photograph(paths[k])
             except PhotographError as error:
-                refused[k] = paths[k].name, str(error).removeprefix(f"{paths[k].name}: ")
+                refused[k] = _name_in(folder, paths[k]), str(error).removeprefix(f"{paths[k].name}: ")
                 continue
-            progress.advance(paths[k].name)
+            progress.advance(_name_in(folder, paths[k]))
             break
     if len(tried) < MIN_READABLE:
         why = listed((f"{name}: {reason}" for name, reason in refused.values()), separator="; ")
@@ -315,6 +414,11 @@ def _read_spread(
             f"{counted(len(tried), 'readable photograph')}, at least {MIN_READABLE} are needed ({why})"
         )
     return [paths[k] for k in sorted(tried)], [tried[k] for k in sorted(tried)], tuple(refused.values())
+
+
+def _name_in(folder: Path | None, path: Path) -> str:
+    """Return the name of a photograph in a folder."""
+    return path.name if folder is None else path.relative_to(folder).as_posix()
 
 
 def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:

@@ -32,6 +32,7 @@ CORNERS = "abcd"
 # A black module narrower than this is not resolved from the code behind it, and the whole tag is fitted. The
 # same fit confirms the codes of larger tags, in a picture reduced to modules of this width.
 MIN_MODULE_PX = 3.0
+FEWEST_MODULES = 6  # along a side of a tag, with its border: those of 4x4
 # Such tags are searched in a picture enlarged by this factor, down to this side.
 ENLARGED, MIN_SIDE_PX = 2, 6.0
 # Part of the correctable bits that is corrected, and part of the border bits that may be wrong, for a code
@@ -258,7 +259,7 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
         is part of another is listed under the largest.
     """
     detector = cv2.aruco.ArucoDetector(
-        [opencv_dictionary(name) for name in LARGEST_DICTIONARIES], _reading_settings()
+        [opencv_dictionary(name) for name in LARGEST_DICTIONARIES], _reading_settings(max(photograph.shape))
     )
     for picture in (photograph, 255 - photograph):  # upright tags, or inverted ones
         corners, ids, _, which = detector.detectMarkersMultiDict(picture)
@@ -276,16 +277,25 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
 
 def smallest_dictionary(name: str, number: IntArray) -> str:
     """Return the smallest part of a dictionary that contains these numbers."""
-    kind, count = name.rsplit("_", 1)
+    kind, _, count = name.rpartition("_")
     parts = (f"{kind}_{n}" for n in (50, 100, 250, 1000)) if count == "1000" else (name,)
     return next(part for part in parts if tag_family(part).count > number.max(initial=0))
 
 
-def _reading_settings() -> cv2.aruco.DetectorParameters:
+def _reading_settings(longest_px: int) -> cv2.aruco.DetectorParameters:
+    """Return settings that also read small tags of large photographs; OpenCV begins at 45 px of 6000."""
     settings = cv2.aruco.DetectorParameters()
+    settings.minMarkerPerimeterRate = min(
+        settings.minMarkerPerimeterRate, _least_perimeter(FEWEST_MODULES) / longest_px
+    )
     settings.errorCorrectionRate = CORRECTED
     settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
     return settings
+
+
+def _least_perimeter(modules: int) -> float:
+    """Return the outline of the smallest tag, px; OpenCV counts its pixels, fewer along a diagonal."""
+    return 4 * MIN_MODULE_PX * modules / math.sqrt(2)
 
 
 def _detect_all(picture: AnyArray, family: TagFamily) -> tuple[FloatArray, IntArray]:
@@ -296,8 +306,7 @@ def _detect_all(picture: AnyArray, family: TagFamily) -> tuple[FloatArray, IntAr
     """
     dictionary, settings = opencv_dictionary(family.name), cv2.aruco.DetectorParameters()
     longest = max(picture.shape)
-    # OpenCV counts the pixels of an outline; along a diagonal there are fewer
-    settings.minMarkerPerimeterRate = 4 * MIN_MODULE_PX * family.modules / math.sqrt(2) / longest
+    settings.minMarkerPerimeterRate = _least_perimeter(family.modules) / longest
     quads, number = _detect(cv2.aruco.ArucoDetector(dictionary, settings), picture)
     for enlarged in (ENLARGED, 1):
         settings = cv2.aruco.DetectorParameters()
