@@ -136,16 +136,16 @@ def _without_other_objects(
         several positions.
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
-    found = find_contested_codes(photographs, matched.naming)
+    found = find_contested_codes(photographs, matched.naming, survey.family)
     moved = plates_elsewhere(found, photographs, survey.family)
     reasons = tuple((photographs.names[i], reason) for i, reason in sorted(found.left_out.items()))
     if found.left_out or found.main.keys() - matched.naming.code[list(found.main.values())]:
         estimate = _without_contested(photographs, matched.naming, matched.estimate, found)
         matched = _match_and_adjust(survey, photographs, matched.naming, replace(start, estimate=estimate))
-        found = find_contested_codes(photographs, matched.naming)
+        found = find_contested_codes(photographs, matched.naming, survey.family)
         for plate, images in plates_elsewhere(found, photographs, survey.family).items():
             moved[plate] = images | moved.get(plate, frozenset())
-    return matched, reasons, remarks_on_contested(found, photographs, matched.naming, moved)
+    return matched, reasons, remarks_on_contested(found, photographs, matched.naming, moved, survey.family)
 
 
 def _without_contested(

@@ -272,8 +272,7 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
         GeometryError: as in `orient_survey`.
     """
     found, failure = None, None
-    texture = survey.tie_points is not None
-    unsaid = [a for a, one in enumerate(survey.cameras) if texture and not one.states_model]
+    unsaid = [a for a, one in enumerate(survey.cameras) if not one.states_model]
     try:
         found = orient_survey(survey, measured)
     except GeometryError as error:

@@ -129,7 +129,7 @@ def test_a_photograph_with_three_codes_and_a_tenth_elsewhere_is_left_out(
     )
     targets: Any = tuple(SimpleNamespace(code=codes) for _ in range(6))
     photographs: Any = SimpleNamespace(names=tuple("abcdef"), targets=targets)
-    found = find_contested_codes(photographs, naming)
+    found = find_contested_codes(photographs, naming, None)
     assert sorted(found.places) == list(range(elsewhere))
     assert sorted(found.left_out) == ([5] if left_out else [])
 

@@ -23,8 +23,7 @@ ROWS = (
         "fisheye_taken",
         "note",
         "Camera {camera} has a fisheye lens and was adjusted with model opencv_fisheye: of {total} image "
-        "points of the tie points, {fitting} {fitting:fits|fit} this model and {before} a central "
-        "perspective.",
+        "points, {fitting} {fitting:fits|fit} this model and {before} a central perspective.",
         "the survey file does not state the model",
         "State the model in the survey file, which saves the trial.",
     ),

@@ -128,6 +128,15 @@ POINTS = (
         "Fix the plates to one another and photograph them again, or survey the states separately.",
     ),
     Kind(
+        "plate_points_apart",
+        "warning",
+        "{points:point} of the plate {points:has|have} rays that do not meet at one position, from "
+        "{photographs}: {points}.",
+        "a board of another size, of which a part was named; a lens that the model does not describe; or a "
+        "plate that was bent",
+        "Let kolinear init draft the survey anew; it finds rows, columns and model of the lens.",
+    ),
+    Kind(
         "code_rays_apart",
         "warning",
         "The rays to code {code} from {photographs} do not meet.",

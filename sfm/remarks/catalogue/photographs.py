@@ -403,6 +403,14 @@ ROWS = (
         "Survey it separately, or correct the codes.",
     ),
     Kind(
+        "photograph_with_points_elsewhere",
+        "warning",
+        "{points:point} of the plate {points:is|are} elsewhere than in the others: {points}[[; {agreeing} "
+        "{agreeing:agrees|agree} with it]].",
+        "another part of a larger board, another plate, or a lens that the model does not describe",
+        "Let kolinear init draft the survey anew; it finds rows, columns and model of the lens.",
+    ),
+    Kind(
         "photograph_not_explained",
         "warning",
         "{against} of its {points:point} {against:contradicts|contradict} the network, and no other c "

@@ -38,12 +38,15 @@ class ContestedCodes:
     """codes that a photograph shows at other points than the largest group, by photograph"""
 
 
-def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> ContestedCodes:
+def find_contested_codes(
+    photographs: MeasuredPhotographs, naming: Naming, family: TargetFamily | None
+) -> ContestedCodes:
     """Return the codes that are read at several positions, and the photographs that show another object.
 
     Args:
         photographs: all measured targets.
         naming: point of each target in the adjusted network.
+        family: codes of the survey; points of a plate have no codes, but are named like them.
     """
     whole, shown = _points_by_code(photographs, naming)
     contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
@@ -64,7 +67,7 @@ def find_contested_codes(photographs: MeasuredPhotographs, naming: Naming) -> Co
     for image, codes in foreign.items():
         group = next(one for one in groups if image in one)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
-        left_out[image] = _reason_for_other_object(codes, others)
+        left_out[image] = _reason_for_other_object(codes, others, plate=bool(plates_of(family)))
     main = {
         code: place
         for code, places in contested.items()
@@ -106,8 +109,9 @@ def remarks_on_contested(
     photographs: MeasuredPhotographs,
     naming: Naming,
     moved: Mapping[PlateFamily, frozenset[int]],
+    family: TargetFamily | None,
 ) -> tuple[Remark, ...]:
-    """Return the remarks on plates that moved, and on every other code read at several positions."""
+    """Return the remarks on plates that moved or do not fit, and on other codes at several positions."""
     remarks = [
         remark(
             "plate_elsewhere",
@@ -117,8 +121,21 @@ def remarks_on_contested(
         for plate, images in moved.items()
     ]
     of_moved = {code for plate in moved for code in range(plate.first_point, plate.last_point + 1)}
+    of_plates = {
+        code for plate in plates_of(family) for code in range(plate.first_point, plate.last_point + 1)
+    }
+    apart = sorted((found.places.keys() & of_plates) - of_moved)
+    if apart:
+        images = {image for code in apart for image in found.places[code]}
+        remarks.append(
+            remark(
+                "plate_points_apart",
+                points=[str(code) for code in apart],
+                photographs=[photographs.names[i] for i in sorted(images)],
+            )
+        )
     for code, places in sorted(found.places.items()):
-        if code in of_moved:
+        if code in of_plates:
             continue
         number = str(_number(code, naming))
         main = found.main.get(code, UNNAMED)
@@ -213,9 +230,11 @@ def _majority_point(places: dict[int, frozenset[int]], group: frozenset[int]) ->
     return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
 
 
-def _reason_for_other_object(codes: set[int], agreeing: list[str]) -> Remark:
-    """Return why a photograph of another object is not in the result."""
+def _reason_for_other_object(codes: set[int], agreeing: list[str], *, plate: bool) -> Remark:
+    """Return why a photograph of another object, or of another part of a plate, is not in the result."""
     numbers = [str(code) for code in sorted(codes)]
+    if plate:
+        return remark("photograph_with_points_elsewhere", points=numbers, agreeing=agreeing or None)
     return remark("photograph_with_codes_elsewhere", codes=numbers, agreeing=agreeing or None)
 
 

@@ -47,7 +47,7 @@ class CameraGroup:
     c_mm: float
     c_source: str
     assumed: bool  # whether pixel size or principal distance is only assumed
-    fisheye: str  # name of the lens or camera if it shows a fisheye lens, else ""
+    fisheye: str  # what shows that it has a fisheye lens, for people, else ""
     remarks: tuple[Remark, ...]  # on the photographs
 
 
@@ -188,7 +188,9 @@ def _group(
         c,
         c_source,
         assumed,
-        next((one for one in (first.lens, first.model) if one and FISHEYE_NAME.search(one)), ""),
+        next(
+            (f"EXIF data: {one}" for one in (first.lens, first.model) if one and FISHEYE_NAME.search(one)), ""
+        ),
         _remarks(label, {name: metadata[name] for name in names}),
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import fill
 from typing import NoReturn
@@ -31,6 +31,7 @@ from sfm.survey.drafting.camera_groups import (
     group_photographs,
 )
 from sfm.survey.drafting.camera_names import IN_ORDER
+from sfm.survey.drafting.lens_models import with_lens_models
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -103,6 +104,10 @@ def draft_survey(
     name = as_plain(folder.resolve().name) or "survey"
     positions = sum(metadata[one].position is not None for one in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
+    if trial.plate is not None:
+        silent = _text(name, grouping, trial, pitch, left_out, positions, models=False)
+        cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
+        grouping = replace(grouping, cameras=cameras)
     return Draft(
         name,
         _text(name, grouping, trial, pitch, left_out, positions),
@@ -173,6 +178,8 @@ def _text(
     pitch: float | None,
     left_out: Sequence[tuple[str, str]],
     positions: int,
+    *,
+    models: bool = True,
 ) -> str:
     lines = [
         "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
@@ -181,7 +188,7 @@ def _text(
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     for camera in grouping.cameras:
-        lines += ["", *_camera_lines(camera, _free_parameters(trial))]
+        lines += ["", *_camera_lines(camera, _free_parameters(trial), models=models)]
     if grouping.rig is not None:
         lines += ["", *_rig_lines(grouping.rig)]
     if left_out:
@@ -217,7 +224,7 @@ def _free_parameters(trial: TargetTrial) -> tuple[str, ...]:
     return FREE_BY_TARGETS if trial.codes != "none" else ()
 
 
-def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
+def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> list[str]:
     globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
     lines = [
         f"# {counted(len(camera.photographs), 'photograph')} of {camera.size_px[0]} x {camera.size_px[1]} px",
@@ -226,7 +233,7 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
         f"images = {json.dumps(globs, ensure_ascii=False)}",
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
-        *_model_lines(camera, free),
+        *(_model_lines(camera, free) if models else ()),
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
 
@@ -249,7 +256,7 @@ def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
     )
     if camera.fisheye:
         lines, free = (
-            [f'model = "{FISHEYE}"  # EXIF data: {as_plain(camera.fisheye)}'],
+            [f'model = "{FISHEYE}"  # {as_plain(camera.fisheye)}'],
             free and FREE_OF_FISHEYES,
         )
     usual = list(FREE_OF_FISHEYES if camera.fisheye else FREE_OF_TEXTURE)
@@ -381,6 +388,7 @@ def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[t
         )
         for camera in grouping.cameras
     ]
+    found += [(f"lens of {one.name}", f"fisheye, {one.fisheye}") for one in grouping.cameras if one.fisheye]
     if grouping.rig is not None:
         found.append(
             (

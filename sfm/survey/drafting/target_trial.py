@@ -63,7 +63,7 @@ MIN_REPEATED = 4  # codes that two photographs must have in common; four orient 
 LOOK_PX = 900  # longer side of the pictures for a first look
 # Longer side of the picture in which few small circles are searched, and their smallest diameter in it. In
 # 24 million px of texture this takes 1 to 2 s a photograph, at full size 5 to 15 s.
-FEW_PX, FEW_DIAMETER_PX = 1800, 6.0
+FEW_PX, FEW_DIAMETER_PX, MANY_DIAMETER_PX = 1800, 6.0, 4.0
 # Pixels of a photograph over pixels of such a picture beyond which a first look saves time.
 MIN_PIXEL_RATIO = 3.0
 CROP_PX, CROP_RADII = 160, 6.0  # side of the picture of a dot with its ring; half of it in radii of the dot
@@ -375,7 +375,8 @@ def _look(grey: AnyArray) -> _Look:
             return _Look(True, 0, tags)
     circles, less = 0, reduce_photograph(grey, FEW_PX)[0]
     for picture in (whole, np.ascontiguousarray(middle), less):
-        targets = find_targets(picture, **({"min_diameter_px": FEW_DIAMETER_PX} if picture is less else {}))
+        smallest = FEW_DIAMETER_PX if picture is less else MANY_DIAMETER_PX
+        targets = find_targets(picture, min_diameter_px=smallest)
         circles = max(circles, len(targets))
         many = shows_a_lattice(targets.xy) if picture is less else len(targets) >= MIN_TARGETS
         rings = (*RINGS, *NECKLACES)

@@ -220,6 +220,18 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
     return (lattice.xy, found[0][1]) if len(found) == 1 else none
 
 
+def find_filled_board(grey: AnyArray) -> Lattice | None:
+    """Return the crossings of a checkerboard in a photograph (uint8), if they fill rows and columns.
+
+    Neighbours are predicted from one another, so a wide-angle lens may bend the board.
+    """
+    xy = find_saddles(grey)
+    lattice = find_lattice(xy, np.ones(len(xy), dtype=bool)) if len(xy) >= MIN_CROSSINGS else None
+    if lattice is None or len(lattice.rows) < max(MIN_CROSSINGS, lattice.box):
+        return None
+    return None if _dark_squares(grey, lattice) is None else lattice
+
+
 def find_saddles(grey: AnyArray) -> FloatArray:
     """Return positions with four alternately dark and bright sectors around them, whole px, (k, 2)."""
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING_PX)

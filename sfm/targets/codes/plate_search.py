@@ -21,6 +21,7 @@ from sfm.targets.codes.boards import (
     board_ends,
     charuco_patterns,
     find_crossings,
+    find_filled_board,
     name_corners,
     read_april_tags,
     reduce_photograph,
@@ -87,11 +88,19 @@ def part_of_checkerboard(grey: AnyArray) -> Part | None:
     """
     small, _ = reduce_photograph(grey, SEARCHED_PX)
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
-    if not found or meta is None or min(meta.shape[:2]) < MIN_SIDE:
+    size, xy = (0, 0), np.zeros((0, 2))
+    if found and meta is not None:
+        size, xy = meta.shape[:2], np.asarray(corners, dtype=float).reshape(-1, 2)
+    lattice = find_filled_board(small)  # OpenCV's board ends where a wide-angle lens bends it
+    if lattice is not None and len(lattice.xy) > len(xy):
+        low, high = lattice.place.min(axis=0), lattice.place.max(axis=0)
+        order = np.lexsort((lattice.place - low).T[::-1])
+        size, xy = (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1), lattice.xy[order]
+    if min(size) < MIN_SIDE:
         return None
-    place = np.stack(np.divmod(np.arange(meta.size), meta.shape[1]), axis=1)
-    ends = board_ends(np.asarray(corners, dtype=float).reshape(-1, 2), place, small.shape)
-    return meta.shape[:2], (not all(ends[0]), not all(ends[1]))
+    place = np.stack(np.divmod(np.arange(len(xy)), size[1]), axis=1)
+    ends = board_ends(xy, place, small.shape)
+    return size, (not all(ends[0]), not all(ends[1]))
 
 
 def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
