@@ -257,7 +257,7 @@ def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
     if camera.fisheye:
         lines, free = (
             [f'model = "{FISHEYE}"  # {as_plain(camera.fisheye)}'],
-            free and FREE_OF_FISHEYES,
+            (),  # with k3 and k4 free, four photographs of a board left 200 px, with those determined 1.3 px
         )
     usual = list(FREE_OF_FISHEYES if camera.fisheye else FREE_OF_TEXTURE)
     without = "  # without it: what the photographs determine"
