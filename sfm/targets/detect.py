@@ -175,9 +175,10 @@ def find_targets(
     reason = judge_fits(fit, noise=noise, scale=scale, **limits)
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
     levels = np.column_stack([fit.background, fit.contrast])
+    ring_radius = np.zeros(len(reason))
     if isinstance(family, CodeFamily):
         legible = find_legible(fit, reason)
-        code[legible], confidence[legible] = read_codes(
+        code[legible], confidence[legible], ring_radius[legible] = read_codes(
             grey,
             fit.xy[legible],
             fit.shape[legible],
@@ -200,7 +201,7 @@ def find_targets(
     good = reason == 0
     if isinstance(family, CodeFamily):
         code[~good] = UNCODED
-        reason[good & find_parts_of_codes(fit, code, confidence, family)] = Flag.PART_OF_CODE
+        reason[good & find_parts_of_codes(fit, code, confidence, ring_radius)] = Flag.PART_OF_CODE
     if isinstance(family, PlateFamily):
         code[good] = _name_dots(fit, outlines.sign, good, family)
         confidence[code >= 0] = 1.0

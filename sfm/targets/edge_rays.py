@@ -141,6 +141,23 @@ def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
             return 0.0, 1.0
         c = g
         tolerance = 0.15
+    if not reshape(theta, c):
+        return 0.0, 1.0
+    return used / RAYS, abs(c[0] - 1) + abs(c[1]) + abs(c[2]) + abs(c[3]) + abs(c[4])
+
+
+@compiled
+def reshape(theta: FloatArray, c: FloatArray) -> bool:
+    """Move and reshape an ellipse so that its outline is at these radii, to first order.
+
+    Args:
+        theta: x0, y0, p, q, r, which are changed, (>= 5,).
+        c: radius of the outline over that of the ellipse as c0 + c1 cos phi + c2 sin phi + c3 cos 2 phi +
+            c4 sin 2 phi, (5,).
+
+    Returns:
+        Whether the radii are those of an ellipse; it is moved in any case.
+    """
     p, q, r = theta[2], theta[3], theta[4]
     det = p * r - q * q
     theta[0] += (r * c[1] - q * c[2]) / det
@@ -148,11 +165,11 @@ def improve_outline(theta: FloatArray, edge: FloatArray) -> tuple[float, float]:
     # new unit circle T^-1 S with T = c0 I + (c3 c4; c4 -c3); S is the square root of S T^-2 S
     t_det = c[0] * c[0] - c[3] * c[3] - c[4] * c[4]
     if t_det < 0.1:
-        return 0.0, 1.0
+        return False
     a, b, d = (c[0] - c[3]) / t_det, -c[4] / t_det, (c[0] + c[3]) / t_det
     m00, m01, m10, m11 = a * p + b * q, a * q + b * r, b * p + d * q, b * q + d * r
     e, f, g2 = m00 * m00 + m10 * m10, m00 * m01 + m10 * m11, m01 * m01 + m11 * m11
     root = math.sqrt(e * g2 - f * f)
     scale = math.sqrt(e + g2 + 2 * root)
     theta[2], theta[3], theta[4] = (e + root) / scale, f / scale, (g2 + root) / scale
-    return used / RAYS, abs(c[0] - 1) + abs(c[1]) + abs(c[2]) + abs(c[3]) + abs(c[4])
+    return True

@@ -10,7 +10,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import as_grey, bilinear
-from sfm.targets.codes.rings import UNCODED, CodeFamily
+from sfm.targets.codes.rings import UNCODED
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BACKGROUND, BLUR, CONTRAST, GAIN_X, UNKNOWNS, P, R
@@ -371,13 +371,19 @@ def find_duplicates(
 
 
 def find_parts_of_codes(
-    fit: EllipseFit, code: IntArray, confidence: FloatArray, family: CodeFamily
+    fit: EllipseFit, code: IntArray, confidence: FloatArray, ring_radius: FloatArray
 ) -> BoolArray:
     """Return which candidates lie in the code ring of another target and are therefore parts of its code.
 
     Codes are processed from the most confident to those that could not be read, and a part of one code does
     not count afterwards: an arc that resembles a dot does not remove the dot of the same ring. Around a dot
     whose code was not read, only candidates clearly smaller than the dot are parts.
+
+    Args:
+        fit: fits of the candidates.
+        code: codes, see `sfm.targets.codes.rings.RingCodes`, shape (k,).
+        confidence: of the codes, 0 to 1, shape (k,).
+        ring_radius: outer radius of the ring in radii of the dot, shape (k,).
     """
     inside = np.zeros(len(fit.xy), dtype=bool)
     size = np.sqrt(np.abs(fit.shape[:, 0] * fit.shape[:, 2] - fit.shape[:, 1] ** 2))  # 1 / mean semi-axis
@@ -388,7 +394,7 @@ def find_parts_of_codes(
         p, q, r = fit.shape[k]
         dx, dy = (fit.xy - fit.xy[k]).T
         rho = np.hypot(p * dx + q * dy, q * dx + r * dy)
-        part = (rho > 1) & (rho < family.outer + 0.2)
+        part = (rho > 1) & (rho < ring_radius[k] + 0.2)
         inside |= part if code[k] >= 0 else part & (size * PART_OF_DOT > size[k])
     return inside
 

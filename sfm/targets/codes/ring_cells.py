@@ -53,6 +53,7 @@ def fit_cells(
     cells: int,
     inner: float,
     outer: float,
+    tilt: FloatArray,
 ) -> FloatArray:
     """Return the contents of the cells of the ring around each dot; nan if the photograph cuts the ring.
 
@@ -70,6 +71,7 @@ def fit_cells(
         cells: number of cells.
         inner: inner radius of the ring in radii of the dot.
         outer: outer radius of the ring in radii of the dot.
+        tilt: perspective, see `ring_ellipses.Rings`, shape (k, 2).
 
     Returns:
         For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell
@@ -87,7 +89,8 @@ def fit_cells(
     nothing = np.zeros((2, cells))
     for k in range(len(xy)):
         if not _sample(
-            image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, samples, sigma, ring_part, dot_part
+            *(image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, tilt[k]),
+            *(samples, sigma, ring_part, dot_part),
         ):
             continue
         least, place = math.inf, 0.0
@@ -113,7 +116,7 @@ def fit_cells(
                         if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                             continue
                         if not _model(
-                            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, bits, tried),
+                            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried),
                             *(samples, sigma, ring_part, dot_part, W),
                         ):
                             continue
@@ -129,7 +132,7 @@ def fit_cells(
                         break
                     steps /= 2
         if not _model(
-            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, bits, found),
+            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, found),
             *(samples, sigma, ring_part, dot_part, W),
         ):
             continue
@@ -148,6 +151,7 @@ def _model(
     blur: float,
     inner: float,
     outer: float,
+    tilt: FloatArray,
     bits: FloatArray,
     ring: FloatArray,
     samples: FloatArray,
@@ -165,7 +169,9 @@ def _model(
     s = blur * math.exp(ring[3])
     near, far = _spread_ring(inner, outer, ring[1])
     without = _without_glow(shape, ring[2])
-    if not _sample(image, xy, without, levels, s, ring[2], near, far, samples, sigma, ring_part, dot_part):
+    if not _sample(
+        *(image, xy, without, levels, s, ring[2], near, far, tilt, samples, sigma, ring_part, dot_part)
+    ):
         return False
     _mixture(sigma, ring[0], _shifts(bits, ring[1], ring[2] / s, near, far), W)
     return True
@@ -306,6 +312,7 @@ def _sample(
     glow: float,
     inner: float,
     outer: float,
+    tilt: FloatArray,
     samples: FloatArray,
     sigma: FloatArray,
     ring_part: FloatArray,
@@ -332,7 +339,8 @@ def _sample(
                 rho = 1 + IN_GAP * (inner - 1)
             else:
                 rho = inner + BEHIND * (outer - inner)
-            x, y = xy[0] + rho * ex, xy[1] + rho * ey
+            seen = rho * (1 + (tilt[0] * u + tilt[1] * v) * rho)
+            x, y = xy[0] + seen * ex, xy[1] + seen * ey
             if not (x >= 0 and y >= 0 and x < w - 1 and y < h - 1):
                 if row <= len(IN_RING):
                     return False

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import as_grey, bilinear
 from sfm.targets.codes.ring_cells import fit_cells
+from sfm.targets.codes.ring_ellipses import measure_rings
 
 UNCODED = -1
 UNREADABLE = -2
@@ -41,6 +43,9 @@ RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
 # Blur of an edge in a sharp photograph, px.
 SHARP_PX = 0.8
+# Number of codes that must be read with radii measured in the photograph: neighbours of a dot in a grid may
+# look like a code, but the neighbours of several are the same code.
+MIN_READ = 2
 # Maximum angle of an interruption of the ring, and minimum angle of an arc.
 SHORTEST_ARC_DEG = 12
 
@@ -69,7 +74,7 @@ ARCS_INNER, ARCS_OUTER = 2.4, 4.3
 MAX_CELLS = 32  # of a ring in a table file; the published codes end at 20 cells
 MAX_TABLE_BYTES = 10_000_000
 # The families of rings by name, and their number of cells; for arcs, the number of arcs is the code.
-RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20}
+RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20, "even14": 14}
 # Rings of other makers that use all necklaces, without parity: a misread cell gives another valid code.
 NECKLACES = {"necklace8": 8, "necklace10": 10, "necklace12": 12}
 MIRRORED = "-mirrored"  # suffix of a name: cells are counted counter-clockwise in the image
@@ -90,9 +95,10 @@ def ring_family(name: str) -> CodeFamily:
         none = np.zeros(0, dtype=np.int64)
         return CodeFamily(name, 0, none, none, ARCS_INNER, ARCS_OUTER)
     cells = NECKLACES[plain] if plain in NECKLACES else RINGS[plain]
-    pattern = necklaces(cells) if plain in NECKLACES else ring_patterns(cells)
+    even = plain.startswith("even")  # its numbers ascend with the patterns read counter-clockwise
+    pattern = (necklaces if plain in NECKLACES else even_patterns if even else ring_patterns)(cells)
     number = np.arange(1, len(pattern) + 1)
-    if plain != name:
+    if (plain != name) != even:
         pattern = smallest_rotation(mirrored_patterns(pattern, cells), cells)
         order = np.argsort(pattern)
         pattern, number = pattern[order], number[order]
@@ -140,6 +146,26 @@ def ring_patterns(cells: int) -> IntArray:
     parity = np.bitwise_count(value) % 2
     value = value[parity == 0]
     return np.asarray(value[smallest_rotation(value, cells) == value])
+
+
+def even_patterns(cells: int) -> IntArray:
+    """Return the bit patterns of a ring code of even parity that covers more than half of the ring, ascending.
+
+    A pattern is the smallest number of its rotations, has even parity and at least four set cells, which are
+    not all in one half of the ring; the full ring is excluded. Code number k is entry k - 1.
+
+    Args:
+        cells: number of cells of the ring, even.
+
+    Returns:
+        Patterns, shape (m,).
+
+    Source: numbers printed beside rings of 14 cells in photographs of a public project
+    (github.com/lcmrl/multicamera-calibration); the rule gives all of the 37 numbers that were compared.
+    """
+    value = necklaces(cells)
+    set_cells = np.bitwise_count(value)
+    return np.asarray(value[(set_cells % 2 == 0) & (set_cells >= 4) & (value >> (cells // 2) > 0)])
 
 
 def smallest_rotation(value: IntArray, cells: int) -> IntArray:
@@ -209,6 +235,18 @@ def _is_number(word: str) -> bool:
     return word.isascii() and word.isdigit() and len(word) <= 18
 
 
+class RingCodes(NamedTuple):
+    """Codes read around k dots."""
+
+    code: IntArray
+    """code numbers, `UNCODED` if there is nothing around the dot and `UNREADABLE` if the ring is not a valid
+    code, shape (k,)"""
+    confidence: FloatArray
+    """confidence of the reading, 0 to 1, shape (k,)"""
+    outer: FloatArray
+    """outer radius of the ring in radii of the dot, shape (k,)"""
+
+
 def read_codes(
     photograph: AnyArray,
     xy: FloatArray,
@@ -218,11 +256,13 @@ def read_codes(
     *,
     blur_px: FloatArray | None = None,
     noise: FloatArray | None = None,
-) -> tuple[IntArray, FloatArray]:
+) -> RingCodes:
     """Read the code around each measured dot.
 
     The ring is sampled on ellipses similar to the dot's, which removes tilt and rotation. Intensities are
-    scaled to 0 = background and 1 = dot, so dark and bright targets are read alike.
+    scaled to 0 = background and 1 = dot, so dark and bright targets are read alike. Codes that are not read
+    so are read again from the rings that the photograph shows: with the radii that several of them have in
+    common, and on their own ellipses, see `ring_ellipses`.
 
     Args:
         photograph: intensities, shape (H, W).
@@ -235,26 +275,60 @@ def read_codes(
         noise: standard deviation of the intensities about the fit of each dot, shape (k,); default is 0.
 
     Returns:
-        Code numbers, `UNCODED` if there is nothing around the dot and `UNREADABLE` if the ring is not a
-        valid code, shape (k,); confidence of the reading, 0 to 1, shape (k,).
+        Codes, confidence and the radius of each ring.
     """
-    radii = family.inner + RADII * (family.outer - family.inner)
     grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
+    blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
+    misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
+    found = _read_with_radii(grey, xy, shape, levels, family, blur, misfit, np.zeros((len(xy), 2)))
+    unread = np.flatnonzero(found.code < 0)
+    if family.cells == 0 or not len(unread):
+        return found
+    rings = measure_rings(grey, xy[unread], shape[unread], levels[unread], (family.inner, family.outer))
+    of = unread[rings.row]
+    again = _read_with_radii(
+        grey,
+        xy[of],
+        rings.shape,
+        levels[of],
+        replace(family, inner=rings.inner, outer=rings.outer),
+        blur[of],
+        misfit[of],
+        rings.tilt,
+    )
+    read = again.code >= 0
+    if not rings.are_other or read.sum() >= MIN_READ:
+        for part, values in zip(found, again, strict=True):
+            part[of[read]] = values[read]
+    return found
+
+
+def _read_with_radii(
+    grey: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    levels: FloatArray,
+    family: CodeFamily,
+    blur: FloatArray,
+    misfit: FloatArray,
+    tilt: FloatArray,
+) -> RingCodes:
+    """Read the code around each dot with the radii of the family; see `read_codes`."""
+    radii = family.inner + RADII * (family.outer - family.inner)
     polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
+    outer = np.full(len(xy), family.outer)
     if family.cells == 0:
-        return _read_arcs(polar)
+        return RingCodes(*_read_arcs(polar), outer)
     code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
     body = polar[:, 1:4]
     ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
     code[ring] = UNREADABLE
     ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
-    blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
     geometry = xy[ring], shape[ring], levels[ring], blur[ring]
-    cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer)
-    misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
+    cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer, tilt[ring])
     for k, found in zip(ring, cells, strict=True):
         code[k], confidence[k] = _read_cells(found, family, misfit[k])
-    return code, confidence
+    return RingCodes(code, confidence, outer)
 
 
 @compiled
