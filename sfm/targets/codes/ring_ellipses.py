@@ -28,8 +28,9 @@ SAME_RING = 0.15
 # Perspective and motion blur move the edges of a ring by up to this part of their radius from ray to ray.
 DISPLACED = 0.1
 # A dot has such a ring if it is on this part of its rays (half a cell of a ring of 20), and on this part of
-# the rays that rise anywhere between the two radii: an arc rises on all of them, a round neighbour on 0.66.
-LEAST_SEEN, PURE = 0.025, 0.8
+# the rays that rise anywhere between the two radii: an arc rises there on all of them, a round neighbour on
+# 0.71, and on 0.77 with soft edges.
+LEAST_SEEN, PURE = 0.025, 0.9
 # Number of dots that must have the same ring.
 MIN_DOTS = 3
 # A priori sigma of the displacement and of the flattening of a ring relative to its dot, and of the radius on
@@ -127,10 +128,11 @@ def _on_ring(rays: FloatArray, inner: float, outer: float, part: float) -> BoolA
         rays: inner and outer radius on each ray, (ANGLES, 2).
         inner: inner radius.
         outer: outer radius.
-        part: permitted difference from the radii as a part of them, which is SAME_RING at least.
+        part: permitted difference from the inner radius as a part of it, which is SAME_RING at least.
     """
     on = np.zeros(len(rays), np.bool_)
-    near, far = max(SAME_RING, part * inner), max(SAME_RING, part * outer)
+    near = max(SAME_RING, part * inner)
+    far = near * (outer / max(inner, near)) ** 2  # perspective displaces points by the square of the radius
     crossing, between = 0, 0
     for k in range(len(rays)):
         on[k] = abs(rays[k, 0] - inner) <= near and abs(rays[k, 1] - outer) <= far

@@ -43,8 +43,8 @@ RADIAL_TOLERANCE, RESIDUAL_TOLERANCE, NOISE_SIGMAS = 0.2, 0.1, 3.0
 OUTSIDE_CLUTTER, BEHIND_SET = 0.25, 0.3
 # Blur of an edge in a sharp photograph, px.
 SHARP_PX = 0.8
-# Number of codes that must be read with radii measured in the photograph: neighbours of a dot in a grid may
-# look like a code, but the neighbours of several are the same code.
+# Number of different codes that must be read with radii measured in the photograph: the neighbours of a dot
+# in a grid may look like a code, but like the same one around most dots.
 MIN_READ = 2
 # Maximum angle of an interruption of the ring, and minimum angle of an arc.
 SHORTEST_ARC_DEG = 12
@@ -297,7 +297,7 @@ def read_codes(
         rings.tilt,
     )
     read = again.code >= 0
-    if not rings.are_other or read.sum() >= MIN_READ:
+    if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
         for part, values in zip(found, again, strict=True):
             part[of[read]] = values[read]
     return found
