@@ -40,8 +40,8 @@ _SIGMAS = np.array([_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA])
 # The search is worthwhile from this jump from clear to set, in steps of the ring, between these steps, in
 # steps to the dot, and up to this RMS of the residuals at the best position of the first cell. 350 rings that
 # are read (the retro-panel, rings on screens, sharpened JPEG, motion blur, tilts of 60 degrees) have jumps of
-# 0.62 on, steps of 0.86 to 1.06 and residuals of up to 0.136; holes of a perforated plate have 0.207 on.
-_WORTH_JUMP, _WORTH_STEPS, _WORTH_RESIDUAL = 0.4, (0.5, 1.7), 0.2
+# 0.46 on, steps of 0.73 to 1.11 and residuals of up to 0.19; holes of a perforated plate have 0.21 to 0.45.
+_WORTH_JUMP, _WORTH_STEPS, _WORTH_RESIDUAL = 0.25, (0.25, 2.0), 0.25
 # Rows of the result after the levels.
 _RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, SPREAD, ROWS = 3, 4, 5, 6, 7, 8
 
@@ -110,11 +110,7 @@ def fit_cells(
         found, steps = np.array([place, 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
         residual = math.sqrt(least / samples[: len(IN_RING)].size)
         least_step, most_step = _WORTH_STEPS
-        if (
-            jump >= _WORTH_JUMP * step
-            and least_step <= step <= most_step
-            and residual <= _WORTH_RESIDUAL
-        ):
+        if jump >= _WORTH_JUMP * step and least_step <= step <= most_step and residual <= _WORTH_RESIDUAL:
             halved = 0
             for _ in range(_ROUNDS):
                 before = least

@@ -212,7 +212,10 @@ def _repaired(
     variance = _variances(fits, least_variance)
     if sound.sum() >= MIN_POPULATION:
         unexplained = _unexplained(fits, sound, least_variance)
-        more, relative, marks = (_stands_out(*pair) for pair in zip(unexplained, usual, strict=True))
+        more, relative, marks = (
+            _stands_out(values, values[sound]) & _stands_out(values, before)
+            for values, before in zip(unexplained, usual, strict=True)
+        )
         marks &= (unexplained[2] > 1) & np.isinf(depth)
         fits.flag[((more & relative & judged) | marks) & weight.any(axis=1)] |= Flag.POOR_FIT.value
     shift = gap_shifts(common, weight, keep)
