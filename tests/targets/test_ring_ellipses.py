@@ -130,7 +130,7 @@ def test_neighbours_in_a_grid_are_no_ring(pitch: float) -> None:
 
 
 def test_codes_of_even_parity_have_the_numbers_printed_beside_them() -> None:
-    """Patterns read counter-clockwise and the numbers printed beside them on the sheets of a public project."""
+    """Patterns read counter-clockwise, and the numbers printed beside them on public sheets."""
     printed = {255: 31, 263: 32, 281: 37, 311: 44, 343: 52, 365: 58, 387: 63, 401: 67, 411: 69}
     assert {value: even_patterns(14).tolist().index(value) + 1 for value in printed} == printed
     assert (len(even_patterns(12)), len(even_patterns(14))) == (161, 561)

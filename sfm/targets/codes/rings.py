@@ -149,7 +149,7 @@ def ring_patterns(cells: int) -> IntArray:
 
 
 def even_patterns(cells: int) -> IntArray:
-    """Return the bit patterns of a ring code of even parity that covers more than half of the ring, ascending.
+    """Return the bit patterns of a ring code of even parity that covers more than half a ring, ascending.
 
     A pattern is the smallest number of its rotations, has even parity and at least four set cells, which are
     not all in one half of the ring; the full ring is excluded. Code number k is entry k - 1.

@@ -225,7 +225,7 @@ def _repaired(
             p * r - q * q
         )
     fits.theta[cut, :2] -= px.T[cut]
-    # A mark inside that was left out may reach the edge, where it pulls the centre as far as it is significant.
+    # A mark inside that was left out may reach the edge, where it pulls the centre as far as it stands out.
     rest = np.where(np.isfinite(depth), np.maximum(_marks(fits, goodness.TOGETHER, sound), 1.0), 1.0)
     softness = fits.theta[:, BLUR] / _radii(fits.theta)
     rise = rise_to_first(h[sound], weight[sound], float(np.median(softness[sound])) if sound.any() else 0.0)
