@@ -166,7 +166,8 @@ def test_what_is_unlike_the_others() -> None:
     for scatter, limit in ((0.0, 0.5), (0.4, 2.0)):  # 5 sigmas of 0.1 at least
         others = np.exp(scatter * np.where(np.arange(40) % 2, 1, -1) / damage.MAD)
         for z, unlike in ((0.75 * limit, False), (1.3 * limit, True)):
-            assert _stands_out(np.append(math.exp(z), others), sound)[0] == unlike
+            values = np.append(math.exp(z), others)
+            assert _stands_out(values, values[sound])[0] == unlike
 
 
 @pytest.mark.parametrize(
@@ -215,7 +216,8 @@ def test_nicks_are_left_out_and_widen_the_sigma() -> None:
     """Before: 1.71 of the stated sigma."""
     measured, damaged, _ = measure_class("nick", ((25.0, 5),))
     assert measured.flagged[damaged].mean() > 0.7
-    assert not measured.flagged[~damaged].any()
+    assert np.isfinite(measured.error[~damaged]).all()  # one was lost before, and is flagged now
+    assert measured.flagged[~damaged].sum() <= 1
     assert 0.6 < over_stated(measured, damaged) < 1.3
 
 

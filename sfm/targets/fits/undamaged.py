@@ -292,6 +292,7 @@ def _has_marks_inside(fits: EllipseFits, sound: BoolArray) -> BoolArray:
     marks = _marks(fits, goodness.INSIDE, sound)
     side, contrast = np.maximum(2, np.round(2 * fits.theta[:, BLUR])), np.abs(fits.theta[:, CONTRAST])
     large = fits.statistics[:, goodness.INSIDE] > POOR_FIT * side * contrast
+    large &= not sound.any() or bool(np.median(marks[sound]) > 1)
     return np.asarray((marks > 1) & (large | _stands_out(marks, marks[sound])))
 
 
