@@ -101,9 +101,7 @@ def test_tables_that_are_no_files(tmp_path: Path) -> None:
 
 def test_control_in_another_unit_than_its_sigmas_is_refused(tmp_path: Path) -> None:
     text = "id,X,Y,Z,sX,sY,sZ\na,0,0,0,0.01,0.01,0\nb,1000,0,0,0.01,0.0000005,0\n"
-    with pytest.raises(
-        SurveyFileError, match=r"line 3: column sY contains 5e-07, needed at least 0.001,"
-    ):
+    with pytest.raises(SurveyFileError, match=r"line 3: column sY contains 5e-07, needed at least 0.001,"):
         read_control(table(tmp_path, text))
     assert len(read_control(table(tmp_path, text.replace("0.0000005", "0.005"))).names) == 2
 
