@@ -31,6 +31,10 @@ class GeometryError(KolinearError):
     """The given points or photographs do not determine the requested result."""
 
 
+class DivergedError(GeometryError):
+    """Unknowns have become so large in an iteration that their squares overflow."""
+
+
 class UnknownNameError(KolinearError):
     """No point, photograph or camera has that name."""
 

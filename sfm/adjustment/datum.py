@@ -35,7 +35,7 @@ from sfm.adjustment.engine.normals import Equations, solve_transposed, times_red
 from sfm.adjustment.engine.observed import ObservedKind, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
+from sfm.errors import DivergedError, GeometryError
 from sfm.kernels.compiling import kernel
 from sfm.network import Network
 
@@ -418,7 +418,7 @@ def with_further(
         datum: kind and sound points; constraints on points are inner ones, except in a minimal datum.
 
     Raises:
-        GeometryError: unknowns have become so large that their squares overflow.
+        DivergedError: unknowns have become so large that their squares overflow.
     """
     if further.shape[1] == 0 and not equations.blocks.held.any():
         return motions
@@ -445,7 +445,7 @@ def with_further(
     try:
         inverse = np.linalg.inv(_product(on_points, on_reduced, moved, N))
     except np.linalg.LinAlgError:
-        raise GeometryError(
+        raise DivergedError(
             "datum: the network has diverged, and nothing fixes what it leaves open"
         ) from None
     across = _product(on_points, on_reduced, motions.points, motions.reduced)

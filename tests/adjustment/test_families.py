@@ -253,15 +253,15 @@ def choice(
 ) -> Cause | None:
     """Return the best of these alternatives, an adjustment with which gains so much."""
 
-    def adjusted(plain: Any, one: Alternative, *_: Any) -> Refit:
+    def adjusted(plain: Any, one: Alternative, *_: Any, **__: Any) -> Refit:
         return Refit(SimpleNamespace(), np.ones(1), (gains or {}).get(id(one), gain), 4.0, 4.0)  # type: ignore[arg-type]
 
     monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
     monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: SimpleNamespace(redundancy=200))
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
     monkeypatch.setattr(hypotheses, "refit", adjusted)
-    nothing: Any = None
-    return hypotheses._best(nothing, before)
+    of_ten: Any = SimpleNamespace(network=SimpleNamespace(images=("photograph",) * 10))
+    return hypotheses._best(of_ten, before)
 
 
 def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(

@@ -68,7 +68,7 @@ def test_what_is_not_determined_comes_first_and_without_precision(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = ("wall:4000,2000", *LENS, "--points", 60, "--stations", "strips:3x3", "--sigma", "10")
-    assert plan(*given, "--out", tmp_path / "plan") == 0
+    assert plan(*given, "--out", tmp_path / "plan") == 1  # the verdict is bad
     printed = capsys.readouterr().out
     found = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "bad" and found["remarks"][0]["kind"] == "plan_undetermined"

@@ -31,7 +31,7 @@ from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
 from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
+from sfm.errors import DivergedError, GeometryError
 from sfm.runtime.progress import keep_freed_memory
 
 TOLERANCE = 1e-6
@@ -247,6 +247,9 @@ def _solve(
         return None
     try:
         motions = motions_of(layout, p.observed, state, on_sound_points(p.datum, equations.blocks.held))
+    except GeometryError:  # the datum points have moved together during the iteration
+        return None
+    try:
         if last is not None:
             found = _step(p, equations, last, motions)
             if found.within(tolerance):
@@ -258,7 +261,7 @@ def _solve(
             found = _step(p, equations, factored, motions)
             if not (coarse and found.within(SINGLE_TOLERANCE)):
                 return found
-    except GeometryError:  # the datum points have moved together, or the network has diverged
+    except DivergedError:
         return None
     return None
 

@@ -84,7 +84,9 @@ def reinstate_dropped(growth: Growth) -> bool:
     """
     mirrored = [i for i, reason in growth.reasons.items() if reason.kind == MIRRORED]
     dropped = np.setdiff1d(np.flatnonzero(growth.dropped), mirrored).tolist()
+    reasons = dict(growth.reasons)
     returned = [i for i in dropped if growth.resect([i])]
+    growth.reasons = {i: reason for i, reason in reasons.items() if i not in returned}
     growth.dropped[returned] = False
     return bool(returned)
 

@@ -59,8 +59,8 @@ DRAFTS = (
     Kind(
         "rings_not_read",
         "warning",
-        "{ringed} of {dots} dots of {photograph} have rings that no known family of codes reads: texture "
-        "orients the photographs.",
+        "Of {dots:dot} of {photograph}, {ringed} {ringed:has a ring|have rings} that no known family of "
+        "codes reads: texture orients the photographs.",
         "codes of another family, or rings of other proportions; too small, blurred or mirrored",
         "Compare the picture beside the survey file with the families; give a table of codes, or use other "
         "targets.",

@@ -46,15 +46,22 @@ def tag(dictionary: str, number: int, module_px: int) -> AnyArray:
 
 
 def ring(
-    number: int, dot_px: float, *, inner: float = 2.0, outer: float = 3.0, family: str = "ring14"
+    number: int, dot_px: float, *, inner: float = 2.0, outer: float = 3.0, family: str | None = "ring14"
 ) -> AnyArray:
-    """A dot of a diameter with its ring, whose radii are in radii of the dot; drawn larger, then reduced."""
-    rings, side = ring_family(family), 16 * round(dot_px)
+    """A dot of a diameter with its ring, whose radii are in radii of the dot; drawn larger, then reduced.
+
+    Without a family it has 17 cells, some of them set, which no family has.
+    """
+    side = 16 * round(dot_px)
     y, x = 8 * (np.mgrid[:side, :side] - side / 2 + 0.5) / side
-    radius, cell = np.hypot(x, y), (np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * rings.cells).astype(int)
-    pattern = int(rings.pattern[number - 1])
-    bits = np.array([pattern >> (rings.cells - 1 - k) & 1 for k in range(rings.cells)], dtype=bool)
-    on = (radius < 1) | ((radius > inner) & (radius < outer) & bits[cell % rings.cells])
+    if family is None:
+        bits = seed_of(f"ring {number}").uniform(size=17) < 0.5
+    else:
+        rings = ring_family(family)
+        pattern = int(rings.pattern[number - 1])
+        bits = np.array([pattern >> (rings.cells - 1 - k) & 1 for k in range(rings.cells)], dtype=bool)
+    radius, cell = np.hypot(x, y), (np.arctan2(y, x) % (2 * np.pi) / (2 * np.pi) * len(bits)).astype(int)
+    on = (radius < 1) | ((radius > inner) & (radius < outer) & bits[cell % len(bits)])
     return cv2.resize(
         np.where(on, 25, 230).astype(np.uint8), (side // 4, side // 4), interpolation=cv2.INTER_AREA
     )
@@ -151,11 +158,11 @@ def test_few_dots_at_random_are_no_plate() -> None:
 
 
 def sheet(rows: int, columns: int, *, inner: float, outer: float) -> AnyArray:
-    """Dots in rows, with rings of ring14 codes of other proportions."""
+    """Dots in rows, with rings that no family has."""
     picture = np.full((180 * rows + 60, 180 * columns + 60), 230, np.uint8)
     for k in range(rows * columns):
         row, column = divmod(k, columns)
-        patch = ring(3 + 2 * k, 36.0, inner=inner, outer=outer)
+        patch = ring(3 + 2 * k, 36.0, inner=inner, outer=outer, family=None)
         paste(picture, patch, 120 + 180 * column, 120 + 180 * row)
     return picture
 
