@@ -10,12 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.orientation.incremental.sequence import Orientation
@@ -36,6 +33,7 @@ from sfm.survey.measuring.targets import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import orient_with_models
 from sfm.survey.target_network import measure_targets
+from sfm.survey.unfinished import UnfinishedSurveyError, unfinished_survey
 
 
 def run_survey(
@@ -58,44 +56,54 @@ def run_survey(
         progress: receives stages and photographs.
 
     Raises:
+        UnfinishedSurveyError: a stage after the measurement cannot go on; `reached` states how far the survey
+            came.
         KolinearError: the survey cannot be run; the message states the remedy.
     """
     clock = StageClock(progress)
-    reached: list[str] = []
-    with _stating_progress(survey, reached), own_threads(jobs):
-        survey, measured = _measure(survey, images_dir, jobs, store, clock)
-        survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock, reached)
+    so_far = _SoFar(survey)
+    with _stating_how_far(so_far, clock), own_threads(jobs):
+        so_far.survey, so_far.measured = _measure(survey, images_dir, jobs, store, clock)
+        solution = _solve(so_far, jobs, clock)
         copies = find_copies(solution.adjustment)
         if copies:
-            measured = without_copies(measured, copies)
-            survey, measured, start, matched, solution = _solve(survey, measured, jobs, clock, reached)
-        compared = compare_solution(solution, others, clock, files=measured.files)
+            so_far.measured = without_copies(so_far.measured, copies)
+            solution = _solve(so_far, jobs, clock)
+        compared = compare_solution(solution, others, clock, files=so_far.measured.files)
+        survey, measured, start, matched = so_far.stages
         return assemble_result(survey, measured, start, matched, solution, compared, clock)
 
 
-def _solve(
-    survey: Survey, measured: Measurements, jobs: int, clock: StageClock, reached: list[str]
-) -> tuple[Survey, Measurements, Orientation, Correspondences, SolvedSurvey]:
-    """Orient, match and adjust the image points; orientation may change the survey and the image points.
+@dataclass
+class _SoFar:
+    """What the stages of a survey returned so far."""
 
-    `reached` receives what each stage reached, for the message of a stage that cannot go on.
-    """
-    network = measured.network
-    seen = len(np.unique(network.image_points.image))
-    measured_points = counted(len(network.image_points), "image point")
-    reached[:] = [f"{measured_points} in {seen} of {counted(len(network.images), 'photograph')}"]
+    survey: Survey
+    measured: Measurements | None = None
+    start: Orientation | None = None
+    matched: Correspondences | None = None
+
+    @property
+    def stages(self) -> tuple[Survey, Measurements, Orientation, Correspondences]:
+        """What every stage before the adjustment returned."""
+        assert self.measured is not None and self.start is not None and self.matched is not None
+        return self.survey, self.measured, self.start, self.matched
+
+
+def _solve(so_far: _SoFar, jobs: int, clock: StageClock) -> SolvedSurvey:
+    """Orient, match and adjust the image points; orientation may change the survey and the image points."""
+    survey, measured = so_far.survey, so_far.measured
+    assert measured is not None
+    so_far.start = so_far.matched = None
     with clock.stage("orientation"):
         survey, measured, start = orient_with_models(survey, measured)
         survey, measured, start = agree_on_clocks(survey, measured, start)
         measured, start = agree_on_turns(survey, measured, start)
-    oriented = f"{start.estimate.oriented.sum()} of {len(start.estimate.oriented)} photographs oriented"
-    reached.append(f"{oriented}, {counted(int(start.estimate.determined.sum()), 'object point')}")
+    so_far.survey, so_far.measured, so_far.start = survey, measured, start
     with clock.stage("matching"):
-        matched = find_correspondences(survey, measured, start, jobs=jobs)
-    reached.append(f"{counted(len(matched.network.image_points), 'image point')} matched")
+        so_far.matched = find_correspondences(survey, measured, start, jobs=jobs)
     with clock.stage("adjustment"):
-        solution = solve_survey(survey, matched)
-    return survey, measured, start, matched, solution
+        return solve_survey(survey, so_far.matched)
 
 
 def _measure(
@@ -127,10 +135,18 @@ def _measure(
 
 
 @contextmanager
-def _stating_progress(survey: Survey, reached: list[str]) -> Iterator[None]:
-    """Add to the message of a GeometryError the name of the survey, and how far the survey came."""
+def _stating_how_far(so_far: _SoFar, clock: StageClock) -> Iterator[None]:
+    """Add to every GeometryError the name of the survey and, once it is measured, how far it came."""
     try:
         yield
     except GeometryError as error:
-        so_far = f"; reached before: {'; '.join(reached)}" if len(reached) > 1 else ""
-        raise GeometryError(f"survey {survey.name}: {error}{so_far}") from error
+        name = f"survey {so_far.survey.name}"
+        if so_far.measured is None:
+            raise GeometryError(f"{name}: {error}") from error
+        reached = unfinished_survey(
+            so_far.survey, so_far.measured, so_far.start, so_far.matched, clock, error
+        )
+        before = f"; reached before: {'; '.join(reached.steps)}" if reached.oriented is not None else ""
+        unfinished = UnfinishedSurveyError(f"{name}: {error}{before}")
+        unfinished.reached = reached
+        raise unfinished from error

@@ -26,8 +26,16 @@ from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
-from sfm.report.output import LOG, SurveyLog, read_log, remove_log, result_entries, write_result
+from sfm.report.findings.survey_remarks import Findings, findings_of
+from sfm.report.output import (
+    LOG,
+    SurveyLog,
+    read_log,
+    remove_log,
+    result_entries,
+    write_result,
+    write_unfinished,
+)
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.result import SurveyResult
 from sfm.runtime.executor import Send
@@ -40,6 +48,7 @@ from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import Measured, MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.survey.measuring.tie_points import natural_points_of
+from sfm.survey.unfinished import UnfinishedSurvey, UnfinishedSurveyError
 
 LOCK = ".lock"  # of the batch
 VERDICTS = ("good", "fair", "bad")
@@ -104,7 +113,7 @@ class SurveyRow:
     points: int | None = None
     comparison: str = ""  # agrees | differs | none
     seconds: float = 0.0  # computing time, including photographs
-    reason: str = ""  # why there is no result, one line
+    reason: str = ""  # why there is no result, or why a stage could not go on, one line
     fault: bool = False  # whether the reason is an error of the program, not of the survey
 
     @property
@@ -153,7 +162,7 @@ def reconstruct(
         send: receives the stages.
 
     Returns:
-        The row of the survey, with a reason if there is no result.
+        The row of the survey, with a reason if there is no result or a stage could not go on.
 
     Raises:
         OutputError: the result or the log cannot be written.
@@ -255,25 +264,32 @@ def _run(
 ) -> SurveyRow:
     others = comparers.others_of(survey)
     store = replace(MeasuredStore.of_user(), held=held)
-    result = run_survey(survey, others=others, store=store, progress=log)
+    ended: Findings | UnfinishedSurvey
+    try:
+        ended = findings_of(run_survey(survey, others=others, store=store, progress=log))
+    except UnfinishedSurveyError as error:
+        ended = error.reached
     log.stage("report")
-    findings = findings_of(result)
     row: list[SurveyRow] = []
 
     def close_log(folder: Path) -> None:
         _refuse_ended(job)
-        row.append(_row(job, result_entries(findings), round(seconds(), 3)))
-        log.close_into(folder, findings, seconds=row[0].seconds)
+        row.append(_row(job, result_entries(ended), round(seconds(), 3)))
+        log.close_into(folder, ended, seconds=row[0].seconds)
 
-    with locked(lock_of(job.out, job.folder), job.out / job.folder):
-        write_result(
-            findings,
-            job.out / job.folder,
-            write_colmap=comparers.writer_of(result),
-            finish=close_log,
-            budget_mb=job.pictures_mb,
-        )
-        note_finished(job.out / job.folder)  # at once, in case the batch is killed now
+    out = job.out / job.folder
+    with locked(lock_of(job.out, job.folder), out):
+        if isinstance(ended, UnfinishedSurvey):
+            write_unfinished(ended, out, finish=close_log)
+        else:
+            write_result(
+                ended,
+                out,
+                write_colmap=comparers.writer_of(ended.result),
+                finish=close_log,
+                budget_mb=job.pictures_mb,
+            )
+        note_finished(out)  # at once, in case the batch is killed now
     return row[0]
 
 

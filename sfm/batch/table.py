@@ -147,6 +147,8 @@ def outcome_of(row: SurveyRow) -> str:
     """Return a short text on how a survey ended."""
     if row.status != "done":
         return f"{row.status}: {row.reason}"
+    if row.reason:
+        return f"{row.verdict}: {row.reason}"
     sigma0 = "" if row.sigma0_px is None else f", sigma0 {row.sigma0_px:.4f} px"
     return f"{row.verdict}, {row.photographs} of {row.photographs_total} photographs{sigma0}"
 

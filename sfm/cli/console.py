@@ -28,7 +28,9 @@ from sfm.report.phrases import (
     significant,
     words_left_out,
 )
+from sfm.report.unfinished import verdict
 from sfm.result import SurveyResult
+from sfm.survey.unfinished import UnfinishedSurvey
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}
 COLUMN_GAP = 2  # characters between columns
@@ -74,6 +76,12 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
             console.print(Text(f"  camera {camera.name} ({camera.model}): {values}"))
     console.print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
     return verdict.level != "bad"
+
+
+def print_unfinished(reached: UnfinishedSurvey, page: Path) -> None:
+    """Print why a survey could not be finished, the remarks so far, and the path of its report."""
+    print_verdict(verdict(reached))
+    Console(highlight=False).print(Text(f"Report: {page}", style="bold"), soft_wrap=True)
 
 
 def print_verdict(verdict: Verdict | Banner) -> None:

@@ -9,7 +9,8 @@ line, written as events happen. Every line has `time` (UTC) and `event`:
     stage       stage, seconds, steps
     warning     text
     remark      kind, severity, text, subjects, numbers, cause, remedy
-    result      verdict, sigma0_px, rms_px, photographs, points, observations, stored_photographs, ...
+    result      verdict, sigma0_px, rms_px, photographs, points, observations, stored_photographs, ...;
+                with reason and stage if that stage of the survey could not go on
     failed      reason
 """
 
@@ -20,7 +21,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -41,21 +42,23 @@ from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, 
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.remarks.remark import remark
-from sfm.report.figures.overlays import draw_overlays
+from sfm.report.figures.overlays import Overlay, draw_overlays
 from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.findings.calibrated_cameras import projection_of
 from sfm.report.findings.checks import adjusted_sigmas, root_mean_square
 from sfm.report.findings.survey_remarks import Findings, with_remark
-from sfm.report.pages import html_of
+from sfm.report.pages import html_of, page_of, text, texts_of
 from sfm.report.phrases import finer_unit
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
+from sfm.report.unfinished import verdict
 from sfm.report.viewer.embedded import scene_of_result, viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
-from sfm.result import StageTime
+from sfm.result import StageTime, SurveyResult
 from sfm.runtime.progress import SILENT, Progress, give_back_memory
+from sfm.survey.unfinished import UnfinishedSurvey
 
 LOG = "log.jsonl"  # in the folder of a result
 MAX_LOG_BYTES = 50_000_000  # of a log to be read back
@@ -106,7 +109,7 @@ def write_result(
         scene = scene_of_result(findings)
         give_back_memory()
         # One after another: while Python works, threads with short calls wait for their turn each time.
-        overlays = draw_overlays(result, jobs=jobs, progress=progress)
+        overlays = draw_overlays(result.photographs, result.adjustment, jobs=jobs, progress=progress)
         files = {one.image: one.path for one in result.photographs}
         pictures = cut_pictures(
             scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
@@ -117,10 +120,7 @@ def write_result(
             findings = with_remark(findings, remark("photographs_not_drawn", photographs=lost))
             result = findings.result
         write_tables(findings, folder)
-        if overlays:
-            (folder / "overlays").mkdir()
-        for overlay in overlays:
-            (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
+        _write_overlays(overlays, folder)
         if pictures.beside:
             (folder / "pictures").mkdir()
         for name, content in pictures.beside.items():
@@ -142,6 +142,52 @@ def write_result(
         if finish is not None:
             finish(folder)
     return out / "report.html"
+
+
+def write_unfinished(
+    reached: UnfinishedSurvey,
+    out: Path,
+    *,
+    finish: Callable[[Path], None] | None = None,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> Path:
+    """Write the report of a survey that a stage could not finish into one folder, whole or not at all.
+
+    Args:
+        reached: how far the survey came.
+        out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
+        finish: receives the folder when everything else is written, and may add log.jsonl.
+        jobs: photographs drawn at the same time.
+        progress: called for every photograph.
+
+    Returns:
+        The path of report.html.
+
+    Raises:
+        OutputError: the folder cannot be written, or contains something other than an earlier result.
+    """
+    out = Path(out)
+    refuse_foreign_folder(out)
+    progress.stage("report", len(reached.photographs))
+    with whole_folder(out, "the result", replaceable=True) as folder:
+        overlays = draw_overlays(reached.photographs, reached.network, jobs=jobs, progress=progress)
+        _write_overlays(overlays, folder)
+        page = page_of(reached, overlays=overlays)
+        for name, content in texts_of(page).items():
+            (folder / name).write_text(content, encoding="utf-8", newline="")
+        (folder / "report.txt").write_text(text(page), encoding="utf-8")
+        if finish is not None:
+            finish(folder)
+    return out / "report.html"
+
+
+def _write_overlays(overlays: Sequence[Overlay], folder: Path) -> None:
+    """Write overlays into a folder of that name; none if there are none."""
+    if overlays:
+        (folder / "overlays").mkdir()
+    for overlay in overlays:
+        (folder / "overlays" / overlay.file_name).write_bytes(overlay.jpeg)
 
 
 def folder_name(name: str) -> str:
@@ -387,24 +433,39 @@ class SurveyLog:
             self.note("stage", stage=self._stage, seconds=seconds, **steps)
             self._stage = None
 
-    def close_into(self, folder: Path, findings: Findings, **more: Any) -> None:
-        """Log the end of a successful survey, and write all lines into the folder of the result.
+    def close_into(self, folder: Path, ended: Findings | UnfinishedSurvey, **more: Any) -> None:
+        """Log the end of a survey, and write all lines into the folder of the result.
 
         Args:
             folder: the folder, before it is renamed.
-            findings: findings of the survey.
+            ended: findings of the survey, or how far it came.
             more: further entries of the last line.
         """
         self.end_stage()
-        for one in findings.verdict.remarks:
+        judged = ended.verdict if isinstance(ended, Findings) else verdict(ended)
+        for one in judged.remarks:
             self.note("remark", **one.as_dict())
-        self.note("result", **result_entries(findings), **more)
+        self.note("result", **result_entries(ended), **more)
         (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
 
 
-def result_entries(findings: Findings) -> dict[str, Any]:
+def result_entries(ended: Findings | UnfinishedSurvey) -> dict[str, Any]:
     """Return the key figures of a result for a log or a table of surveys; None if unknown."""
-    result = findings.result
+    if isinstance(ended, UnfinishedSurvey):
+        return {
+            "survey": ended.survey,
+            "verdict": verdict(ended).level,
+            "reason": ended.reason,
+            "stage": ended.stage,
+            "sigma0_px": None,
+            "rms_px": None,
+            "photographs": 0 if ended.oriented is None else int(ended.oriented.sum()),
+            "photographs_total": ended.images_total,
+            "points": None,
+            "comparison": "none",
+            **_photographs(ended),
+        }
+    findings, result = ended, ended.result
     a, both = result.adjustment, result.comparison
     return {
         "survey": result.survey,
@@ -419,8 +480,15 @@ def result_entries(findings: Findings) -> dict[str, Any]:
         "iterations": a.iterations,
         "converged": a.converged,
         "comparison": "none" if both is None else both.outcome,
-        "stored_photographs": [p.image for p in result.photographs if p.stored],
-        "failed_photographs": [{"image": f.image, "reason": f.reason.as_dict()} for f in result.failed],
+        **_photographs(result),
+    }
+
+
+def _photographs(found: SurveyResult | UnfinishedSurvey) -> dict[str, Any]:
+    """Return the photographs measured in an earlier run, and those that failed."""
+    return {
+        "stored_photographs": [p.image for p in found.photographs if p.stored],
+        "failed_photographs": [{"image": f.image, "reason": f.reason.as_dict()} for f in found.failed],
     }
 
 

@@ -52,6 +52,7 @@ PAGES: Mapping[str, str] = {
     "Plan": "sfm.report.planning:page",
     "Refinement": "sfm.report.refinement:page",
     "ResultComparison": "sfm.report.differences:page",
+    "UnfinishedSurvey": "sfm.report.unfinished:page",
     "Validation": "sfm.report.differences:validation_page",
     "ViewerScene": "sfm.report.view_page:page",
 }

@@ -454,20 +454,33 @@ def photographs(report: Report) -> Section:
         "not part of the result; yellow: residual vectors, enlarged; crosses: candidates that were not "
         f"measured, coloured by reason. Click a picture to see it at full size.{edges}"
     )
-    cards = []
-    for one in overlays[:MAX_LISTED]:
+
+    def describe(image: str) -> str:
         words = "not in the result"
-        if one.image in images:
-            i = images.index(one.image)
+        if image in images:
+            i = images.index(image)
             points = counted(int(f.geometry.image_points[i]), "point")
             words = f"{points}, RMS {fixed(f.geometry.image_rms_px[i], 3)} px"
-        if one.image in f.edges:
-            words += f", edges {fixed(f.edges[one.image], 2)} px"
-        cards.append(Card(f"overlays/{one.file_name}", one.thumbnail, one.image, words))
+        return f"{words}, edges {fixed(f.edges[image], 2)} px" if image in f.edges else words
+
+    parts = overlay_parts(overlays, describe)
+    return Section("The photographs", legend, *parts, key="photographs", in_text=False)
+
+
+def overlay_parts(overlays: Sequence[Overlay], describe: Callable[[str], str]) -> tuple[Part, ...]:
+    """Return thumbnails of overlays that link to the large ones, and links to further ones.
+
+    Args:
+        overlays: the overlays.
+        describe: returns the words below the thumbnail of a photograph, from its name.
+    """
+    cards = Cards(
+        Card(f"overlays/{one.file_name}", one.thumbnail, one.image, describe(one.image))
+        for one in overlays[:MAX_LISTED]
+    )
     others = [(Link(one.image, f"overlays/{one.file_name}"),) for one in overlays[MAX_LISTED:]]
     without = f"{counted(len(others), 'further photograph')} without a thumbnail here"
-    more = FoldedParts(without, Table(columns("photograph"), others)) if others else None
-    return Section("The photographs", legend, Cards(cards), more, key="photographs", in_text=False)
+    return (cards, FoldedParts(without, Table(columns("photograph"), others))) if others else (cards,)
 
 
 def process(report: Report) -> Section:

@@ -92,6 +92,7 @@ class StageClock:
         share_freed_memory()
         self.progress = progress
         self.seconds: list[tuple[str, float]] = []
+        self.last = ""  # name of the stage that was begun last
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[None]:
@@ -102,6 +103,7 @@ class StageClock:
             total: number of its steps, if known.
         """
         self.progress.stage(name, total)
+        self.last = name
         begun = time.perf_counter()
         watching = _watching.set(self.progress)
         try:

@@ -136,7 +136,7 @@ def run(
     photographs, written beside the result and run; edit it there and run it again with --images PHOTOS.
 
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
-    reasons in the report; 2 if the input must be corrected.
+    reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
     """
     if survey_file.is_dir():
         if images is not None:
@@ -179,7 +179,7 @@ def adjust(
     [observations] in the survey file states the image points, which replace photographs.
 
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
-    reasons in the report; 2 if the input must be corrected.
+    reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
     """
     _run_survey(
         survey_file,
@@ -223,13 +223,19 @@ def _run_survey(
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
-        from sfm.cli.console import print_result
+        from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
         from sfm.kernels.threads import cores
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings.survey_remarks import findings_of
-        from sfm.report.output import Origin, SurveyLog, refuse_other_origin, write_result
+        from sfm.report.output import (
+            Origin,
+            SurveyLog,
+            refuse_other_origin,
+            write_result,
+            write_unfinished,
+        )
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.drafting.draft import SUFFIXES
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
@@ -237,6 +243,7 @@ def _run_survey(
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
+        from sfm.survey.unfinished import UnfinishedSurveyError
 
     if not survey_file.exists():
         raise KolinearError(f"{survey_file}: neither a survey file nor a folder{nearest_name(survey_file)}")
@@ -288,7 +295,21 @@ def _run_survey(
         SurveyLog(watch=drawn) as log,
     ):
         log.start(survey.name, survey_file, **origin.written(folder))
-        result = run_survey(survey, images_dir=images, jobs=workers, others=others, store=store, progress=log)
+        try:
+            result = run_survey(
+                survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
+            )
+        except UnfinishedSurveyError as error:
+            reached = error.reached
+            page = write_unfinished(
+                reached,
+                folder,
+                finish=lambda part: log.close_into(part, reached),
+                jobs=workers,
+                progress=log,
+            )
+            print_unfinished(reached, page)
+            raise SystemExit(FAILED) from error
         findings = findings_of(result)
         page = write_result(
             findings,

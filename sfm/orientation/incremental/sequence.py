@@ -80,6 +80,17 @@ class Orientation:
     remarks: tuple[Remark, ...] = ()  # on useless given values, and on ambiguities of the image points
 
 
+class NotOrientedError(GeometryError):
+    """Too few photographs could be oriented."""
+
+    def __init__(self, message: str, failures: tuple[tuple[str, Remark], ...] = ()) -> None:
+        super().__init__(message, failures)
+        self.failures = failures  # (name of the photograph, reason)
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 @checked_arguments()
 def orient(
     network: Network,
@@ -305,9 +316,11 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
     residuals = growth.residuals_px()
     fits = residuals <= growth.tolerance_px[network.camera[seen.image]]
     if growth.estimate.oriented.sum() < 2:
-        raise GeometryError(
+        failures = _failures(growth)
+        raise NotOrientedError(
             f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "
-            f"oriented, at least 2 are needed: {_list_failures(_failures(growth))}"
+            f"oriented, at least 2 are needed: {_list_failures(failures)}",
+            failures,
         )
     if start.pair is not None and len(control) >= 3:
         known = growth.estimate.determined[control.point]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -15,8 +16,9 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import PhotographError
 from sfm.kernels.sampling import resample
 from sfm.matching.conjugate_patches import ConjugatePoints
+from sfm.network import Network
 from sfm.photographs.reading import read_photograph
-from sfm.result import PhotographTargets, SurveyResult, in_words
+from sfm.result import PhotographTargets, in_words
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.outlines import Flag
 
@@ -82,24 +84,31 @@ class Overlay:
     thumbnail: bytes  # a small one, JPEG
 
 
-def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = SILENT) -> tuple[Overlay, ...]:
+def draw_overlays(
+    photographs: Sequence[PhotographTargets],
+    solved: Adjustment | Network,
+    *,
+    jobs: int = 1,
+    progress: Progress = SILENT,
+) -> tuple[Overlay, ...]:
     """Draw the overlays of all readable photographs of a survey.
 
     Args:
-        result: result of the survey; its photographs are read again from their files.
+        photographs: the photographs with their targets; they are read again from their files.
+        solved: the adjustment of the image points, or the image points of a survey without adjustment.
         jobs: photographs drawn at the same time.
         progress: called for every photograph.
 
     Returns:
         The overlays in the order of the photographs, without photographs that can no longer be read.
     """
-    factor = arrow_factor(result.adjustment)
-    names = overlay_names(tuple(photograph.image for photograph in result.photographs))
+    factor = arrow_factor(solved) if isinstance(solved, Adjustment) else None
+    names = overlay_names(tuple(photograph.image for photograph in photographs))
 
     def draw(index: int) -> Overlay | None:
-        photograph = result.photographs[index]
+        photograph = photographs[index]
         try:
-            picture = draw_photograph(photograph, result.adjustment, factor)
+            picture = draw_photograph(photograph, solved, factor)
         except PhotographError:
             return None
         legend = _legend(picture.shape[1], factor, photograph)
@@ -112,20 +121,22 @@ def draw_overlays(result: SurveyResult, *, jobs: int = 1, progress: Progress = S
 
     drawn = []
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
-        for overlay in pool.map(draw, range(len(result.photographs))):
+        for overlay in pool.map(draw, range(len(photographs))):
             if overlay is not None:
                 drawn.append(overlay)
                 progress.advance(overlay.image)
     return tuple(drawn)
 
 
-def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, factor: float) -> AnyArray:
+def draw_photograph(
+    photograph: PhotographTargets, solved: Adjustment | Network, factor: float | None
+) -> AnyArray:
     """Draw the overlay of one photograph.
 
     Args:
         photograph: the photograph with its targets.
-        adjustment: gives ids, residuals and rejections of its image points.
-        factor: magnification of the residual vectors.
+        solved: gives ids of its image points, and an adjustment also their residuals and rejections.
+        factor: magnification of the residual vectors; None draws none.
 
     Returns:
         Picture in the channel order blue, green, red, uint8, shape (H, W, 3).
@@ -139,9 +150,12 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     scale = min(1.0, MAX_SIDE_PX / max(grey.shape))
     picture = cv2.cvtColor(fitted_picture(grey, MAX_SIDE_PX), cv2.COLOR_GRAY2BGR)
 
-    rows, names = _image_points(photograph.image, adjustment)
-    seen = adjustment.network.image_points.xy[rows]
-    colour = [DROPPED if rejected else USED for rejected in adjustment.rejected[rows]]
+    adjustment = solved if isinstance(solved, Adjustment) else None
+    network = solved.network if isinstance(solved, Adjustment) else solved
+    rows, names = _image_points(photograph.image, network)
+    seen = network.image_points.xy[rows]
+    rejected = np.zeros(len(rows), dtype=bool) if adjustment is None else adjustment.rejected[rows]
+    colour = [DROPPED if dropped else USED for dropped in rejected]
     owner = nearest_image_points(photograph.xy, seen)
     colour_of_target = [UNUSED if row < 0 else colour[row] for row in owner]
     crowded = len(photograph.xy) > MAX_NAMED_POINTS
@@ -150,10 +164,11 @@ def draw_photograph(photograph: PhotographTargets, adjustment: Adjustment, facto
     else:
         _outlines(picture, photograph, colour_of_target, scale)
     _crosses(picture, photograph.rejected_xy, photograph.rejected_flag, scale)
-    # The vector points from the measured to the adjusted position: v = computed - measured.
-    ends = seen + factor / scale * adjustment.residuals[rows]
-    finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
-    _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
+    if adjustment is not None and factor is not None:
+        # The vector points from the measured to the adjusted position: v = computed - measured.
+        ends = seen + factor / scale * adjustment.residuals[rows]
+        finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
+        _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
     if not crowded:
         for name, xy, one in zip(names, seen, colour, strict=True):
             _label(picture, name, xy, scale, one)
@@ -186,9 +201,8 @@ def overlay_names(images: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _image_points(image: str, adjustment: Adjustment) -> tuple[IntArray, tuple[str, ...]]:
+def _image_points(image: str, network: Network) -> tuple[IntArray, tuple[str, ...]]:
     """Return rows of the image points of one photograph, and the names of their points."""
-    network = adjustment.network
     if image not in network.images:
         return np.zeros(0, dtype=np.int64), ()
     rows = np.flatnonzero(network.image_points.image == network.images.index(image))
@@ -264,14 +278,17 @@ def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: t
         cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, LABEL_SIZE, shade, thickness, cv2.LINE_AA)
 
 
-def _legend(width: int, factor: float, photograph: PhotographTargets) -> AnyArray:
+def _legend(width: int, factor: float | None, photograph: PhotographTargets) -> AnyArray:
     """Return the strip below the photograph that explains the colours and the scale of the vectors."""
     entries: list[tuple[str, tuple[int, int, int]]] = [
         ("accepted", USED),
         ("rejected in the adjustment", DROPPED),
         ("measured, not part of the result", UNUSED),
-        (f"residual, {factor:g} times as long", ARROW),
     ]
+    if factor is None:
+        entries = [("image point", USED), ("measured, not an image point", UNUSED)]
+    else:
+        entries.append((f"residual, {factor:g} times as long", ARROW))
     entries += [
         (f"x {in_words(str(reason.name).lower())}", colour)
         for reason, colour in REASON_COLOURS
