@@ -11,11 +11,9 @@ from sfm.display import counted
 from sfm.remarks.remark import SEVERITIES
 from sfm.remarks.verdict import Verdict
 from sfm.report.figures.overlays import Overlay
-from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, Tile, facts, values_of
+from sfm.report.page import Column, Note, Page, Part, Section, Table, Tile, facts, values_of
 from sfm.report.survey_report import overlay_parts
 from sfm.survey.unfinished import UnfinishedSurvey
-
-STOPPED = "stopped, none oriented"
 
 
 def page(found: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> Page:
@@ -29,7 +27,7 @@ def page(found: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> Page:
     seen = dict(zip((row[0] for row in table.rows), (row[2] for row in table.rows), strict=True))
     shown: tuple[Part, ...] = ()
     if overlays:
-        legend = Paragraph(
+        legend = Note(
             "Green: image points with their names; blue: measured, but not an image point; crosses: "
             "candidates that were not measured, coloured by reason. Click a picture to see it at full size."
         )
@@ -37,7 +35,7 @@ def page(found: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> Page:
         shown = (legend, *overlay_parts(overlays, lambda image: words.get(image, "")))
     note = Note("Shared: image points whose object point is also measured in another photograph.")
     written = facts([("Written", f"by Kolinear {version('kolinear')}"), *found.settings])
-    oriented = STOPPED if found.oriented is None else f"{found.oriented.sum()} of {found.images_total}"
+    oriented = 0 if found.oriented is None else int(found.oriented.sum())
     return Page(
         "summary",
         "Survey report",
@@ -45,14 +43,13 @@ def page(found: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> Page:
         verdict(found),
         (
             Section("How far did it come?", facts(_steps(found)), key="reached"),
-            Section("Photographs", table, note, key="table"),
-            Section("The photographs", *shown, key="photographs", in_text=False),
+            Section("Photographs", table, note, *shown, key="photographs"),
             Section("Settings", written, key="settings"),
         ),
         (
             Tile("Stopped in", found.stage),
             Tile("Image points", len(found.network.image_points)),
-            Tile("Photographs oriented", oriented),
+            Tile("Photographs oriented", f"{oriented} of {found.images_total}"),
         ),
         summary=summary(found),
         file="report",
@@ -146,7 +143,7 @@ def _steps(found: UnfinishedSurvey) -> list[tuple[str, str]]:
     points = f"{counted(len(seen), 'image point')} of {measured}; {shared} in two or more photographs"
     rows.append(("Image points", f"{points}{', matched' if found.matched else ''}"))
     if found.oriented is None or found.determined is None:
-        return [*rows, ("Orientation", STOPPED)]
+        return [*rows, ("Orientation", "stopped, none oriented")]
     oriented = f"{found.oriented.sum()} of {counted(len(found.oriented), 'photograph')} oriented"
     known = counted(int(found.determined.sum()), "object point")
     return [*rows, ("Orientation", f"{oriented}, {known} with approximate coordinates")]
