@@ -127,7 +127,7 @@ ROWS = (
         "warning",
         "{observations:survey observation} {observations:was|were} not used: {observations}.",
         "their points or photographs are not in the result, or too few points of a group are: a plane "
-        "needs 4, a line 3, a station 2 targets",
+        "needs 4, a line 3, a rigid frame 2, a station 2 targets",
         "Correct the names, or look among the points that were left out.",
     ),
     Kind(
