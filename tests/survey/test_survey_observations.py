@@ -588,6 +588,19 @@ def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
     assert "not determined" in text_report(findings_of(result))
 
 
+@pytest.mark.parametrize("others", [(), ("tip", "end")])
+def test_a_frame_with_one_point_in_the_photographs_is_said(others: tuple[str, ...], tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("frame of one point"), images=6, points=20, free=())
+    names = (network.points[15], *others)
+    rows = [f"F,{name},{k},0,0,1e-4,1e-4,1e-4" for k, name in enumerate(names)]
+    (tmp_path / "frame.csv").write_text("\n".join(["group,point,X,Y,Z,sX,sY,sZ", *rows]), "utf-8")
+    lines = '[[survey_observations]]\nkind = "rigid frame"\nfile = "frame.csv"\n\n'
+    result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
+    (unused,) = (one for one in result.remarks if one.kind == "observations_unused")
+    assert "rigid frame F" in unused.names("observations") and "a rigid frame 2" in unused.cause
+    assert len(unused.names("observations")) == 1 + len(others)
+
+
 def test_differences_of_directions_have_no_mean() -> None:
     """Their orientation takes it, however much they differ."""
     rng = seed_of("directions")
