@@ -207,14 +207,15 @@ def test_photographs_that_cannot_be_read_do_not_stop_the_others(
 def test_fewer_than_two_orientable_photographs(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
     for k in range(2, 7):
         (survey.parent / f"bild é {k}.jpg").unlink()
-    assert "1 readable photograph" in refused(capsys, "run", survey)
+    out = survey.parent / "out"
+    assert "1 readable photograph" in refused(capsys, "run", survey, "--out", out)
     blank = np.full((600, 800), 200, dtype=np.uint8)
     for k in range(2, 5):
         cv2.imencode(".jpg", blank)[1].tofile(survey.parent / f"blank {k}.jpg")
-    assert not (survey.parent / "out").exists()
-    assert kolinear("run", survey, "--out", survey.parent / "out") == 1
+    assert not out.exists()
+    assert kolinear("run", survey, "--out", out) == 1
     assert "no two photographs have 4 coded targets in common" in capsys.readouterr().out
-    assert (survey.parent / "out" / "report.html").is_file()
+    assert (out / "report.html").is_file()
 
 
 def test_wrong_survey_files(capsys: pytest.CaptureFixture[str], survey: Path) -> None:
