@@ -37,6 +37,11 @@ RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 5000
 # Contrast of a feature over the full scale; OpenCV's 0.04 keeps only a fifth of the features of a weak
 # texture. Lowe (2004) uses 0.03 of the range 0 to 1, before the division by the layers of an octave.
 MIN_CONTRAST = 0.01
+# Contrast of features of noise alone, in its standard deviations: three of those of the differences of
+# Gaussians of the finest octave (0.10 of the noise), times the three layers of an octave. White noise of 0.5
+# to 4 grey values has 30 to 70 such features in a megapixel, 0.6 of it 300 to 400.
+NOISE_CONTRAST = 0.9
+ROUNDING_8 = 1 / FULL_SCALE_8 / np.sqrt(12)  # standard deviation of rounding to 8 bit, over the full scale
 # Features are extracted from an image of at most this side, reduced at least by 2: they only start the
 # matching, which measures in the photograph itself. If too few are found, a finer image is used.
 MAX_SIDE_PX = 1600
@@ -57,12 +62,14 @@ class Features:
         return len(self.xy)
 
 
-def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features:
+def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: float | None = None) -> Features:
     """Return SIFT features with root-normalised descriptors, spread over the photograph.
 
     Args:
         photograph: (H, W), 8 or 16 bit, grey or colour.
         max_features: if there are more, every cell of a raster keeps its strongest.
+        noise: standard deviation of its noise over the full scale; with fewer features than `max_features`
+            their smallest contrast sinks to what noise alone would have. Not below MIN_CONTRAST if None.
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
@@ -72,16 +79,21 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000) -> Features
     shrink = 2
     while max(eight_bit.shape) > shrink * MAX_SIDE_PX:
         shrink *= 2
-    sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=True)
+    contrast = MIN_CONTRAST
+    least = MIN_CONTRAST if noise is None else NOISE_CONTRAST * float(np.hypot(noise, ROUNDING_8))
     while True:
+        sift = cv2.SIFT.create(contrastThreshold=contrast, enable_precise_upscale=True)
         height, width = (max(1, side // shrink) for side in eight_bit.shape)
         # whole blocks of pixels: a remainder at the border belongs to none
         whole = eight_bit[: height * shrink, : width * shrink]
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
-        if shrink == 1 or len(points) >= max_features:
+        if len(points) >= max_features or (shrink == 1 and contrast <= least):
             break
-        shrink //= 2
+        if shrink > 1:
+            shrink //= 2
+        else:
+            contrast = max(contrast / 2, least)
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     kept = _strongest_per_cell(xy, np.array([p.response for p in points]), picture.shape, max_features)
     points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])

@@ -256,7 +256,11 @@ class NaturalPoints(Features):
 
 @checked_arguments()
 def natural_points(
-    photograph: AnyArray, *, detector: str = "foerstner", max_features: int = 2000
+    photograph: AnyArray,
+    *,
+    detector: str = "foerstner",
+    max_features: int = 2000,
+    noise: float | None = None,
 ) -> NaturalPoints:
     """Find the natural points by which a photograph is linked to others and measured.
 
@@ -264,6 +268,7 @@ def natural_points(
         photograph: (H, W), 8 or 16 bit, grey or colour.
         detector: foerstner finds positions for the points, sift keeps those of the features.
         max_features: largest number of features, the strongest of all parts of the photograph.
+        noise: standard deviation of its noise over the full scale, down to which weak texture is used.
 
     Raises:
         GeometryError: an unknown detector.
@@ -272,6 +277,6 @@ def natural_points(
     """
     if detector not in DETECTORS:
         raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
-    found = sift_features(photograph, max_features=max_features)
+    found = sift_features(photograph, max_features=max_features, noise=noise)
     corners = foerstner_points(photograph).xy if detector == "foerstner" else np.zeros((0, 2))
     return NaturalPoints(found.xy, found.scale, found.angle, found.descriptor, corners)

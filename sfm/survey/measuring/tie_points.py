@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
+from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
 from sfm.matching.tracks.features import PARTNERS
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
@@ -34,6 +35,7 @@ from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
 from sfm.survey.measuring.targets import each_photograph
+from sfm.targets.outlines import estimate_noise
 
 NONE = -1  # no photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
@@ -207,11 +209,14 @@ def natural_points_of(
         path,
         TEXTURE,
         settings.model_dump_json(include={"detector", "max_features"}),
-        lambda: natural_points(
-            read_photograph(path) if photograph is None else photograph,
-            detector=settings.detector,
-            max_features=settings.max_features,
-        ),
+        lambda: _natural_points(read_photograph(path) if photograph is None else photograph, settings),
+    )
+
+
+def _natural_points(photograph: AnyArray, settings: TiePointSettings) -> NaturalPoints:
+    noise = estimate_noise(grey_of(photograph)) / full_scale(photograph)
+    return natural_points(
+        photograph, detector=settings.detector, max_features=settings.max_features, noise=noise
     )
 
 
