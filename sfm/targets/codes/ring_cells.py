@@ -37,11 +37,6 @@ _SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA = 0.05, 0.3, 0.25
 _STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR, _HALVINGS, _ROUNDS = 1 / 24, 0.03, 0.3, 0.15, 4, 24
 _FIRST_STEPS = (_STEP_PLACE, _STEP_SPREAD, _STEP_GLOW, _STEP_BLUR)
 _SIGMAS = np.array([_SPREAD_SIGMA, _GLOW_SIGMA, _BLUR_SIGMA])
-# The search is worthwhile from this jump from clear to set, in steps of the ring, between these steps, in
-# steps to the dot, and up to this RMS of the residuals at the best position of the first cell. 350 rings that
-# are read (the retro-panel, rings on screens, sharpened JPEG, motion blur, tilts of 60 degrees) have jumps of
-# 0.46 on, steps of 0.73 to 1.11 and residuals of up to 0.19; holes of a perforated plate have 0.21 to 0.45.
-_WORTH_JUMP, _WORTH_STEPS, _WORTH_RESIDUAL = 0.25, (0.25, 2.0), 0.25
 # Rows of the result after the levels.
 _RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, SPREAD, ROWS = 3, 4, 5, 6, 7, 8
 
@@ -105,37 +100,34 @@ def fit_cells(
                 best_c[:] = c
         if least == math.inf:
             continue
-        bits, step, jump = _two_levels(best_c)
+        bits, _ = _two_levels(best_c)
         # position, spread, glow, ln of the blur over that of the dot
         found, steps = np.array([place, 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
-        residual = math.sqrt(least / samples[: len(IN_RING)].size)
-        least_step, most_step = _WORTH_STEPS
-        if jump >= _WORTH_JUMP * step and least_step <= step <= most_step and residual <= _WORTH_RESIDUAL:
-            halved = 0
-            for _ in range(_ROUNDS):
-                before = least
-                for parameter in range(len(found)):
-                    for sign in (-1.0, 1.0):
-                        tried = found.copy()
-                        tried[parameter] += sign * steps[parameter]
-                        if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
-                            continue
-                        if not _model(
-                            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried),
-                            *(samples, sigma, ring_part, dot_part, W),
-                        ):
-                            continue
-                        cost = _solve(samples, ring_part, dot_part, W, N, c)
-                        cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
-                        if cost < least:
-                            least = cost
-                            found[:] = tried
-                            break
-                if least == before:
-                    halved += 1
-                    if halved == _HALVINGS:
+        halved = 0
+        for _ in range(_ROUNDS):
+            before = least
+            for parameter in range(len(found)):
+                for sign in (-1.0, 1.0):
+                    tried = found.copy()
+                    tried[parameter] += sign * steps[parameter]
+                    if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
+                        continue
+                    if not _model(
+                        *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried),
+                        *(samples, sigma, ring_part, dot_part, W),
+                    ):
+                        continue
+                    cost = _solve(samples, ring_part, dot_part, W, N, c)
+                    cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
+                    if cost < least:
+                        least = cost
+                        found[:] = tried
                         break
-                    steps /= 2
+            if least == before:
+                halved += 1
+                if halved == _HALVINGS:
+                    break
+                steps /= 2
         if not _model(
             *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, found),
             *(samples, sigma, ring_part, dot_part, W),
@@ -271,8 +263,8 @@ def _solve(
 
 
 @compiled
-def _two_levels(c: FloatArray) -> tuple[FloatArray, float, float]:
-    """Return which cells are set (1.0), split at the widest gap between mean levels, the step and the gap."""
+def _two_levels(c: FloatArray) -> tuple[FloatArray, float]:
+    """Return which cells are set (1.0), split at the widest gap between mean levels, and the step."""
     radii, cells = c.shape
     level = np.zeros(cells)
     for a in range(cells):
@@ -281,14 +273,14 @@ def _two_levels(c: FloatArray) -> tuple[FloatArray, float, float]:
     order = np.sort(level)
     at = int(np.argmax(order[1:] - order[:-1])) + 1
     bits = np.where(level >= order[at], 1.0, 0.0)
-    return bits, order[at:].mean() - order[:at].mean(), order[at] - order[at - 1]
+    return bits, order[at:].mean() - order[:at].mean()
 
 
 @compiled
 def _scatter(c: FloatArray) -> float:
     """Return the sum of squares of the levels about the means of set and clear cells, over all radii."""
     radii, cells = c.shape
-    bits, step, _ = _two_levels(c)
+    bits, step = _two_levels(c)
     high, number = 0.0, 0.0
     for a in range(cells):
         number += bits[a]

@@ -13,7 +13,7 @@ from sfm.errors import SurveyFileError
 from sfm.kernels.compiling import compiled
 from sfm.kernels.sampling import as_grey, bilinear
 from sfm.targets.codes.ring_cells import fit_cells
-from sfm.targets.codes.ring_ellipses import measure_rings
+from sfm.targets.codes.ring_ellipses import may_have_rings, measure_rings, trace_crossings
 
 UNCODED = -1
 UNREADABLE = -2
@@ -280,11 +280,14 @@ def read_codes(
     grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
     blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
     misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
-    found = _read_with_radii(grey, xy, shape, levels, family, blur, misfit, np.zeros((len(xy), 2)))
+    if family.cells == 0:
+        return _read_arcs(grey, xy, shape, levels, family)
+    crossings = trace_crossings(grey, xy, shape, levels)
+    found = _read_with_radii(grey, xy, shape, levels, family, blur, misfit, np.zeros((len(xy), 2)), crossings)
     unread = np.flatnonzero(found.code < 0)
-    if family.cells == 0 or not len(unread):
+    if not len(unread):
         return found
-    rings = measure_rings(grey, xy[unread], shape[unread], levels[unread], (family.inner, family.outer))
+    rings = measure_rings(crossings[unread], shape[unread], (family.inner, family.outer))
     of = unread[rings.row]
     again = _read_with_radii(
         grey,
@@ -295,6 +298,7 @@ def read_codes(
         blur[of],
         misfit[of],
         rings.tilt,
+        crossings[of],
     )
     read = again.code >= 0
     if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
@@ -312,18 +316,18 @@ def _read_with_radii(
     blur: FloatArray,
     misfit: FloatArray,
     tilt: FloatArray,
+    crossings: FloatArray,
 ) -> RingCodes:
-    """Read the code around each dot with the radii of the family; see `read_codes`."""
+    """Read the code around each dot with the radii of the family; see `read_codes` and `trace_crossings`."""
     radii = family.inner + RADII * (family.outer - family.inner)
     polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
     outer = np.full(len(xy), family.outer)
-    if family.cells == 0:
-        return RingCodes(*_read_arcs(polar), outer)
     code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
     body = polar[:, 1:4]
     ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
     code[ring] = UNREADABLE
     ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
+    ring = ring[may_have_rings(crossings[ring], family.inner, family.outer)]
     geometry = xy[ring], shape[ring], levels[ring], blur[ring]
     cells = fit_cells(grey, *geometry, family.cells, family.inner, family.outer, tilt[ring])
     for k, found in zip(ring, cells, strict=True):
@@ -354,8 +358,12 @@ def _sample_rings(
     return out
 
 
-def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the number of arcs in each ring, and the confidence."""
+def _read_arcs(
+    grey: AnyArray, xy: FloatArray, shape: FloatArray, levels: FloatArray, family: CodeFamily
+) -> RingCodes:
+    """Read the number of arcs around each dot, see `read_codes`."""
+    radii = family.inner + RADII * (family.outer - family.inner)
+    polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
     count = np.full(len(polar), UNCODED, dtype=np.int64)
     confidence = np.zeros(len(polar))
     for k, rings in enumerate(polar):
@@ -382,7 +390,7 @@ def _read_arcs(polar: FloatArray) -> tuple[IntArray, FloatArray]:
             continue
         count[k] = len(edges) // 2
         confidence[k] = min(1.0, 2 * certainty)
-    return count, confidence
+    return RingCodes(count, confidence, np.full(len(xy), family.outer))
 
 
 def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
