@@ -152,7 +152,7 @@ TRIES = (
     ),
     Try(
         "two photographs", "4 common points and free camera parameters",
-        _few, 2, ("4 common points in 2 photographs",),
+        _few, 1, ("4 common points in 2 photographs",),
     ),
     Try(
         "no overlap", "4 of 10 photographs share two points with the others",

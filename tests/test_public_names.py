@@ -428,6 +428,7 @@ NOT_IN_THE_TABLE = {
     "allow_outside",
     "source",
     "copied",
+    "other_moments",
     "equipment",
     "diameters",
     "start_orientations",

@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.camera import camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.pipeline import _solve
+from sfm.pipeline import _SoFar, _solve
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, StageClock
 from sfm.survey.assembly import ALONE, assemble_result, compare_solution
@@ -141,6 +141,7 @@ def run_plates(
         files=PhotographList(names, paths, of_camera, Path(".")), photographs=photographs, naming=naming,
     )  # fmt: skip
     clock = StageClock(SILENT)
-    survey, measured, oriented, matched, solution = _solve(survey, measured, 1, clock)
+    so_far = _SoFar(survey, measured)
+    solution = _solve(so_far, 1, clock)
     compared = compare_solution(solution, ALONE, clock, files=None)
-    return assemble_result(survey, measured, oriented, matched, solution, compared, clock)
+    return assemble_result(*so_far.stages, solution, compared, clock)
