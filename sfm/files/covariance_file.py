@@ -193,7 +193,8 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
     fits &= all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
     rigs = known.get("rigs")
     if exterior is not None and stored is not None and fits:
-        exterior[[images.index(name) for name in named]] = stored
+        place = {name: i for i, name in enumerate(images)}
+        exterior[[place[name] for name in named]] = stored
     found = replace(result, exterior_covariance=exterior, interior_covariance=interior, rig_covariance=rigs)
     if rigs is not None:
         names = found.rig_parameters

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -179,18 +180,9 @@ def resect(
         from sfm.textbook.resection.by_method import resect_by_all, signs_warning
 
     with working_on(str(points)):
-        task, other = (
-            read_task(
-                points,
-                c_mm=c,
-                camera_file=camera,
-                start=start,
-                tolerance_mm=tolerance,
-                opposite_signs=signs,
-            )
-            for signs in (opposite_signs, not opposite_signs)
-        )
-    warning = signs_warning(task, other)
+        read = partial(read_task, points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+        task = read(opposite_signs=opposite_signs)
+        warning = "" if camera is None else signs_warning(task, read(opposite_signs=not opposite_signs))
     if method == "all":
         found = resect_by_all(task)
         text = comparison_table(found, task.c) + (f"\nwarning: {warning}" if warning else "")

@@ -56,8 +56,8 @@ MIN_POINTS = 4  # fewest points of a photograph: P3P always fits three, the four
 START_TOLERANCE = 0.03  # share of the photograph's diagonal: residuals of unknown distortion after resection
 FINAL_TOLERANCE_PX = 4.0  # no image point is excluded below this here; the adjustment tests further
 # Share of oriented photographs from which a dropped one casts no doubt on the others. Of 40 simulated castles
-# of 9 photographs with 25 % wrong matches, the solution is wrong in one of those with fewer, and in none with
-# more; growing again takes three times as long.
+# of 9 photographs with 25 % wrong matches, growing again corrected one, of which 5 were oriented, and none
+# with more than this share; it takes three times as long.
 MOST = 0.75
 MIN_RIVALS = 3  # oriented photographs; with two, other knowledge decides, see `best_start`
 GROWTH = 1.25  # growth in the number of photographs after which the network is adjusted again
