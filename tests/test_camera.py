@@ -183,6 +183,20 @@ def test_rays_and_pixels_of_strong_lenses_are_inverse_up_to_the_fold_and_end_the
     assert back == 200
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_many_points_of_strong_lenses_are_mapped_like_single_ones(model: str) -> None:
+    """The range without a fold is found once for many points, and tested for every one of few."""
+    rng = seed_of(f"many {model}")
+    for _ in range(4):
+        camera = strong_lens(model, rng)
+        xy = rng.uniform(-0.2, 1.2, (200, 2)) * SIZE_PX
+        uv = tangents_from_pixel(camera, xy)
+        single = np.vstack([tangents_from_pixel(camera, of_point[None]) for of_point in xy])
+        assert uv == pytest.approx(single, rel=1e-9, abs=1e-9, nan_ok=True)
+        single = np.vstack([pixel_from_tangents(camera, ray[None]) for ray in uv])
+        assert pixel_from_tangents(camera, uv) == pytest.approx(single, rel=1e-9, abs=1e-9, nan_ok=True)
+
+
 @pytest.mark.parametrize("share", [0.25, 0.4, 0.7])
 def test_barrel_distortion_of_any_share_has_pixels_in_the_corners(share: float) -> None:
     """A fixed-point iteration diverges where 3 K1 r^2 reaches 1, and with it a third of a wide lens."""

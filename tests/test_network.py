@@ -14,7 +14,15 @@ import sfm
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, KolinearError
-from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.network import (
+    Estimate,
+    ExteriorObservations,
+    ImagePoints,
+    Network,
+    ObjectPoints,
+    ScaleBars,
+    sum_rows,
+)
 from sfm.observations import HeightDifferences
 from sfm.reduced_network import reduce_network, select_determined
 from tests.synthetic import make_network, seed_of
@@ -297,3 +305,13 @@ def test_a_point_with_one_ray_has_no_coordinates_in_a_result() -> None:
     control = ObjectPoints(np.arange(4), truth.points[:4], np.tile(1e-8 * np.eye(3), (4, 1, 1)))
     known = adjust(replace(network, control=control), truth, datum="control")  # known otherwise
     assert known.estimate.determined.all()
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (3, 6)])
+def test_rows_are_summed_by_their_index(shape: tuple[int, ...]) -> None:
+    rng = seed_of("sums")
+    index, values = rng.integers(0, 7, 50), rng.standard_normal((50, *shape))
+    expected = np.zeros((9, *shape))
+    np.add.at(expected, index, values)
+    np.testing.assert_array_equal(sum_rows(index, values, 9), expected)
+    assert not sum_rows(index[:0], values[:0], 4).any()

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
+from sfm.network import sum_rows
 
 STEPS = 30  # largest number of Gauss-Newton steps; six to ten are usual
 SETTLED = 1e-8  # last change of the normal, rad, and relative change of the radius
@@ -69,9 +70,8 @@ def fit_circles(views: CircleViews, n_points: int, *, radius: FloatArray | None 
         axes = _across(normal)
         A = _derivatives(lambda n, r: _misfit(views, whitening, n, r), normal, axes, log_radius)
         A[np.isfinite(known)[point], :, 2] = 0.0
-        N, b = np.zeros((n_points, 3, 3)), np.zeros((n_points, 3))
-        np.add.at(N, point, np.einsum("k,kia,kib->kab", weight, A, A))
-        np.add.at(b, point, -np.einsum("k,kia,ki->ka", weight, A, v))
+        N = sum_rows(point, np.einsum("k,kia,kib->kab", weight, A, A), n_points)
+        b = sum_rows(point, -np.einsum("k,kia,ki->ka", weight, A, v), n_points)
         step = np.einsum("nab,nb->na", np.linalg.pinv(N, hermitian=True), b)
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(np.abs(step).max(axis=1), LONGEST_STEP))[:, None]
         normal, log_radius = _tilted(normal, axes, step), log_radius + step[:, 2]
@@ -111,8 +111,7 @@ def _start(views: CircleViews, n_points: int) -> tuple[FloatArray, FloatArray]:
     """Return normals towards the mean of the cameras, (n, 3), and ln of radii from the major axes, (n,)."""
     towards = -np.einsum("kij,kj->ki", views.rotation, views.rays)
     towards /= np.linalg.norm(towards, axis=1)[:, None]
-    normal = np.zeros((n_points, 3))
-    np.add.at(normal, views.point, towards)
+    normal = sum_rows(views.point, towards, n_points)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
     scale = np.sqrt(np.abs(np.linalg.det(views.pixel_jacobian)))
     major = np.sqrt(np.linalg.eigvalsh(views.shape)[:, 1]) / scale * np.abs(views.rays[:, 2])

@@ -53,6 +53,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_sf
 from sfm.kernels.threads import own_threads
+from sfm.network import sum_rows
 from sfm.remarks.remark import Remark, remark
 
 MIN_GROUP = 2  # photographs on each side of a split
@@ -92,8 +93,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     n, m, size = len(reduced.L), reduced.photographs, len(reduced.t)
     on = factor[reduced.image] > 0
     D = np.where(on[:, None, None], reduced.B, 0.0)
-    V = np.zeros((n, 3, 3))
-    np.add.at(V, reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on])
+    V = sum_rows(reduced.point[on], np.swapaxes(D[on], 1, 2) @ D[on], n)
     C = reduced.L @ V  # L^-1 B'D, as B'D = V here
     before = np.bincount(reduced.point[~on], minlength=n)
     after = np.bincount(reduced.point[on], minlength=n)
@@ -104,8 +104,7 @@ def _moved_at(reduced: Reduced, factor: FloatArray, search: float) -> Iterator[A
     by = np.swapaxes(reduced.B[on], 1, 2) @ reduced.A[on]
     K = points_by_cameras(by, reduced.point[on], reduced.image[on], n, m)
     K = K[movable] - np.swapaxes(C[movable], 1, 2) @ reduced.W[movable]
-    g = np.zeros((n, 3))
-    np.add.at(g, reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]))
+    g = sum_rows(reduced.point[on], np.einsum("kab,ka->kb", D[on], reduced.v[on]), n)
     g = g[movable] - np.einsum("nab,na->nb", C[movable], reduced.y[movable])
     g = g - K @ (reduced.Sinv @ reduced.t)
     blocks_of = V[movable] - np.swapaxes(C[movable], 1, 2) @ C[movable]

@@ -29,7 +29,7 @@ from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.distributions import f_sf
-from sfm.network import rows_of
+from sfm.network import rows_of, sum_rows
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5
@@ -84,8 +84,8 @@ class Reduced:
         """
         n, f, count = len(self.L), D.shape[2], int(run.max()) + 1
         owner = run[self.image]
-        C = np.zeros((n, count, 3, f))
-        np.add.at(C, (self.point, owner), np.swapaxes(self.B, 1, 2) @ D)
+        by_points = np.swapaxes(self.B, 1, 2) @ D
+        C = sum_rows(self.point * count + owner, by_points, n * count).reshape(n, count, 3, f)
         flat_C = np.moveaxis(self.L[:, None] @ C, 1, 2).reshape(3 * n, count * f)
         by = np.swapaxes(self.A, 1, 2) @ D
         m = self.photographs
@@ -149,8 +149,7 @@ class Reduced:
     def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return H, g, squares, remainder after elimination and shifts of points, for whitened columns."""
         n, q = len(self.L), D.shape[2]
-        C = np.zeros((n, 3, q))
-        np.add.at(C, self.point, np.swapaxes(self.B, 1, 2) @ D)
+        C = sum_rows(self.point, np.swapaxes(self.B, 1, 2) @ D, n)
         flat_C = (self.L @ C).reshape(3 * n, q)
         flat = D.reshape(-1, q)
         squares = np.einsum("kq,kq->q", flat, flat)
@@ -170,9 +169,7 @@ class Reduced:
         m, q = self.photographs, D.shape[2]
         by = np.swapaxes(self.A, 1, 2) @ D
         K = np.zeros((len(self.t), q))
-        by_pose = np.zeros((m, 6, q))
-        np.add.at(by_pose, self.image, by[:, :6])
-        K[: 6 * m] = by_pose.reshape(6 * m, q)
+        K[: 6 * m] = sum_rows(self.image, by[:, :6], m).reshape(6 * m, q)
         K[6 * m :] = by[:, 6:].sum(axis=0)
         return K
 
@@ -202,11 +199,9 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     interior, prior, slope = _free_interior(a)
     A = np.concatenate([F @ columns.exterior[used], F @ interior[used]], axis=2)
     size = 6 * m + interior.shape[2]
-    V, gp = np.zeros((n, 3, 3)), np.zeros((n, 3))
     Bt = np.swapaxes(B, 1, 2)
-    np.add.at(V, point, Bt @ B)
-    np.add.at(gp, point, np.einsum("kab,kb->ka", Bt, v))
-    V, gp = V + weight, gp + slope_of_given
+    V = sum_rows(point, Bt @ B, n) + weight
+    gp = sum_rows(point, np.einsum("kab,kb->ka", Bt, v), n) + slope_of_given
     V[~V.any(axis=2)] += np.tile(np.eye(3), (n, 1, 1))[~V.any(axis=2)]  # fixed or not seen
     L = np.linalg.inv(np.linalg.cholesky(V))
     W = L @ points_by_cameras(Bt @ A, point, image, n, m)
@@ -255,10 +250,9 @@ def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, 
         m: number of photographs.
     """
     found = np.zeros((n, 3, 6 * m + by.shape[2] - 6))
-    every = np.zeros((n, m, 3, 6))
-    np.add.at(every, (point, image), by[:, :, :6])
+    every = sum_rows(point * m + image, by[:, :, :6], n * m).reshape(n, m, 3, 6)
     found[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
-    np.add.at(found[:, :, 6 * m :], point, by[:, :, 6:])
+    found[:, :, 6 * m :] = sum_rows(point, by[:, :, 6:], n)
     return found
 
 
