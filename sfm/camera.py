@@ -458,7 +458,7 @@ def _clear_radius(
             if not radius > narrowest:
                 return 0.0
             at[0], at[1] = x_axis + radius * np.cos(t), y_axis + radius * np.sin(t)
-    return CERTAIN * radius
+    return float(CERTAIN * radius)
 
 
 @kernel
