@@ -69,11 +69,17 @@ def test_no_code_is_read_from_print(codes: str) -> None:
 
 
 def test_counters_of_letters_are_no_targets_and_free_rings_are() -> None:
+    """Letters of a geometric face: o is a ring, and b, d, p and q have a stem beside it."""
     rng = np.random.default_rng(4)
     ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
-    for y in range(40, 400, 34):  # words of o
-        for x in range(40, WIDTH - 40, 26):
+    for y in range(40, 400, 38):
+        for x in range(40, WIDTH - 40, 30):
+            letter = rng.choice(list("obdpq"))
             cv2.circle(ink, (x * SUPER, y * SUPER), 8 * SUPER, 255, 4 * SUPER)
+            if letter != "o":
+                stem = (x + (8 if letter in "dq" else -8)) * SUPER
+                end = (y + (18 if letter in "pq" else -18)) * SUPER
+                cv2.line(ink, (stem, y * SUPER), (stem, end), 255, 4 * SUPER)
     rings = [(100, 560), (300, 560), (500, 560)]
     for x, y in rings:  # a white dot on a black disc stands for itself
         cv2.circle(ink, (x * SUPER, y * SUPER), 16 * SUPER, 255, -1)
@@ -82,7 +88,47 @@ def test_counters_of_letters_are_no_targets_and_free_rings_are() -> None:
         found = find_targets(exposed(ink, rng), polarity="bright", codes=codes, min_diameter_px=4)
         assert len(found) == len(rings)
         assert np.abs(np.sort(found.xy[:, 0]) - [x for x, _ in rings]).max() < 0.6
-        assert dict(count_flags(found.rejected_flag))["thin_background"] > 300
+        assert dict(count_flags(found.rejected_flag))["thin_background"] > 200
+
+
+def labels(outline: str, rim: float, ratio: float, turn_deg: float) -> tuple[AnyArray, FloatArray]:
+    """Return a photograph of white dots of 20 px on dark labels in rows, and their centres, px.
+
+    Args:
+        outline: round, square or oblong.
+        rim: width of the label around the dot, in radii.
+        ratio: of the axes of the dots, as a tilt of the whole sheet shows them.
+        turn_deg: direction of the tilt.
+    """
+    turn, radius = np.radians(turn_deg), 10.0
+    c, s = np.cos(turn), np.sin(turn)
+    A = np.array([[c, -s], [s, c]]) @ np.diag([1.0, ratio]) @ np.array([[c, s], [-s, c]])
+    half = radius * (1 + rim) * np.array([1.5 if outline == "oblong" else 1.0, 1.0])
+    across, down = np.meshgrid(np.arange(8) - 3.5, np.arange(5) - 2.0)
+    places = np.column_stack([across.ravel(), down.ravel()]) * (2 * half + 0.8 * radius)
+    circle = np.exp(2j * np.pi * np.arange(180) / 180)
+    disc = radius * np.column_stack([circle.real, circle.imag])
+    box = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    ink = np.zeros((HEIGHT * SUPER, WIDTH * SUPER), np.uint8)
+    middle = np.array([WIDTH, HEIGHT]) / 2
+    for place in places:
+        for shape, value in ((disc * (1 + rim) if outline == "round" else box, 255), (disc, 0)):
+            corners = ((place + shape) @ A.T + middle + 0.5) * SUPER - 0.5
+            cv2.fillPoly(ink, [np.rint(16 * corners).astype(np.int32)], value, cv2.LINE_8, 4)
+    return exposed(ink, np.random.default_rng(5)), places @ A.T + middle
+
+
+@pytest.mark.parametrize("rim", [0.5, 0.9])
+@pytest.mark.parametrize(("ratio", "turn_deg"), [(1.0, 0), (0.5, 25)])
+@pytest.mark.parametrize("outline", ["round", "square", "oblong"])
+def test_dots_on_labels_beside_others_are_targets(
+    outline: str, rim: float, ratio: float, turn_deg: float
+) -> None:
+    photograph, centres = labels(outline, rim, ratio, turn_deg)
+    found = find_targets(photograph, polarity="bright")
+    distance = np.hypot(*(centres[:, None] - found.xy).transpose(2, 0, 1)).min(axis=1)
+    assert (distance < 0.3).sum() >= 38
+    assert len(found) <= 40
 
 
 def test_an_arc_does_not_take_the_dot_away() -> None:
