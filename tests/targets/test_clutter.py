@@ -194,7 +194,30 @@ def test_keys_are_refused_without_a_search(monkeypatch: pytest.MonkeyPatch) -> N
     assert searched < found / 4
 
 
-def search(picture: AnyArray, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
+@pytest.mark.parametrize("pitch", [3.0, 3.5])
+@pytest.mark.parametrize("square", [False, True])
+def test_large_keys_at_the_radii_of_a_ring_are_refused_without_a_search(
+    square: bool, pitch: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neighbours begin where a ring does, but go on behind it."""
+    ink, half = np.zeros((440 * SUPER, 640 * SUPER), np.uint8), 14
+    letter = np.random.default_rng(8)
+    for row, y in enumerate(np.arange(2 * half, 440 - half, half * pitch)):
+        for x in np.arange(2 * half + row % 4 * half / 2, 640 - half, half * pitch):
+            left, top, size = int((x - half) * SUPER), int((y - half) * SUPER), 2 * half * SUPER
+            if square:
+                cv2.rectangle(ink, (left, top, size, size), 255, -1)
+            else:
+                middle = (left + half * SUPER, top + half * SUPER)
+                cv2.ellipse(ink, middle, (half * SUPER, round(0.9 * half * SUPER)), 0, 0, 360, 255, -1)
+            corner = (left + round(0.55 * half * SUPER), top + round(1.4 * half * SUPER))
+            cv2.putText(ink, str(letter.choice(list("oQebd80"))), corner, 0, 0.4 * SUPER, 0, 2 * SUPER)
+    found, searched = search(exposed(ink, np.random.default_rng(6)), monkeypatch, polarity="auto")
+    assert found > 20
+    assert searched < found / 10
+
+
+def search(picture: AnyArray, monkeypatch: pytest.MonkeyPatch, polarity: str = "dark") -> tuple[int, int]:
     """Return the number of dots, and of those around which the cells of a ring are searched (13 ms each)."""
     searched = 0
 
@@ -204,7 +227,7 @@ def search(picture: AnyArray, monkeypatch: pytest.MonkeyPatch) -> tuple[int, int
         return np.full((len(xy), ROWS, 14), np.nan)
 
     monkeypatch.setattr("sfm.targets.codes.rings.fit_cells", count)
-    found = find_targets(picture, codes="ring14", polarity="dark", min_diameter_px=5)
+    found = find_targets(picture, codes="ring14", polarity=polarity, min_diameter_px=5)
     return len(found), searched
 
 

@@ -42,7 +42,7 @@ _RESIDUAL, _GAP, _BEHIND_RING, _SIGMA, SPREAD, ROWS = 3, 4, 5, 6, 7, 8
 
 
 @compiled
-def fit_cells(
+def place_cells(
     image: AnyArray,
     xy: FloatArray,
     shape: FloatArray,
@@ -52,13 +52,11 @@ def fit_cells(
     inner: float,
     outer: float,
     tilt: FloatArray,
-) -> FloatArray:
-    """Return the contents of the cells of the ring around each dot; nan if the photograph cuts the ring.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the contents of the cells at the best of twelve positions of the first cell, and this start.
 
     Samples on ellipses similar to that of the dot are modelled as a sum of cell levels, each blurred like the
-    edge of the dot. Of twelve positions of the first cell the one that is best explained by two levels is
-    chosen. Then four quantities are refined: this position, the widening of the set cells along and across
-    the ring by spreading ink and light, and the blur.
+    edge of the dot. The position that is best explained by two levels is chosen.
 
     Args:
         image: intensities, shape (H, W).
@@ -72,13 +70,11 @@ def fit_cells(
         tilt: perspective, see `ring_ellipses.Rings`, shape (k, 2).
 
     Returns:
-        For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell
-        (inner, middle and outer); RMS residual in the cell; deviations from the expected level in the clear
-        ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink
-        in radii of the dot; (k, 8, cells).
+        Contents as from `fit_cells`, (k, 8, cells); cost, position and which cells are set, (k, 2 + cells).
+        Both are nan if the photograph cuts the ring.
     """
     m = cells * SAMPLES
-    out = np.full((len(xy), ROWS, cells), math.nan)
+    out, start = np.full((len(xy), ROWS, cells), math.nan), np.full((len(xy), 2 + cells), math.nan)
     samples = np.empty((len(IN_RING) + 2, m))
     sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
     dot_part = np.empty((len(IN_RING) + 2, m))
@@ -100,9 +96,64 @@ def fit_cells(
                 best_c[:] = c
         if least == math.inf:
             continue
-        bits, _ = _two_levels(best_c)
+        start[k, 0], start[k, 1] = least, place
+        start[k, 2:] = _two_levels(best_c)[0]
+        _mixture(sigma, place, nothing, W)
+        _solve(samples, ring_part, dot_part, W, N, c)
+        _compare(samples, ring_part, dot_part, W, N, c, out[k])
+        out[k, SPREAD] = 0.0
+    return out, start
+
+
+@compiled
+def fit_cells(
+    image: AnyArray,
+    xy: FloatArray,
+    shape: FloatArray,
+    levels: FloatArray,
+    blur: FloatArray,
+    cells: int,
+    inner: float,
+    outer: float,
+    tilt: FloatArray,
+    start: FloatArray,
+) -> FloatArray:
+    """Return the contents of the cells of the ring around each dot; nan if the photograph cuts the ring.
+
+    Four quantities are refined: the position of the first cell, the widening of the set cells along and
+    across the ring by spreading ink and light, and the blur.
+
+    Args:
+        image: intensities, shape (H, W).
+        xy: centres of the dots, px, shape (k, 2).
+        shape: (p, q, r) of S, which turns image vectors into dot radii, 1/px, shape (k, 3).
+        levels: intensity of the background and its step to the dot, shape (k, 2).
+        blur: standard deviation of the edge of the dot, px, shape (k,).
+        cells: number of cells.
+        inner: inner radius of the ring in radii of the dot.
+        outer: outer radius of the ring in radii of the dot.
+        tilt: perspective, see `ring_ellipses.Rings`, shape (k, 2).
+        start: from `place_cells`, shape (k, 2 + cells).
+
+    Returns:
+        For each dot and cell, clockwise, with 0 the background and 1 the dot: three levels of the cell
+        (inner, middle and outer); RMS residual in the cell; deviations from the expected level in the clear
+        ring before the cell and behind it; sigma of the level for residuals of 1; and the spread of the ink
+        in radii of the dot; (k, 8, cells).
+    """
+    m = cells * SAMPLES
+    out = np.full((len(xy), ROWS, cells), math.nan)
+    samples = np.empty((len(IN_RING) + 2, m))
+    sigma, ring_part = np.empty(m), np.empty((len(IN_RING) + 2, m))
+    dot_part = np.empty((len(IN_RING) + 2, m))
+    W, N = np.empty((m, cells)), np.empty((cells, cells))
+    c = np.empty((len(IN_RING), cells))
+    for k in range(len(xy)):
+        if math.isnan(start[k, 0]):
+            continue
+        least, bits = start[k, 0], start[k, 2:]
         # position, spread, glow, ln of the blur over that of the dot
-        found, steps = np.array([place, 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
+        found, steps = np.array([start[k, 1], 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
         halved = 0
         for _ in range(_ROUNDS):
             before = least
