@@ -47,11 +47,11 @@ def assemble_result(
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
-    failed = tuple(
-        FailedImage(*one)
-        for one in (*start.failures, *matched.left_out, *solution.dropped_images)
-        if one[0] not in is_in
-    )
+    reasons: dict[str, Remark] = {}  # of a photograph placed by its rig: that of its orientation
+    for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
+        if name not in is_in:
+            reasons.setdefault(name, reason)
+    failed = tuple(FailedImage(*one) for one in reasons.items())
     correlations = exterior_correlations(adjustment)
     code = np.full(len(points), -1) if naming is None else naming.codes(adjustment.network)
     return SurveyResult(

@@ -18,6 +18,7 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
+from sfm.remarks.remark import kinds_of
 from sfm.report.figures.plots import epipolar_figure
 from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.findings.survey_remarks import findings_of
@@ -95,6 +96,33 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     far = replace(result.adjustment, estimate=replace(result.estimate, mounts=turned(result.estimate.mounts)))
     turned_away = rigs_of(far)[0].mounts[0].epipolar
     assert turned_away is not None and turned_away.rms_px > 5 * epipolar_px
+
+
+@pytest.mark.parametrize("seen", [1, 3, 4])
+def test_a_photograph_that_only_its_rig_poses_is_named(seen: int, tmp_path: Path) -> None:
+    """Four image points determine a pose and check it."""
+    network, truth = make_rig(seed_of("posed by rig"), cameras=3, moments=5)
+    k = network.image_points
+    few = (k.image != 4) | (np.cumsum(k.image == 4) <= seen)
+    network = replace(network, image_points=k.select(few))
+    rig = RIG.replace('"camera 2"', '"camera 2", "camera 3"')
+    result = run_survey(read_survey(written(tmp_path, network, truth, rig)))
+    assert network.images[4] in result.adjustment.network.images
+    named = [one for one in result.remarks if one.kind == "photographs_posed_by_rig"]
+    assert [one.names("photographs") for one in named] == ([("moment 2 camera 2",)] if seen < 4 else [])
+    assert all(one.severity == "note" and one.numbers["accepted"].value == seen for one in named)
+
+
+def test_a_photograph_of_a_rig_without_points_of_the_result_is_missing(tmp_path: Path) -> None:
+    """Its only point is in no other photograph."""
+    network, truth = make_rig(seed_of("none accepted"), moments=6)
+    k = network.image_points
+    alone = int(k.point[k.image == 3][0])
+    network = replace(network, image_points=k.select((k.image == 3) == (k.point == alone)))
+    result = run_survey(read_survey(written(tmp_path, network, truth)))
+    (missing,) = result.failed
+    assert missing.image == "moment 2 camera 2" and missing.reason.kind == "photograph_with_few_points"
+    assert "photographs_posed_by_rig" not in kinds_of(result.remarks)
 
 
 def turned(mounts: Mounts | None) -> Mounts:

@@ -126,6 +126,15 @@ ROWS = (
         explains=("photograph_not_connected",),
     ),
     Kind(
+        "photographs_posed_by_rig",
+        "note",
+        "{photographs} {photographs:has|have} too few accepted image points ({accepted}, {needed} are "
+        "needed) for a pose of {photographs:its|their} own: the other cameras of the rig give it.",
+        "little of the object in the view, misidentified points, or a photograph of another moment",
+        "Check that {photographs:it shows|they show} the moment of the others; a shift of the camera on the "
+        "rig goes unnoticed in {photographs:it|them}.",
+    ),
+    Kind(
         "two_photographs",
         "note",
         "Two photographs: no third ray checks a point, and the camera is only as good as its given values.",

@@ -23,6 +23,7 @@ from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import base_name
+from sfm.conventions import IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
@@ -44,6 +45,7 @@ from sfm.survey.adjusting.settling import (
 from sfm.survey.adjusting.solution_remarks import (
     handedness_unchecked,
     left_out_points,
+    posed_by_rigs,
     remarks_on_held_c,
     remarks_on_solution,
     remarks_on_uncalibrated,
@@ -182,6 +184,7 @@ def _solve(survey: Survey, matched: Correspondences, varying: frozenset[str] = f
                 for name, c, unit in _c_per_photograph(varying, final.estimate)
             ),
             *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
+            *posed_by_rigs(final, start.of_its_own[settled.images]),
             *remarks_on_uncalibrated(survey, final.estimate),
             *handedness_unchecked(survey, checked=given.checks_handedness),
             *windows_elsewhere(survey, judged.causes),
@@ -211,6 +214,7 @@ class _Prepared:
 
     task: Task  # with all given values, which are not judged yet
     estimate: Estimate
+    of_its_own: IntArray  # image points that each photograph would need without its rig, (m,)
     frame: Estimate | None  # given coordinates that carry a free datum; None without any
     remarks: tuple[Remark, ...]  # on observed exterior orientation and on freed parameters
 
@@ -257,12 +261,14 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     network, estimate = split_blocks(survey, network, estimate)
     fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
     least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
+    of_its_own = least
     if network.moment is not None:  # the other photographs of a moment determine its pose
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
         least = np.where(shared, 1, least)
     return _Prepared(
         Task(survey, network, matched.min_rays, least, matched.suspected),
         estimate,
+        of_its_own,
         frame,
         (*unused, *chosen.remarks),
     )

@@ -57,6 +57,30 @@ def remarks_on_solution(
     )
 
 
+def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...]:
+    """Return the note on photographs that have a pose by their rig alone.
+
+    Args:
+        adjustment: the final adjustment.
+        needed: image points that determine and check the pose of each photograph without its rig, (m,).
+    """
+    network = adjustment.network
+    of_accepted = network.image_points.image[~adjustment.rejected]
+    accepted = np.bincount(of_accepted, minlength=len(network.images))
+    few = np.flatnonzero(accepted < needed)
+    if not len(few):
+        return ()
+    names = [network.images[i] for i in few]
+    return (
+        remark(
+            "photographs_posed_by_rig",
+            photographs=names,
+            accepted=int(accepted[few].min()),
+            needed=int(needed[few].max()),
+        ),
+    )
+
+
 def windows_elsewhere(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return the remarks; points of texture did not move, but are seen at other positions."""
     if survey.tie_points is None:
