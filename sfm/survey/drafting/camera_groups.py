@@ -2,7 +2,8 @@
 
 Photographs with the same make, model, serial number, lens, focal length and size form a group. It is divided
 by the cameras that the names of the photographs propose, unless serial numbers or times of exposure
-contradict them. Missing pixel sizes and focal lengths are assumed, and the draft states so.
+contradict them. Where names do not pair up, times of exposure may. Missing pixel sizes and focal lengths are
+assumed, and the draft states so.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ import numpy as np
 
 from sfm.photographs.exif import Metadata
 from sfm.remarks.remark import Remark, remark
-from sfm.survey.drafting.camera_names import NamedCameras, cameras_in_names
-from sfm.survey.inputs.settings import RigSettings
+from sfm.survey.drafting.camera_names import NamedCameras, cameras_in_names, divisions_by_names
+from sfm.survey.drafting.camera_times import USUAL_S, TimedRig, rig_of_times
 
 FOCAL_PER_SIDE = 1.2  # assumed focal length over the longer side of the photograph
 FULL_FRAME_MM = 36.0  # assumed longer side of the sensor
@@ -28,7 +29,8 @@ FULL_FRAME_MM = 36.0  # assumed longer side of the sensor
 FISHEYE_NAME = re.compile("fish-?eye", re.IGNORECASE)
 MIN_IN_GROUP = 2  # photographs of a camera; one with fewer is left out if another camera has so many
 # Photographs of one moment differ by the tolerance of a rig, and by the whole seconds that EXIF data state.
-MAX_APART_S = float(RigSettings.model_fields["tolerance_s"].default) + 1.0
+MAX_APART_S = USUAL_S + 1.0
+BY_TIMES = "exif"  # moment of `[[rig]]`: by EXIF times
 
 SensorWidth = Callable[[str, str], float | None]
 """width of the sensor (mm) of a camera by make and model; None where it is unknown"""
@@ -53,12 +55,13 @@ class CameraGroup:
 
 @dataclass(frozen=True)
 class ProposedRig:
-    """Cameras that seem to be mounted on one frame, because the names of their photographs pair up."""
+    """Cameras that seem to be mounted on one frame, because names or times of their photographs pair up."""
 
     cameras: tuple[str, ...]  # their names; the first is the reference
     moment: str  # of `[[rig]]`
     moments: int  # with a photograph of more than one camera
     example: tuple[str, ...]  # photographs of one moment
+    tolerance_s: float = USUAL_S  # of EXIF times
 
 
 @dataclass(frozen=True)
@@ -85,27 +88,61 @@ def group_photographs(
     named = cameras_in_names(sorted(metadata))
     if named is not None and (_is_one_camera(named, metadata) or _are_apart(named, metadata)):
         named = None
-    groups: dict[tuple[object, ...], list[str]] = defaultdict(list)
-    for name, one in sorted(metadata.items()):
-        part = named.camera.get(name, "") if named is not None else ""
-        groups[*_camera_data(one), part].append(name)
-    largest = max((len(names) for names in groups.values()), default=0)
-    kept, left_out = [], []
-    for names in sorted(groups.values(), key=lambda names: (-len(names), names)):
-        if len(names) >= MIN_IN_GROUP or largest < MIN_IN_GROUP:
-            kept.append(names)
-        else:
-            left_out += [(name, _reason_left_out(metadata[name], metadata[kept[0][0]])) for name in names]
-    parts = [named.camera.get(names[0], "") if named is not None else "" for names in kept]
-    labels = _labels([metadata[names[0]] for names in kept], parts)
+    part = {} if named is None else dict(named.camera)
+    kept, left_out = _divide(metadata, part)
+    labels = _labels([metadata[names[0]] for names in kept], [part.get(names[0], "") for names in kept])
+    rig = None if named is None else _rig(named, dict(zip(labels, kept, strict=True)))
+    for division in () if rig is not None else (part, *divisions_by_names(sorted(metadata))):
+        kept_then, left_out_then = _divide(metadata, division)
+        labels_then = _labels(
+            [metadata[names[0]] for names in kept_then], [division.get(names[0], "") for names in kept_then]
+        )
+        cameras = dict(zip(labels_then, kept_then, strict=True))
+        timed = rig_of_times(cameras, metadata)
+        if timed is not None:
+            kept, left_out, labels = kept_then, left_out_then, labels_then
+            rig = _rig_by_times(timed, cameras)
+            break
     return Grouping(
         tuple(
             _group(label, tuple(names), metadata, sensor_width)
             for label, names in zip(labels, kept, strict=True)
         ),
         tuple(left_out),
-        None if named is None else _rig(named, dict(zip(labels, kept, strict=True))),
+        rig,
     )
+
+
+def _divide(
+    metadata: Mapping[str, Metadata], part: Mapping[str, str]
+) -> tuple[list[list[str]], list[tuple[str, str]]]:
+    """Return the photographs of each camera, most first, and those that are left out with the reason.
+
+    part: what stands for the camera in the name of each photograph; none where it is missing.
+    """
+    groups: dict[tuple[object, ...], list[str]] = defaultdict(list)
+    for name, one in sorted(metadata.items()):
+        groups[*_camera_data(one), part.get(name, "")].append(name)
+    largest = max((len(names) for names in groups.values()), default=0)
+    kept: list[list[str]] = []
+    left_out: list[tuple[str, str]] = []
+    for names in sorted(groups.values(), key=lambda names: (-len(names), names)):
+        if len(names) >= MIN_IN_GROUP or largest < MIN_IN_GROUP:
+            kept.append(names)
+        else:
+            left_out += [(name, _reason_left_out(metadata[name], metadata[kept[0][0]])) for name in names]
+    return kept, left_out
+
+
+def _rig_by_times(timed: TimedRig, cameras: Mapping[str, Sequence[str]]) -> ProposedRig:
+    """Return the rig of cameras whose times pair up."""
+    together: dict[str, list[str]] = defaultdict(list)
+    for camera in timed.cameras:
+        for name in cameras[camera]:
+            together[timed.moment[name]].append(name)
+    shared = [tuple(names) for names in together.values() if len(names) > 1]
+    example = max(shared, key=len)
+    return ProposedRig(timed.cameras, BY_TIMES, len(shared), example, timed.tolerance_s)
 
 
 def _camera_data(one: Metadata) -> tuple[object, ...]:

@@ -87,6 +87,26 @@ def cameras_in_names(names: Sequence[str]) -> NamedCameras | None:
     return best[3] if len(groupings) == 1 else None
 
 
+def divisions_by_names(names: Sequence[str]) -> list[dict[str, str]]:
+    """Return the divisions of photographs by a folder or word of their names, whatever their numbers.
+
+    Args:
+        names: names of photographs with their folders, each once.
+
+    Returns:
+        For each division the word of each photograph, by its name; no word is of fewer than MIN_OF_CAMERA.
+    """
+    parts = {name: _parts(name) for name in names}
+    divisions = []
+    for k in range(min((len(one) for one in parts.values()), default=0)):
+        word = {name: of_name[k].text for name, of_name in parts.items()}
+        if {of_name[k].kind for of_name in parts.values()} not in ({FOLDER}, {LETTERS}):
+            continue
+        if len(set(word.values())) > 1 and min(Counter(word.values()).values()) >= MIN_OF_CAMERA:
+            divisions.append(word)
+    return divisions
+
+
 def _parts(name: str) -> tuple[Part, ...]:
     """Return the parts of a name without its ending."""
     path = PurePosixPath(name)

@@ -24,6 +24,7 @@ from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_m
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import (
+    BY_TIMES,
     CameraGroup,
     Grouping,
     ProposedRig,
@@ -31,6 +32,7 @@ from sfm.survey.drafting.camera_groups import (
     group_photographs,
 )
 from sfm.survey.drafting.camera_names import IN_ORDER
+from sfm.survey.drafting.camera_times import USUAL_S
 from sfm.survey.drafting.lens_models import with_lens_models
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
@@ -42,7 +44,10 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".
 DEPTHS = ("*", "*/*")  # where photographs are searched; the first that has some is used
 COMMENT_WIDTH = 100  # characters
 MOMENT_IN_NAMES = "in brackets: what photographs of one moment have in common"
-MOMENTS = {IN_ORDER: "the first photographs of all cameras are of one moment, and so on"}
+MOMENTS = {
+    IN_ORDER: "the first photographs of all cameras are of one moment, and so on",
+    BY_TIMES: "by the times in EXIF data, whatever the clocks differ by",
+}
 FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
 FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
@@ -240,13 +245,23 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> 
 
 def _rig_lines(rig: ProposedRig) -> list[str]:
     return [
-        f"# Names pair up: {counted(rig.moments, 'moment')}, as {as_plain(' and '.join(rig.example))}.",
+        f"# {_what_pairs(rig).capitalize()} pair up: {counted(rig.moments, 'moment')}, "
+        f"as {as_plain(' and '.join(rig.example))}.",
         "# Check that the cameras are fixed to one another and triggered together; else remove this section.",
         "[[rig]]",
         'name = "rig"',
         f"cameras = {json.dumps(list(rig.cameras))}  # the first is the reference",
         f"moment = {_quoted(rig.moment)}  # {MOMENTS.get(rig.moment, MOMENT_IN_NAMES)}",
+        *(
+            []
+            if rig.tolerance_s == USUAL_S
+            else [f"tolerance_s = {rig.tolerance_s:g}  # of times of one moment"]
+        ),
     ]
+
+
+def _what_pairs(rig: ProposedRig) -> str:
+    return "times" if rig.moment == BY_TIMES else "names"
 
 
 def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
@@ -394,7 +409,8 @@ def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[t
             (
                 "rig",
                 f"{' and '.join(grouping.rig.cameras)}, {counted(grouping.rig.moments, 'moment')} by the "
-                "names; check that the cameras are fixed to one another, else remove [[rig]]",
+                f"{_what_pairs(grouping.rig)}; check that the cameras are fixed to one another, else remove "
+                "[[rig]]",
             )
         )
     if trial.plate is not None:

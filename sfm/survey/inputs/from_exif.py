@@ -100,7 +100,7 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
         of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
         corrected, otherwise = dict(of_rig[0]), dict(of_rig[0])
         for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
-            ahead, *others = _clock_offset(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
+            ahead, *others = clock_offsets(list(of_rig[0].values()), list(times.values()), rig.tolerance_s)
             if others and ahead:
                 raise SurveyFileError(
                     f"{survey.source}: rig {rig.name}: the clock of camera {camera} is ahead of that of "
@@ -114,15 +114,20 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
             if ahead or others:
                 kind = "clocks_unsure" if others else "clock_differs"
                 remarks.append(remark(kind, camera=camera, reference=rig.cameras[0], ahead=(second, "s")))
-        moments |= _named_moments(corrected, rig.tolerance_s)
-        other_moments |= _named_moments(otherwise, rig.tolerance_s)
+        moments |= named_moments(corrected, rig.tolerance_s)
+        other_moments |= named_moments(otherwise, rig.tolerance_s)
     if not moments:
         return survey, tuple(remarks)
     return replace(survey, moments=moments, other_moments=other_moments if unsure else {}), tuple(remarks)
 
 
-def _named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str, str]:
-    """Return the moment of each photograph, named by the time of its first photograph."""
+def named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str, str]:
+    """Return the moment of each photograph, named by the time of its first photograph.
+
+    Args:
+        times: time of each photograph, by its name, by one clock.
+        tolerance_s: photographs later than the first of a moment by more are of the next, s.
+    """
     moments, start = {}, datetime.min
     for name, taken in sorted(times.items(), key=lambda one: one[1]):
         if taken - start > timedelta(seconds=tolerance_s):
@@ -150,11 +155,16 @@ def _times(camera: CameraSettings, files: PhotographList, where: str) -> dict[st
     return times
 
 
-def _clock_offset(reference: list[datetime], times: list[datetime], tolerance_s: float) -> list[float]:
+def clock_offsets(reference: list[datetime], times: list[datetime], tolerance_s: float) -> list[float]:
     """Return the possible offsets of a clock from the reference camera's, s; 0 first if that fits as well.
 
     Most pairs of photographs agree at the correct offset. With photographs at regular intervals several
     offsets are possible, and nothing shows which is correct.
+
+    Args:
+        reference: times of the photographs of the reference camera.
+        times: times of the photographs of another camera, by its own clock.
+        tolerance_s: largest difference of the times of one moment, s.
     """
     if not reference or not times:
         return [0.0]
