@@ -22,8 +22,8 @@ from sfm.survey.inputs.from_exif import clock_offsets, named_moments
 from sfm.survey.inputs.settings import RigSettings
 
 ALPHA = 0.001  # probability of as many pairs without a rig
-# Smallest share of the photographs of a camera in pairs. With more than half, 1 of 300 simulated surveys by two
-# people was a rig (eight stations, a photograph of each within 10 s, times in whole seconds); with this, none.
+# Smallest share of the photographs of a camera in pairs. With more than half, 1 of 300 simulated surveys by
+# two people was a rig (eight stations, photographs within 10 s, times in whole seconds); with this, none.
 MIN_PAIRED = 0.75
 # Cameras with one trigger differ by the delay of their shutters, some 10 ms, and of radio triggers.
 TRIGGER_S = 0.25
