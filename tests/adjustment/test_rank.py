@@ -201,6 +201,24 @@ def test_what_drifts_until_the_adjustment_ends_unconverged_is_named(case: str) -
     assert a.defect == 7 + of_cameras + (len(points) if case == "panorama" else 0)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 3, 4])
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_what_drifts_until_the_adjustment_converges_is_named(seed: int, tilt: float) -> None:
+    """Nadir photographs of ground that is nearly flat converge, at any c; with tilts they determine c."""
+    rng = seed_of(f"flat nadir {seed}")
+    position = np.column_stack([rng.uniform(-0.5, 0.5, (6, 2)), np.full(6, 4.0)])
+    points = rng.uniform(-1, 1, (40, 3)) * [1, 1, 0.05]
+    rotation = np.stack([rotation_from_angles(*one) for one in tilt * rng.standard_normal((6, 3))])
+    position[:, :2] += 4.0 * rotation[:, :2, 2]
+    network, truth = noisy("nadir", position, rotation, points, ("c", "x0", "y0"))
+    a = adjust(network, truth, datum=FREE)
+    assert a.converged
+    if tilt:
+        assert a.defect == 7 and not a.undetermined
+    else:
+        assert a.defect > 7 and any("c of camera A" in one for one in a.undetermined)
+
+
 @pytest.mark.parametrize("sigma", [1e-6, 1e-9, 1e-11])
 def test_a_point_that_survey_observations_fix_better_than_rays_has_their_sigma(sigma: float) -> None:
     """Below 3e-5 of the sigma of its rays it was 0, as of a coordinate that the datum fixes."""
