@@ -102,11 +102,12 @@ def pictures() -> tuple[AnyArray, ...]:
     """Render six convergent photographs of two plates with coded targets, without noise."""
     positions, rotations = stations(6)
     optics = Optics(blur_px=0.7, exposure=0.9)
-    found, _ = render_photographs(_scene(), _camera(), positions, rotations, optics=optics, seed=1)
+    found, _ = render_photographs(plates(), camera(), positions, rotations, optics=optics, seed=1)
     return tuple(found)
 
 
-def _camera() -> Camera:
+def camera() -> Camera:
+    """Return the camera of the rendered photographs."""
     return camera_from_values("small", "brown", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=C_MM)
 
 
@@ -127,7 +128,7 @@ def stations(count: int) -> tuple[FloatArray, FloatArray]:
 
 def code_centres() -> dict[int, FloatArray]:
     """Return where the codes of the rendered photographs are by number, mm."""
-    scene = _scene()
+    scene = plates()
     height = np.array([0.0, 60.0])
     return {
         int(code): np.array([*xy, height[face]])
@@ -135,7 +136,8 @@ def code_centres() -> dict[int, FloatArray]:
     }
 
 
-def _scene() -> Scene:
+def plates() -> Scene:
+    """Return two plates with coded targets, one 60 mm above the other, mm."""
     family = code_family("ring14")
     assert isinstance(family, CodeFamily)
     axes = np.tile(np.eye(3)[:2], (2, 1, 1))

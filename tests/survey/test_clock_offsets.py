@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, timedelta
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
-from sfm.remarks.remark import kinds_of, remark
+from sfm.conventions import AnyArray, rotation_from_vector
+from sfm.pipeline import run_survey
+from sfm.remarks.remark import kinds_of, of_kind, remark
+from sfm.rendering.render import render_photographs
+from sfm.rendering.scene import Optics
+from sfm.report.findings.survey_remarks import findings_of
+from sfm.report.survey_report import text_report
 from sfm.survey.clock_offsets import agree_on_clocks, rotation_spread
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
@@ -16,7 +25,10 @@ from sfm.survey.orientation import orient_with_models
 from sfm.survey.rigs import with_moments
 from tests.rigs import make_rig
 from tests.survey.test_rigs import written
+from tests.surveys import SURVEY, camera, code_centres, plates, stations
 from tests.synthetic import seed_of
+
+INTERVAL_S = 10.0
 
 
 @pytest.mark.parametrize("wrong", [True, False])
@@ -47,3 +59,54 @@ def test_the_offset_at_which_cameras_keep_their_mounts_is_taken(wrong: bool, tmp
     assert truth.mounts is not None
     true = truth.mounts.position[1] / np.linalg.norm(truth.mounts.position[1])
     assert base @ true > 0.999
+
+
+@lru_cache
+def rig_pictures(moments: int) -> tuple[tuple[AnyArray, ...], ...]:
+    """Render the photographs of the left and the right camera of a rig, 90 mm apart."""
+    position, rotation = stations(moments)
+    turn = rotation_from_vector(np.array([0.02, 0.1, 0.05]))
+    right = position + rotation @ np.array([90.0, 5.0, 0.0]), rotation @ turn
+    optics = Optics(blur_px=0.7, exposure=0.9)
+    return tuple(
+        tuple(render_photographs(plates(), camera(), *poses, optics=optics, seed=1)[0])
+        for poses in ((position, rotation), right)
+    )
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_clocks_one_interval_off_in_exif_data_are_tried_at_both_offsets(late: bool, tmp_path: Path) -> None:
+    """The right camera misses the first photograph: as they are, its times agree at all its moments."""
+    moments = 6
+    for name, pictures in zip(("left", "right"), rig_pictures(moments), strict=True):
+        for k, picture in enumerate(pictures):
+            if name == "right" and k == 0:
+                continue
+            at = k - 1 if late and name == "right" else k
+            taken = datetime(2026, 5, 4, 12, 0, 0) + timedelta(seconds=INTERVAL_S * at)
+            exif = Image.Exif()
+            exif.get_ifd(ExifTags.IFD.Exif).update(
+                {ExifTags.Base.DateTimeOriginal.value: taken.strftime("%Y:%m:%d %H:%M:%S")}
+            )
+            grey = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+            number = k if name == "left" else 97 + k
+            Image.fromarray(grey).save(tmp_path / f"{name}_{number}.jpg", quality=95, exif=exif)
+    text = SURVEY.format(name="clocks", backend="none")
+    one = text[text.index("[[camera]]") : text.index("[targets]")]
+    cameras = [one.replace("small", side).replace("*.png", f"{side}*.jpg") for side in ("left", "right")]
+    rig = '[[rig]]\nname = "rig"\ncameras = ["left", "right"]\nmoment = "exif"\n'
+    path = tmp_path / "survey.toml"
+    path.write_text(text.replace(one, "".join(cameras) + rig), encoding="utf-8")
+    result = run_survey(read_survey(path))
+    a = result.adjustment
+    assert a.converged and a.sigma0 * a.sigma_px < 0.1 and len(a.network.images) == 2 * moments - 1
+    (said,) = (*of_kind(result.remarks, "clock_differs"), *of_kind(result.remarks, "clocks_unsure"))
+    assert said.kind == ("clock_differs" if late else "clocks_unsure")
+    assert said.number("ahead") == pytest.approx(-INTERVAL_S if late else INTERVAL_S)
+    words = text_report(findings_of(result))
+    assert "nan" not in words.split() and "inf" not in words.split() and "e+1" not in words
+    (mounted,) = findings_of(result).rigs[0].mounts
+    true, found = np.array([code_centres()[one] for one in result.code.tolist()]), a.estimate.points
+    size = np.std(found, axis=0), np.std(true, axis=0)
+    scale = np.linalg.norm(size[0]) / np.linalg.norm(size[1])
+    assert mounted.base / scale == pytest.approx(np.hypot(90.0, 5.0), rel=0.01)
