@@ -233,7 +233,7 @@ def _correlation_of_shared(
             continue
         for epoch, gradient, s, found in ((first, ours, sigma, mine), (second, other, other_sigma, yours)):
             Q = epoch.result.covariance
-            assert Q is not None  # refused before
+            assert Q is not None and epoch.sigma0 is not None  # refused before; see `Epoch`
             found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0))
         words.append(key)
     if not words:
@@ -334,7 +334,7 @@ class Epoch:
     bars: ScaleBars = field(default_factory=ScaleBars)  # that took part, by index of the result's points
     control: ObjectPoints = field(default_factory=ObjectPoints)  # that took part, as observed
     interior: tuple[tuple[str, str, float, float], ...] = ()  # (camera, parameter, observed value, sigma)
-    sigma0: float = 1.0  # sigma0 that scales the covariance of the result
+    sigma0: float | None = None  # sigma0 that scales the covariance of the result
     sigma0_px: float | None = None  # median a posteriori sigma of an image coordinate; None if unknown
     common: Common | None = None  # correlation with the epochs adjusted together with it, if any
 
@@ -343,7 +343,7 @@ class Epoch:
         result = self.result.solution.with_joint_covariance
         given = result.network
         object.__setattr__(self, "result", result)
-        if self.sigma0 == 1.0:
+        if self.sigma0 is None:
             object.__setattr__(self, "sigma0", result.sigma0)
         if not len(self.bars):
             object.__setattr__(self, "bars", given.scale_bars)

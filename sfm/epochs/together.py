@@ -218,6 +218,7 @@ def _network_of(epoch: Epoch) -> Network:
     if epoch.sigma0_px is None:
         raise GeometryError(f"{epoch.name}: its summary.json has no sigma0_px, which its weights come from")
     median = float(np.sqrt(np.median(np.trace(seen.covariance, axis1=1, axis2=2)) / 2))
+    assert epoch.sigma0 is not None  # see `Epoch`
     factor = epoch.sigma0_px / (epoch.sigma0 * median)
     index = {camera.name: k for k, camera in enumerate(result.estimate.cameras)}
     rows = [

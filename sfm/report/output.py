@@ -21,8 +21,8 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -94,12 +94,8 @@ def write_result(
     Raises:
         OutputError: the folder cannot be written, or contains something other than an earlier result.
     """
-    out = Path(out)
-    refuse_foreign_folder(out)
-    started = time.perf_counter()
-    result = findings.result
-    progress.stage("report", 2 * len(result.photographs))
-    with whole_folder(out, "the result", replaceable=True) as folder:
+    out, started, result = Path(out), time.perf_counter(), findings.result
+    with _result_folder(out, finish, progress, steps=2 * len(result.photographs)) as folder:
         if write_colmap is not None:
             (folder / "colmap").mkdir()
             write_colmap(folder / "colmap")
@@ -139,8 +135,6 @@ def write_result(
         beside = {"plots": plots, "overlays": overlays, "has_model": write_colmap is not None}
         page = html_of(timed, viewer=viewer_of(scene, pictures), **beside)
         (folder / "report.html").write_text(page, encoding="utf-8")
-        if finish is not None:
-            finish(folder)
     return out / "report.html"
 
 
@@ -152,12 +146,12 @@ def write_unfinished(
     jobs: int = 1,
     progress: Progress = SILENT,
 ) -> Path:
-    """Write the report of a survey that a stage could not finish into one folder, whole or not at all.
+    """Write the report of a survey that a stage could not finish, as `write_result` writes a result.
 
     Args:
         reached: how far the survey came.
-        out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
-        finish: receives the folder when everything else is written, and may add log.jsonl.
+        out: as in `write_result`, and so are the others.
+        finish: receives the folder, and may add log.jsonl.
         jobs: photographs drawn at the same time.
         progress: called for every photograph.
 
@@ -165,21 +159,30 @@ def write_unfinished(
         The path of report.html.
 
     Raises:
-        OutputError: the folder cannot be written, or contains something other than an earlier result.
+        OutputError: as in `write_result`.
     """
     out = Path(out)
-    refuse_foreign_folder(out)
-    progress.stage("report", len(reached.photographs))
-    with whole_folder(out, "the result", replaceable=True) as folder:
+    with _result_folder(out, finish, progress, steps=len(reached.photographs)) as folder:
         overlays = draw_overlays(reached.photographs, reached.network, jobs=jobs, progress=progress)
         _write_overlays(overlays, folder)
         page = page_of(reached, overlays=overlays)
         for name, content in texts_of(page).items():
             (folder / name).write_text(content, encoding="utf-8", newline="")
         (folder / "report.txt").write_text(text(page), encoding="utf-8")
+    return out / "report.html"
+
+
+@contextmanager
+def _result_folder(
+    out: Path, finish: Callable[[Path], None] | None, progress: Progress, *, steps: int
+) -> Iterator[Path]:
+    """Yield the folder to write, which appears as `out` when all is written and `finish` has received it."""
+    refuse_foreign_folder(out)
+    progress.stage("report", steps)
+    with whole_folder(out, "the result", replaceable=True) as folder:
+        yield folder
         if finish is not None:
             finish(folder)
-    return out / "report.html"
 
 
 def _write_overlays(overlays: Sequence[Overlay], folder: Path) -> None:

@@ -168,6 +168,13 @@ def test_noncentrality_is_that_of_baarda() -> None:
     assert detectable_shift(0.05, 0.8, 1, 20) > detectable_shift(0.05, 0.8, 1, None)
 
 
+def test_a_sigma0_of_one_is_taken_as_given() -> None:
+    """Without it, that of the solution is."""
+    given = epoch(50)
+    assert replace(given, sigma0=1.0).sigma0 == 1.0
+    assert replace(given, sigma0=None).sigma0 == given.result.solution.sigma0 != 1.0
+
+
 def test_a_bar_that_both_share_makes_no_difference_whatever_sigma0_is() -> None:
     """With all weights stated wrong alike, covariances and sigma0 are scaled, and so is what is left."""
     errors = np.array([3.0, -2.0]) * BAR_SIGMA
@@ -177,7 +184,7 @@ def test_a_bar_that_both_share_makes_no_difference_whatever_sigma0_is() -> None:
         scaled = [
             replace(
                 one,
-                sigma0=sigma0 * one.sigma0,
+                sigma0=sigma0 * (one.sigma0 or 1.0),
                 result=replace(one.result, covariance=sigma0**2 * np.asarray(one.result.covariance)),
             )
             for one in (first, second)
