@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sfm.cli.commands.matching import read_task
+from sfm.cli.commands.matching import read_tasks
 from sfm.cli.commands.measuring import resect as resect_command
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.report.single_photographs import comparison_table, resection_json, resection_text
@@ -25,6 +25,10 @@ PRINTED_9 = """
 2.1529e-05 -5.9816e-07 -5.0113e-07 2.0314e-07 4.9247e-06 1.0929e-06
 5.0135e-06 5.4154e-07 -3.3482e-07 -6.5548e-08 1.0929e-06 8.1437e-07
 """
+
+
+def read_task(path, **options):
+    return read_tasks(path, **options)[0]
 
 
 def resect_json(task, method):

@@ -1,11 +1,12 @@
 """The work of `kolinear match`, and the input files of `kolinear resect`.
 
 `match_command` reads two photographs and points, matches the points, and writes a table, JSON and a picture.
-`read_task` reads the points of one photograph and its interior orientation.
+`read_tasks` reads the points of one photograph and its interior orientation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -136,16 +137,15 @@ def _parse_point(text: str) -> FloatArray:
     return xy
 
 
-def read_task(
+def read_tasks(
     points_file: Path,
     *,
     c_mm: float | None = None,
     camera_file: Path | None = None,
     start: str | None = None,
     tolerance_mm: float | None = None,
-    opposite_signs: bool = False,
-) -> Task:
-    """Read the points of one photograph and its interior orientation from files.
+) -> tuple[Task, Task]:
+    """Read the points of one photograph and its interior orientation, also with distortion of opposite signs.
 
     Args:
         points_file: CSV with point,X,Y,Z,x_mm,y_mm.
@@ -154,7 +154,9 @@ def read_task(
             (corrections of the measured point, mm).
         start: start values "X,Y,Z" or "X,Y,Z,omega,phi,kappa" with angles in deg.
         tolerance_mm: largest residual that `robust` accepts as correct, mm; if None, from the data.
-        opposite_signs: whether distortion is subtracted from measured coordinates, as in some programs.
+
+    Returns:
+        The task with distortion added to measured coordinates; and with it subtracted, as in some programs.
 
     Raises:
         SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or c is not
@@ -162,21 +164,24 @@ def read_task(
     """
     names, points, xy = _read_points(points_file)
     values = _read_camera(camera_file) if camera_file is not None else {}
-    if opposite_signs:
-        values |= {name: -values[name] for name in _DISTORTION if name in values}
     if c_mm is not None:
         values["c"] = c_mm
     if "c" not in values:
         raise SurveyFileError("resect: the principal distance is missing, give --c or a camera file with c")
     if not values["c"] > 0:
         raise SurveyFileError(f"resect: the principal distance is {values['c']:g} mm, expected more than 0")
-    # a camera with pixels of 1 mm, so image coordinates in mm can be converted to its pixel coordinates
-    camera = camera_from_values(
-        "resect", "brown", (1, 1), (1.0, 1.0), c_mm=values["c"], values=tuple(values.items())
-    )
-    tangents = tangents_from_pixel(camera, pixel_from_image(xy, (1, 1), _UNIT_PIXEL))
-    c = values["c"]
-    return Task(names, xy, tangents, points, c, _parse_start(start), tolerance_mm)
+    c, begin = values["c"], _parse_start(start)
+    opposite = values | {name: -values[name] for name in _DISTORTION if name in values}
+
+    def task(values: Mapping[str, float]) -> Task:
+        # a camera with pixels of 1 mm, so image coordinates in mm can be converted to its pixel coordinates
+        camera = camera_from_values(
+            "resect", "brown", (1, 1), (1.0, 1.0), c_mm=c, values=tuple(values.items())
+        )
+        tangents = tangents_from_pixel(camera, pixel_from_image(xy, (1, 1), _UNIT_PIXEL))
+        return Task(names, xy, tangents, points, c, begin, tolerance_mm)
+
+    return task(values), task(opposite)
 
 
 def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -169,7 +168,7 @@ def resect(
     Uses one method, or all methods for a comparison.
     """
     with loading():
-        from sfm.cli.commands.matching import read_task
+        from sfm.cli.commands.matching import read_tasks
         from sfm.report.single_photographs import (
             comparison_json,
             comparison_table,
@@ -180,9 +179,9 @@ def resect(
         from sfm.textbook.resection.by_method import resect_by_all, signs_warning
 
     with working_on(str(points)):
-        read = partial(read_task, points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
-        task = read(opposite_signs=opposite_signs)
-        warning = "" if camera is None else signs_warning(task, read(opposite_signs=not opposite_signs))
+        tasks = read_tasks(points, c_mm=c, camera_file=camera, start=start, tolerance_mm=tolerance)
+        task, opposite = reversed(tasks) if opposite_signs else tasks
+        warning = "" if camera is None else signs_warning(task, opposite)
     if method == "all":
         found = resect_by_all(task)
         text = comparison_table(found, task.c) + (f"\nwarning: {warning}" if warning else "")
