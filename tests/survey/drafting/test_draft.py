@@ -251,3 +251,18 @@ def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
 def test_colmap_knows_the_width_of_a_sensor() -> None:
     assert sensor_width_mm("OLYMPUS OPTICAL CO.,LTD", "C4040Z") == pytest.approx(7.11)
     assert sensor_width_mm("Nobody", "Nothing 1") is None
+
+
+def test_names_that_pair_up_are_two_cameras_with_a_rig(tmp_path: Path) -> None:
+    """Each moment was taken for a camera."""
+    for k in range(12):
+        Image.new("L", (120, 80), 9 * k).save(tmp_path / f"dot_{k // 2:02d}_{k % 2}.png")
+    read = tomllib.loads(draft_survey(tmp_path).text)
+    assert len(read["camera"]) == 2 and len(read["rig"]) == 1
+
+
+def test_names_by_date_and_time_are_one_camera(tmp_path: Path) -> None:
+    for k in range(6):
+        Image.new("L", (120, 80), 9 * k).save(tmp_path / f"img-2024-05-0{k + 1}-12-{10 + k}-33-7.png")
+    read = tomllib.loads(draft_survey(tmp_path).text)
+    assert len(read["camera"]) == 1 and "rig" not in read
