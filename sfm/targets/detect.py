@@ -178,7 +178,7 @@ def find_targets(
     ring_radius = np.zeros(len(reason))
     if isinstance(family, CodeFamily):
         legible = find_legible(fit, reason)
-        code[legible], confidence[legible], ring_radius[legible] = read_codes(
+        rings_read = read_codes(
             grey,
             fit.xy[legible],
             fit.shape[legible],
@@ -187,6 +187,8 @@ def find_targets(
             blur_px=fit.blur[legible],
             noise=fit.noise[legible],
         )
+        code[legible], confidence[legible] = rings_read.code, rings_read.confidence
+        ring_radius[legible] = rings_read.outer
         reason[code >= 0] = 0
     duplicate, off_centre = find_duplicates(fit, outlines.sign, reason, code >= 0)
     reason[duplicate] = Flag.DUPLICATE

@@ -149,7 +149,7 @@ def test_coded_rings_are_read_back(family, dark):
         S = vector @ np.diag(value**-0.5) @ vector.T
         shape.append([S[0, 0], S[0, 1], S[1, 1]])
     level = np.tile(255 * 0.9 * np.array([paper, ink - paper]), (4, 1))
-    read, confidence, _ = read_codes(photograph, truth.centre, np.array(shape), level, codes)
+    read, confidence, *_ = read_codes(photograph, truth.centre, np.array(shape), level, codes)
     assert read.tolist() == numbers
     assert confidence.min() > 0.3
 

@@ -58,7 +58,7 @@ def read(picture: AnyArray, family: CodeFamily, affine: FloatArray, dark: float,
     shape = shape_from_axes(s[None], np.arctan2(a[1, 0], a[0, 0])[None])
     centre = np.full((1, 2), (picture.shape[0] - 1) / 2)
     scaled = np.round(dark + (bright - dark) * picture).clip(0, 255).astype(np.uint8)
-    code, _, _ = read_codes(scaled, centre, shape, np.array([[dark, bright - dark]]), family)
+    code, *_ = read_codes(scaled, centre, shape, np.array([[dark, bright - dark]]), family)
     return int(code[0])
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -17,7 +17,6 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
-from sfm.kernels.sampling import as_grey
 from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.settings import TargetSettings
@@ -43,7 +42,7 @@ from sfm.targets.codes.plate_search import (
     shows_a_lattice,
 )
 from sfm.targets.codes.plates import PlateFamily, code_family, group_plates
-from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, UNCODED, CodeFamily, read_codes
+from sfm.targets.codes.rings import NECKLACES, RING_NAMES, RINGS, CodeFamily, RingCodes, RingReader
 from sfm.targets.codes.tags import (
     LARGEST_DICTIONARIES,
     TagFamily,
@@ -143,12 +142,21 @@ def try_targets(
             return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
         tagged, _ = _shared_family([look.tags for look in looks])
     plain = [_measure(path, tagged or "none", store) for path in tried]  # with tags: not measured twice
+    readers = list(map(_ring_reader, photographs, plain))
     counts: dict[str, tuple[int, ...]] = {}
     for families in (RINGS, NECKLACES):  # necklaces have no parity, and also read rings of other families
         if all(len(codes) < MIN_REPEATED for codes in counts.values()):
-            for family in families:
-                codes = list(map(partial(_ring_codes, family), photographs, plain))
-                counts[family] = _repeated_codes(codes)
+            cells = families.__getitem__
+            for number, alike in groupby(sorted(families, key=cells), key=cells):
+                most, unread = 0, 0
+                for family in alike:
+                    read = [_read_rings(family, reader) for reader in readers]
+                    counts[family] = _repeated_codes([one.code for one in read])
+                    if len(counts[family]) > most:
+                        most = len(counts[family])
+                        unread = max(int((one.ringed & (one.code < 0)).sum()) for one in read)
+                if number and most >= max(MIN_REPEATED, unread + 1):  # arcs have few numbers
+                    break  # fewer rings are left for families of other numbers of cells
     progress.advance("rings")
     best, measured = max(counts, key=lambda family: len(counts[family])), plain
     plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
@@ -180,8 +188,8 @@ def try_targets(
                 left_out = ((dots, "no photograph tried shows it with the first plate"),)
         progress.advance("plates of dots")
         if not plates and len(counts[best]) < MIN_REPEATED:
-            read = [read_resolved(photograph) for photograph in photographs]
-            counts |= {family: _repeated_codes([one[family] for one in read]) for family in CONCENTRIC}
+            rings = [read_resolved(photograph) for photograph in photographs]
+            counts |= {family: _repeated_codes([one[family] for one in rings]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
             if len(counts[best]) >= MIN_REPEATED:
                 measured = [_measure(path, best, store) for path in tried]
@@ -237,17 +245,19 @@ def _is_circle(targets: Targets) -> BoolArray:
     return np.asarray(np.isfinite(targets.axes_covariance[:, 0, 0]))
 
 
-def _ring_codes(family: str, photograph: AnyArray, targets: Targets) -> IntArray:
-    """Return the codes of measured targets in a family of rings, negative without a code, (k,)."""
-    rings = code_family(family)
-    assert isinstance(rings, CodeFamily)
+def _ring_reader(photograph: AnyArray, targets: Targets) -> RingReader:
+    """Return a reader of rings around the measured circles of a photograph."""
     circle = _is_circle(targets)
     levels = np.column_stack([targets.background, targets.contrast])[circle]
     shape = shape_from_axes(targets.semi_axes[circle], targets.angle[circle])
-    blur = targets.blur[circle]
-    code = np.full(len(targets), UNCODED)
-    code[circle] = read_codes(as_grey(photograph), targets.xy[circle], shape, levels, rings, blur_px=blur)[0]
-    return code
+    return RingReader(photograph, targets.xy[circle], shape, levels, blur_px=targets.blur[circle])
+
+
+def _read_rings(family: str, reader: RingReader) -> RingCodes:
+    """Return the codes of the circles of a photograph in a family of rings."""
+    rings = code_family(family)
+    assert isinstance(rings, CodeFamily)
+    return reader.read(rings)
 
 
 def _ringed(name: str, grey: AnyArray, targets: Targets) -> Ringed:
@@ -380,9 +390,10 @@ def _look(grey: AnyArray) -> _Look:
         circles = max(circles, len(targets))
         many = shows_a_lattice(targets.xy) if picture is less else len(targets) >= MIN_TARGETS
         rings = (*RINGS, *NECKLACES)
+        reader = _ring_reader(picture, targets)
         if (
             many
-            or any((_ring_codes(family, picture, targets) >= 0).sum() >= MIN_CODES for family in rings)
+            or any((_read_rings(family, reader).code >= 0).sum() >= MIN_CODES for family in rings)
             or any(len(codes) for codes in read_resolved(picture).values())
         ):
             return _Look(True, circles, tags)

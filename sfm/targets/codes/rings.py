@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,7 +78,8 @@ RING_INNER, RING_OUTER = 2.0, 3.0
 ARCS_INNER, ARCS_OUTER = 2.4, 4.3
 MAX_CELLS = 32  # of a ring in a table file; the published codes end at 20 cells
 MAX_TABLE_BYTES = 10_000_000
-# The families of rings by name, and their number of cells; for arcs, the number of arcs is the code.
+# The families of rings by name, and their number of cells; for arcs, the number of arcs is the code. Of two
+# with one number the stricter table comes first: a draft takes the first of those that read most.
 RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20, "even14": 14}
 # Rings of other makers that use all necklaces, without parity: a misread cell gives another valid code.
 NECKLACES = {"necklace8": 8, "necklace10": 10, "necklace12": 12}
@@ -249,6 +251,8 @@ class RingCodes(NamedTuple):
     """confidence of the reading, 0 to 1, shape (k,)"""
     outer: FloatArray
     """outer radius of the ring in radii of the dot, shape (k,)"""
+    ringed: BoolArray
+    """whether the surroundings look like a ring of this number of cells before the search, shape (k,)"""
 
 
 def read_codes(
@@ -281,67 +285,103 @@ def read_codes(
     Returns:
         Codes, confidence and the radius of each ring.
     """
-    grey, levels = as_grey(photograph), np.asarray(levels, dtype=float)
-    blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
-    misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float) / np.abs(levels[:, 1])
-    if family.cells == 0:
-        return _read_arcs(grey, xy, shape, levels, family)
-    crossings = trace_crossings(grey, xy, shape, levels)
-    found = _read_with_radii(grey, xy, shape, levels, family, blur, misfit, np.zeros((len(xy), 2)), crossings)
-    unread = np.flatnonzero(found.code < 0)
-    if not len(unread):
+    return RingReader(photograph, xy, shape, levels, blur_px=blur_px, noise=noise).read(family)
+
+
+class RingReader:
+    """Reads the codes around the dots of a photograph, in as many families as are asked for.
+
+    Where rays cross rings, and what the cells contain for a number of cells and two radii, does not depend on
+    the table of codes. It is measured once for all families.
+    """
+
+    def __init__(
+        self,
+        photograph: AnyArray,
+        xy: FloatArray,
+        shape: FloatArray,
+        levels: FloatArray,
+        *,
+        blur_px: FloatArray | None = None,
+        noise: FloatArray | None = None,
+    ) -> None:
+        """Take the dots; the arguments are those of `read_codes`."""
+        self.grey, self.xy, self.shape = as_grey(photograph), xy, shape
+        self.levels = np.asarray(levels, dtype=float)
+        self.blur = np.full(len(xy), SHARP_PX) if blur_px is None else np.asarray(blur_px, dtype=float)
+        misfit = np.zeros(len(xy)) if noise is None else np.asarray(noise, dtype=float)
+        self.misfit = misfit / np.abs(self.levels[:, 1])
+        self._contents: dict[tuple[int, float, float, bool], dict[int, FloatArray | None]] = {}
+
+    @cached_property
+    def crossings(self) -> FloatArray:
+        """Radii where rays cross a ring, see `trace_crossings`, (k, ANGLES, 2)."""
+        return trace_crossings(self.grey, self.xy, self.shape, self.levels)
+
+    def read(self, family: CodeFamily) -> RingCodes:
+        """Return the codes of a family, see `read_codes`."""
+        if family.cells == 0:
+            return _read_arcs(self.grey, self.xy, self.shape, self.levels, family)
+        every = np.arange(len(self.xy))
+        found = self._read_with_radii(every, self.shape, np.zeros((len(every), 2)), family, as_seen=False)
+        unread = np.flatnonzero(found.code < 0)
+        if not len(unread):
+            return found
+        rings = measure_rings(self.crossings[unread], self.shape[unread], (family.inner, family.outer))
+        of = unread[rings.row]
+        seen = replace(family, inner=rings.inner, outer=rings.outer)
+        again = self._read_with_radii(of, rings.shape, rings.tilt, seen, as_seen=True)
+        read = again.code >= 0
+        if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
+            for part, values in zip(found, again, strict=True):
+                part[of[read]] = values[read]
         return found
-    rings = measure_rings(crossings[unread], shape[unread], (family.inner, family.outer))
-    of = unread[rings.row]
-    again = _read_with_radii(
-        grey,
-        xy[of],
-        rings.shape,
-        levels[of],
-        replace(family, inner=rings.inner, outer=rings.outer),
-        blur[of],
-        misfit[of],
-        rings.tilt,
-        crossings[of],
-    )
-    read = again.code >= 0
-    if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
-        for part, values in zip(found, again, strict=True):
-            part[of[read]] = values[read]
-    return found
 
+    def _read_with_radii(
+        self, of: IntArray, shape: FloatArray, tilt: FloatArray, family: CodeFamily, *, as_seen: bool
+    ) -> RingCodes:
+        """Read the codes around dots with the radii of the family.
 
-def _read_with_radii(
-    grey: AnyArray,
-    xy: FloatArray,
-    shape: FloatArray,
-    levels: FloatArray,
-    family: CodeFamily,
-    blur: FloatArray,
-    misfit: FloatArray,
-    tilt: FloatArray,
-    crossings: FloatArray,
-) -> RingCodes:
-    """Read the code around each dot with the radii of the family; see `read_codes` and `trace_crossings`."""
-    radii = family.inner + RADII * (family.outer - family.inner)
-    polar = _sample_rings(grey, xy, shape, levels, radii, ANGLES)
-    outer = np.full(len(xy), family.outer)
-    code, confidence = np.full(len(xy), UNCODED, dtype=np.int64), np.zeros(len(xy))
-    body = polar[:, 1:4]
-    ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
-    code[ring] = UNREADABLE
-    ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
-    ring = ring[may_have_rings(crossings[ring], family.inner, family.outer)]
-    proportions = family.cells, family.inner, family.outer
-    geometry = xy[ring], shape[ring], levels[ring], blur[ring]
-    contents, start = place_cells(grey, *geometry, *proportions, tilt[ring])
-    ends = np.array([_ends(seen, at[2:]) for seen, at in zip(contents, start, strict=True)], dtype=bool)
-    ring, start = ring[ends], start[ends]
-    geometry = xy[ring], shape[ring], levels[ring], blur[ring]
-    cells = fit_cells(grey, *geometry, *proportions, tilt[ring], start)
-    for k, found in zip(ring, cells, strict=True):
-        code[k], confidence[k] = _read_cells(found, family, misfit[k])
-    return RingCodes(code, confidence, outer)
+        Args:
+            of: dots, (k,).
+            shape: (p, q, r) of S of their rings, 1/px, (k, 3).
+            tilt: perspective of their rings, see `ring_ellipses.Rings`, (k, 2).
+            family: the family of codes.
+            as_seen: whether shape and tilt are those that the photograph shows.
+        """
+        radii = family.inner + RADII * (family.outer - family.inner)
+        polar = _sample_rings(self.grey, self.xy[of], shape, self.levels[of], radii, ANGLES)
+        code, confidence = np.full(len(of), UNCODED, dtype=np.int64), np.zeros(len(of))
+        body = polar[:, 1:4]
+        ring = np.flatnonzero((body > MIN_SET).any(axis=(1, 2)))  # nan is not above
+        code[ring] = UNREADABLE
+        ring = ring[np.isfinite(body[ring]).all(axis=(1, 2))]
+        ring = ring[may_have_rings(self.crossings[of[ring]], family.inner, family.outer)]
+        kept = self._contents.setdefault((family.cells, family.inner, family.outer, as_seen), {})
+        new = np.array([k for k in ring if int(of[k]) not in kept], dtype=np.int64)
+        kept.update(zip(of[new].tolist(), self._fit(of[new], shape[new], tilt[new], family), strict=True))
+        ringed = np.zeros(len(of), dtype=bool)
+        for k in ring:
+            contents = kept[int(of[k])]
+            if contents is not None:
+                ringed[k] = True
+                code[k], confidence[k] = _read_cells(contents, family, self.misfit[of[k]])
+        return RingCodes(code, confidence, np.full(len(of), family.outer), ringed)
+
+    def _fit(
+        self, of: IntArray, shape: FloatArray, tilt: FloatArray, family: CodeFamily
+    ) -> list[FloatArray | None]:
+        """Return the contents of the cells around dots; None where the first comparison shows no ring."""
+        proportions = family.cells, family.inner, family.outer
+        xy, levels, blur = self.xy[of], self.levels[of], self.blur[of]
+        contents, start = place_cells(self.grey, xy, shape, levels, blur, *proportions, tilt)
+        ends = [k for k in range(len(of)) if _ends(contents[k], start[k, 2:])]
+        geometry = xy[ends], shape[ends], levels[ends], blur[ends]
+        cells = fit_cells(self.grey, *geometry, *proportions, tilt[ends], start[ends])
+        found: list[FloatArray | None] = [None] * len(of)
+        for k, fitted in zip(ends, cells, strict=True):
+            found[k] = fitted
+        return found
 
 
 @compiled
@@ -399,7 +439,7 @@ def _read_arcs(
             continue
         count[k] = len(edges) // 2
         confidence[k] = min(1.0, 2 * certainty)
-    return RingCodes(count, confidence, np.full(len(xy), family.outer))
+    return RingCodes(count, confidence, np.full(len(xy), family.outer), count != UNCODED)
 
 
 def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
