@@ -129,7 +129,7 @@ ROWS = (
         "photographs_posed_by_rig",
         "note",
         "{photographs} {photographs:has|have} too few accepted image points ({accepted}, {needed} are "
-        "needed) for a pose of {photographs:its|their} own: the other cameras of the rig give it.",
+        "needed) to be oriented alone: the other cameras of the rig give the pose.",
         "little of the object in the view, misidentified points, or a photograph of another moment",
         "Check that {photographs:it shows|they show} the moment of the others; a shift of the camera on the "
         "rig goes unnoticed in {photographs:it|them}.",
