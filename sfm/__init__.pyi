@@ -3,7 +3,7 @@
 from sfm.adjustment.covariance import change_datum as change_datum
 from sfm.adjustment.datum import Datum as Datum
 from sfm.adjustment.result import Adjustment as Adjustment
-from sfm.adjustment.solve import adjust as adjust
+from sfm.api import adjust as adjust
 from sfm.api import compare as compare
 from sfm.api import distance as distance
 from sfm.api import measure as measure

@@ -8,18 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust as adjust_network
 from sfm.arguments import checked_arguments
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
+from sfm.judgement.verdict import judge_adjustment
 from sfm.kernels.threads import cores
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
@@ -34,6 +36,7 @@ from sfm.survey.measuring.measured_store import MeasuredStore
 
 load_adapters()
 BACKENDS = ("colmap", "none")
+Options = ParamSpec("Options")
 
 
 @checked_arguments()
@@ -147,7 +150,7 @@ def write_result(
             Path(folder), "tables", Content(solution_of(result, "write_result").with_joint_covariance)
         )
         return Path(folder) / "points.csv"
-    from sfm.report.findings.survey_remarks import findings_of
+    from sfm.report.findings import findings_of
     from sfm.report.output import write_result as write
 
     with one_blas_thread():
@@ -158,6 +161,19 @@ def write_result(
             jobs=jobs or cores(),
             budget_mb=pictures_mb,
         )
+
+
+def judged(solve: Callable[Options, Adjustment]) -> Callable[Options, Adjustment]:
+    """Return a function that adjusts a network and judges the result."""
+
+    @wraps(solve)
+    def adjust(*args: Options.args, **options: Options.kwargs) -> Adjustment:
+        return judge_adjustment(solve(*args, **options))
+
+    return adjust
+
+
+adjust = judged(adjust_network)
 
 
 @checked_arguments()

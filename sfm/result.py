@@ -21,6 +21,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark
+from sfm.remarks.verdict import NOT_JUDGED, Verdict
 from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution
 from sfm.targets.outlines import LIKELIEST_FIRST, Flag, count_flags
 
@@ -154,7 +155,8 @@ class SurveyResult:
     baseline: BaselineComparison | None = None  # comparison with another pipeline; None if not requested
     photographs: tuple[PhotographTargets, ...] = ()  # all readable photographs; none with [observations]
     control_check: ControlCheck | None = None  # None without control, or where the datum is control
-    remarks: tuple[Remark, ...] = ()  # remarks of its stages
+    stage_remarks: tuple[Remark, ...] = ()  # remarks of its stages
+    verdict: Verdict = NOT_JUDGED  # level, headline and all remarks
     eccentricity: Eccentricity | None = None  # None where it was not corrected
     no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
@@ -177,6 +179,11 @@ class SurveyResult:
     def name(self) -> str:
         """Name of the survey."""
         return self.survey
+
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
+        """All remarks of the verdict, the most serious first."""
+        return self.verdict.remarks
 
     @property
     def network(self) -> Network:
@@ -224,7 +231,9 @@ class SurveyResult:
     @cached_property
     def solution(self) -> Solution:
         """The accepted image points, with their solution and covariance."""
-        return replace(self.adjustment.solution, name=self.survey, unit=self.length_unit)
+        return replace(
+            self.adjustment.solution, name=self.survey, unit=self.length_unit, verdict=self.verdict
+        )
 
     @property
     def points(self) -> PointTable:
@@ -273,13 +282,16 @@ class SurveyResult:
         ]
         if both is not None:
             rows.append((both.backend, both.outcome))
-        return rows + [(one.severity, one.text) for one in self.remarks]
+        return rows
 
     def __repr__(self) -> str:
-        return text_table(f"Survey {self.survey}", ("", ""), self._rows())
+        table = text_table(f"Survey {self.survey}", ("", ""), self._rows())
+        return f"{table}\n{self.verdict.text}"
 
     def _repr_html_(self) -> str:
-        return html_table(f"Survey {self.survey}", ("", ""), self._rows())
+        remarks = [(one.severity, one.text) for one in self.verdict.lines]
+        rows = [("verdict", self.verdict.headline), *self._rows(), *remarks]
+        return html_table(f"Survey {self.survey}", ("", ""), rows)
 
     @property
     def image_point_counts(self) -> str:

@@ -21,6 +21,7 @@ from sfm.display import counted, html_table, text_table
 from sfm.errors import BackendError, GeometryError
 from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
+from sfm.remarks.verdict import NOT_JUDGED, Verdict
 
 if TYPE_CHECKING:
     import pandas
@@ -107,6 +108,7 @@ class Solution:
     # rad, (s, s)
     rig_covariance: FloatArray | None = None
     joint: JointCovariance | None = None  # joint covariance of an adjustment in memory; otherwise None
+    verdict: Verdict = NOT_JUDGED  # level, headline and all remarks
     sigma0: float = 1.0  # of unit weight: the covariances are its square times those of the stated weights
 
     @property
@@ -248,12 +250,15 @@ class Solution:
 
     def _rows(self) -> list[tuple[str, str]]:
         known = self.point_covariance is not None
-        return [
+        rows = [
             ("photographs", str(len(self.network.images))),
             ("points", f"{len(self.network.points)}{', with' if known else ', without'} standard deviations"),
             ("image points", str(len(self.network.image_points))),
             ("cameras", ", ".join(f"{c.name} ({c.model})" for c in self.estimate.cameras)),
         ]
+        if self.verdict is NOT_JUDGED:
+            return rows
+        return [*rows, ("verdict", self.verdict.summary)]
 
     def __repr__(self) -> str:
         return text_table(f"Result {self.name}", ("", ""), self._rows())

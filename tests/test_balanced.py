@@ -12,9 +12,9 @@ from sfm.camera import camera_from_values, pixel_from_tangents
 from sfm.distortion.brown import BALANCED, brown_by_balanced, from_balanced, to_balanced
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.survey import CameraSetup, Survey
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of

@@ -15,7 +15,6 @@ from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.rendering.render import write_photographs
 from sfm.rendering.scene_file import Staging, read_scene
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.report.viewer.embedded import scene_of_result, scene_of_stored
@@ -24,6 +23,7 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.places import ROOT
 
 DEMO = ROOT / "datasets" / "demo"

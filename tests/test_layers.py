@@ -39,6 +39,7 @@ LAYERS = (
         "sfm.printing",
     ),
     ("sfm.result",),
+    ("sfm.judgement",),
     ("sfm.survey", "sfm.inspection"),
     ("sfm.report",),
     ("sfm.pipeline",),
@@ -179,7 +180,7 @@ def test_libraries_stay_in_their_rooms() -> None:
 
 def test_the_rules_would_notice() -> None:
     assert layer_of("sfm.targets.detect") == 1
-    assert layer_of("sfm.survey.inputs.start") == 4
+    assert layer_of("sfm.survey.inputs.start") == 5
     assert layer_of("sfm.surveying") is None
     assert "sfm.errors" in imported(MODULES["sfm.cli"])
 

@@ -17,11 +17,11 @@ from sfm.network import values_of
 from sfm.observations.point_pairs import PointPairs
 from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
+from tests.findings import findings_of
 from tests.survey.test_rigs import written
 from tests.synthetic import make_network, seed_of
 

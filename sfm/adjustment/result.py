@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, wraps
+from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from sfm.display import counted, html_table, text_table
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
+from sfm.remarks.verdict import NOT_JUDGED, Verdict
 from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
 # Relative rounding of an image coordinate. Computed coordinates are exact to about 1e-15, or to 1e-10 if
@@ -23,6 +25,9 @@ MOTIONS = 7  # position, attitude and scale, which image points leave open
 # images 1/1000 px. With larger weights, control and bars of a usual survey would vanish in rounding. Source:
 # Luhmann et al. (2020), Close-Range Photogrammetry, sec. 5.4.2.
 MIN_SIGMA_PX = 1e-3
+
+Further = ParamSpec("Further")
+Computed = TypeVar("Computed")
 
 
 @dataclass(frozen=True)
@@ -139,6 +144,7 @@ class Adjustment:
     remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation
+    verdict: Verdict = NOT_JUDGED  # level, headline and all remarks
 
     @cached_property
     def solution(self) -> Solution:
@@ -161,6 +167,7 @@ class Adjustment:
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=JointOnDemand(self),
             sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
+            verdict=self.verdict,
         )
 
     @property
@@ -290,6 +297,8 @@ class Adjustment:
             ("image points", f"{int((~self.rejected).sum())} accepted, {int(self.rejected.sum())} rejected"),
             ("sigma0", f"{self.sigma0_px:.4f} px, redundancy {self.redundancy}"),
         ]
+        if self.verdict is not NOT_JUDGED:
+            return [*rows, ("verdict", self.verdict.summary)]
         return rows + [("undetermined", name) for name in self.undetermined]
 
     def __repr__(self) -> str:
@@ -297,6 +306,26 @@ class Adjustment:
 
     def _repr_html_(self) -> str:
         return html_table("Adjustment", ("", ""), self._rows())
+
+
+def computed_once(
+    compute: Callable[Concatenate[Adjustment, Further], Computed],
+) -> Callable[Concatenate[Adjustment, Further], Computed]:
+    """Return a function of an adjustment that keeps what it returned, as a cached property does.
+
+    Judgement and report ask for the same figures.
+    """
+
+    @wraps(compute)
+    def figure(adjustment: Adjustment, /, *args: Further.args, **options: Further.kwargs) -> Computed:
+        kept = adjustment.__dict__.setdefault("_figures", {})
+        key = (f"{compute.__module__}.{compute.__name__}", args, *sorted(options.items()))
+        if key not in kept:
+            kept[key] = compute(adjustment, *args, **options)
+        found: Computed = kept[key]
+        return found
+
+    return figure
 
 
 def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:

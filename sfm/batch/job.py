@@ -26,7 +26,7 @@ from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.kernels.compiling import when_compiling
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import Findings, findings_of
+from sfm.report.findings import Findings, findings_of
 from sfm.report.output import (
     LOG,
     SurveyLog,

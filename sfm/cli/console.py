@@ -14,7 +14,7 @@ from sfm.cli.commands.starting import FAILED
 from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.remarks.remark import Severity
 from sfm.remarks.verdict import Line, Verdict
-from sfm.report.findings.survey_remarks import Findings
+from sfm.report.findings import Findings
 from sfm.report.page import Banner
 from sfm.report.phrases import (
     describe_calibration,

@@ -6,11 +6,12 @@ makes it fair, and with notes alone it is good.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from sfm.display import MAX_LISTED
+from sfm.display import MAX_LISTED, counted
 from sfm.remarks.kind import Grade
 from sfm.remarks.remark import SEVERITIES, Remark, Severity
 
@@ -41,10 +42,29 @@ class Verdict:
         """The remarks as they are printed: the first ones of each kind, and the number of the others."""
         return lines_of(self.remarks)
 
+    @property
+    def text(self) -> str:
+        """Headline and remarks, a line each; errors and warnings begin with an exclamation mark."""
+        signs = {"note": " "}
+        return "\n".join(
+            [self.headline, *(f"{signs.get(one.severity, '!')} {one.text}" for one in self.lines)]
+        )
+
+    @property
+    def summary(self) -> str:
+        """Headline and numbers of remarks."""
+        counts = Counter(one.severity for one in self.remarks)
+        listed = ", ".join(counted(counts[one], one) for one in SEVERITIES if counts[one])
+        return f"{self.headline} {listed}".rstrip()
+
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         remarks = [one.as_dict() for one in self.remarks]
         return {"headline": self.headline, "verdict": self.level, "remarks": remarks}
+
+
+NOT_JUDGED = Verdict("bad", "The result was not judged.", ())
+"""the verdict on a result before `judge`"""
 
 
 def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:

@@ -11,7 +11,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.display import counted
 from sfm.files.result_tables import GIVEN
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.report.findings.bundle_statistics import Given
+from sfm.judgement.bundle_statistics import Given
 from sfm.report.page import (
     Column,
     FoldedParts,

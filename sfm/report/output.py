@@ -41,13 +41,13 @@ from sfm.files.csv_tables import read_table
 from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, refuse_foreign_folder
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
+from sfm.judgement.calibrated_cameras import projection_of
+from sfm.judgement.checks import adjusted_sigmas, root_mean_square
 from sfm.remarks.remark import remark
 from sfm.report.figures.overlays import Overlay, draw_overlays
 from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
-from sfm.report.findings.calibrated_cameras import projection_of
-from sfm.report.findings.checks import adjusted_sigmas, root_mean_square
-from sfm.report.findings.survey_remarks import Findings, with_remark
+from sfm.report.findings import Findings, with_remark
 from sfm.report.pages import html_of, page_of, text, texts_of
 from sfm.report.phrases import finer_unit
 from sfm.report.survey_report import text_report

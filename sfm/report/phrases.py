@@ -16,11 +16,11 @@ from sfm.conventions import SUPERSCRIPTS, FloatArray
 from sfm.conventions import finer_unit as finer_unit
 from sfm.display import NO_BREAK, counted, listed
 from sfm.distributions import normal_ppf
+from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
+from sfm.judgement.checks import Precision, Sigma0
 from sfm.remarks.kind import probability as probability
 from sfm.remarks.kind import significant as significant
-from sfm.report.findings.calibrated_cameras import CalibratedCamera, Rig
-from sfm.report.findings.checks import Precision, Sigma0
-from sfm.report.findings.survey_remarks import Findings
+from sfm.report.findings import Findings
 from sfm.result import ControlCheck, SurveyResult
 
 MIN_PLAIN_VALUE = 1e-3  # parameters below it are written with an exponent

@@ -13,6 +13,7 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
 from sfm.files.result_tables import IN_FILES
+from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.observations.given import ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.observations.tables import TABLES
@@ -21,7 +22,6 @@ from sfm.planning.plan import Plan, verdict_of_plan
 from sfm.planning.prediction import ALPHA, found_displacement
 from sfm.planning.stations import Shot, Stations
 from sfm.planning.weakness import Calibratability, Contribution
-from sfm.report.findings.calibrated_cameras import rigs_of
 from sfm.report.page import (
     YES,
     Column,

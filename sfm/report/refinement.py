@@ -10,9 +10,9 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import IntArray
 from sfm.display import counted
+from sfm.judgement.bundle_statistics import given_of
+from sfm.judgement.checks import rms_of_groups, standard_deviations
 from sfm.remarks.verdict import judge
-from sfm.report.findings.bundle_statistics import given_of
-from sfm.report.findings.checks import rms_of_groups, standard_deviations
 from sfm.report.given import given_parts
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes
 from sfm.report.phrases import general, significant

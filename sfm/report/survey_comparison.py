@@ -8,9 +8,9 @@ import numpy as np
 
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.display import counted, program_name
+from sfm.judgement.checks import point_sigma
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.checks import point_sigma
-from sfm.report.findings.survey_remarks import Findings
+from sfm.report.findings import Findings
 from sfm.report.page import Column, Heading, Note, Paragraph, Part, Statement, Table, columns, facts
 from sfm.report.phrases import finer_unit, fixed, general, scientific, significant, words_left_out
 

@@ -10,9 +10,9 @@ from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, POWER, C
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
 from sfm.files.result_tables import VARIANCE_COMPONENTS
-from sfm.report.findings.bundle_statistics import WEAK_DEG, Coverage, Geometry
-from sfm.report.findings.calibrated_cameras import InteriorParameter
-from sfm.report.findings.survey_remarks import Findings
+from sfm.judgement.bundle_statistics import WEAK_DEG, Coverage, Geometry
+from sfm.judgement.calibrated_cameras import InteriorParameter
+from sfm.report.findings import Findings
 from sfm.report.given import given_parts
 from sfm.report.page import (
     Column,

@@ -20,7 +20,7 @@ from sfm.files.result_tables import LEFT_OUT
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
-from sfm.report.findings.survey_remarks import Findings
+from sfm.report.findings import Findings
 from sfm.report.page import (
     Card,
     Cards,

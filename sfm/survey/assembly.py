@@ -17,6 +17,7 @@ from sfm.comparison.solutions import Baseline, BaselineComparison, compare_basel
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.conventions import IntArray
 from sfm.errors import KolinearError, MissingLibraryError
+from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import Remark, remark
@@ -43,7 +44,7 @@ def assemble_result(
     compared: SurveyComparison,
     clock: StageClock,
 ) -> SurveyResult:
-    """Return the result of a survey; each argument is the return value of the stage of that name."""
+    """Return the judged result of a survey; each argument is what the stage of that name returned."""
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
@@ -54,7 +55,7 @@ def assemble_result(
     failed = tuple(FailedImage(*one) for one in reasons.items())
     correlations = exterior_correlations(adjustment)
     code = np.full(len(points), -1) if naming is None else naming.codes(adjustment.network)
-    return SurveyResult(
+    result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
         images_total=len(measured.images) - sum(one.is_copy for one in measured.failed),
@@ -65,7 +66,7 @@ def assemble_result(
         baseline=compared.baseline,
         photographs=measured.overlays if matched.overlays is None else matched.overlays,
         control_check=solution.control_check,
-        remarks=(
+        stage_remarks=(
             *measured.remarks,
             *start.remarks,
             *matched.remarks,
@@ -92,6 +93,7 @@ def assemble_result(
         orientation_correlations=strong_correlations(correlations),
         seconds=tuple(StageTime(*one) for one in clock.seconds),
     )
+    return judge_survey(result)
 
 
 def _plates(survey: Survey, code: IntArray) -> tuple[SeenPlate, ...]:

@@ -16,11 +16,11 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
 from sfm.result import SurveyResult
+from tests.findings import findings_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 HEIGHT = 10.0

@@ -21,10 +21,10 @@ from sfm.cli.commands.matching import match_command
 from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import LINE, MAX_PICTURES
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.view_page import photographs_in
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of

@@ -15,8 +15,8 @@ from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_a
 from sfm.distortion.models import GENERAL_MODELS, MODELS, Role
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
+from tests.findings import findings_of
 from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of
 

@@ -24,11 +24,11 @@ from sfm.files import globs
 from sfm.files.csv_tables import read_header, read_table
 from sfm.inspection.planned_survey import read_plan
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refining.refinement import refine_model
+from tests.findings import findings_of
 from tests.inspection.benches import one_bench
 from tests.synthetic import make_network, seed_of
 

@@ -11,15 +11,15 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import rotation_from_vector
+from sfm.judgement import cameras as camera_remarks
+from sfm.judgement.calibrated_cameras import camera_is_result
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.remarks.verdict import Verdict
-from sfm.report.findings import camera_remarks
-from sfm.report.findings.calibrated_cameras import camera_is_result
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.phrases import describe_calibration
 from sfm.result import SeenPlate, SurveyResult
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 

@@ -17,7 +17,7 @@ from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

@@ -19,11 +19,11 @@ from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.pages import content_policy, html, write_page
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.places import ROOT
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of

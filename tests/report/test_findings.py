@@ -15,24 +15,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-import sfm.report.findings.bundle_statistics as statistics
-import sfm.report.findings.checks as checks
-import sfm.report.findings.survey_remarks as findings_module
+import sfm.judgement.bundle_statistics as statistics
+import sfm.judgement.checks as checks
+import sfm.judgement.verdict as verdict
+import sfm.report.findings as findings_module
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.consistency import Consistency, Uneven, consistency_of
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
 from sfm.conventions import FloatArray
+from sfm.judgement.bundle_statistics import Given
+from sfm.judgement.cameras import edges_of, larger_than_the_others, sharpness_remarks
+from sfm.judgement.checks import longest_residual
+from sfm.judgement.verdict import given_remarks
 from sfm.network import Estimate, Network, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, of_kind, remark
-from sfm.report.findings.bundle_statistics import Given
-from sfm.report.findings.camera_remarks import edges_of, larger_than_the_others, sharpness_remarks
-from sfm.report.findings.checks import longest_residual
-from sfm.report.findings.survey_remarks import Findings, findings_of, given_remarks
+from sfm.report.findings import Findings
 from sfm.report.output import SurveyLog, write_result
 from sfm.result import FailedImage, PhotographTargets, SurveyResult
 from tests import compare_results
+from tests.findings import findings_of
 from tests.places import ROOT
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -42,11 +45,8 @@ COMPUTED = (
     *((checks, name) for name in ("variance_components",)),
     *((statistics, name) for name in ("by_kind", "by_camera", "by_photograph", "w_test", "tau_test")),
     *((statistics, name) for name in ("reliability", "significance", "correlations")),
-    *(
-        (findings_module, name)
-        for name in ("statistics_of", "geometry_of", "given_of", "interior_of", "judge")
-    ),
-    *((findings_module, name) for name in ("precision_of", "sigma0_of", "longest_residual")),
+    *((findings_module, name) for name in ("geometry_of", "precision_of")),
+    *((verdict, name) for name in ("judge", "longest_residual")),
 )
 
 

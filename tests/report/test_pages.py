@@ -33,7 +33,6 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import TRIALS, largest_difference, verdict_of_validation
 from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.page import FoldedParts, Heading, Paragraph, Part, Statement, Table
 from sfm.report.pages import html_of, page_of, write_page
@@ -43,6 +42,7 @@ from sfm.result import BaselineComparison, SurveyResult
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.outlines import Flag
+from tests.findings import findings_of
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey

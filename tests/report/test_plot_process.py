@@ -19,9 +19,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.report.figures.plot_data import PlotData
 from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data
 from sfm.result import SurveyResult
+from tests.findings import findings_of
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
 

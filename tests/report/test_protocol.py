@@ -16,10 +16,11 @@ from sfm.camera import project
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import Findings, findings_of
+from sfm.report.findings import Findings
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of
@@ -100,7 +101,7 @@ def test_the_field_of_view_and_the_distortion_are_those_of_the_lens(found: Findi
 def test_radial_parameters_are_tested_together() -> None:
     network, truth = make_network(seed_of("cumulative"), images=8, points=40)
     found = adjust(network, truth, datum=Datum("free"))
-    from sfm.report.findings.protocol import _cumulative
+    from sfm.report.protocol import _cumulative
 
     tests = {one.parameters: one for one in _cumulative(found)}
     assert set(tests) == {"K1, K2", "K2"}

@@ -24,14 +24,13 @@ from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import bound, counted
 from sfm.errors import OutputError
 from sfm.files.open_folders import refuse_foreign_folder
+from sfm.judgement.bundle_statistics import geometry_of
 from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
 from sfm.report import survey_report
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
-from sfm.report.findings.bundle_statistics import geometry_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.page import Paragraph, Section
 from sfm.report.pages import WIDTH, html_of, page_of, wrapped
@@ -60,6 +59,7 @@ from sfm.result import (
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.outlines import LIKELIEST_FIRST, Flag
 from tests.browser import Tab
+from tests.findings import findings_of
 from tests.other_adjuster import in_house_adjuster
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
@@ -110,7 +110,7 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
         comparison=None,
         photographs=tuple(photographs),
         control_check=ControlCheck(("1", "2"), np.array([[3e-5, 0, 4e-5], [-3e-5, 0, -4e-5]]), 1.5),
-        remarks=(remark("scale_bars_missing", bars=["1 - 2"]),),
+        stage_remarks=(remark("scale_bars_missing", bars=["1 - 2"]),),
         seconds=(StageTime("targets", 1.25),),
     )
 
@@ -486,7 +486,7 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
 def test_verdict(result: SurveyResult) -> None:
     assert findings_of(result).verdict.level == "fair"
     assert set(kinds_of(findings_of(result).verdict.remarks)) >= {"scale_bars_missing", "photographs_missing"}
-    fine = replace(result, images_total=8, failed=(), remarks=())
+    fine = replace(result, images_total=8, failed=(), stage_remarks=())
     assert findings_of(fine).verdict.level == "good"
     assert (
         findings_of(fine).verdict.headline
@@ -507,7 +507,7 @@ def test_every_remark_is_shown_once_by_every_renderer(
 ) -> None:
     missing = [f"control point {k} with a name of some length" for k in range(4)]
     more = replace(
-        result, remarks=(remark("control_missing", points=missing), remark("scale_undefined", unit="m"))
+        result, stage_remarks=(remark("control_missing", points=missing), remark("scale_undefined", unit="m"))
     )
     findings = findings_of(more)
     text = text_report(findings)
@@ -703,7 +703,7 @@ def test_the_terminal_says_once_why_photographs_are_lost(
     for explained in ((), ("lost 2", "lost 3")):
         group = remark("not_connected", photographs=explained, oriented=8, needed=4)
         board = remark("checkerboard_not_found", photographs=explained, size="7 x 9")
-        said = replace(result, failed=lost, remarks=(group, board) if explained else ())
+        said = replace(result, failed=lost, stage_remarks=(group, board) if explained else ())
         print_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
         told = [line.strip() for line in capsys.readouterr().out.splitlines()]
         ends = tuple(f"{one.text} {one.remedy}" for one in (few, apart))

@@ -28,12 +28,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.conventions import angles_from_rotation
-from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.remarks.remark import kinds_of, of_kind
-from sfm.report.figures.plots import all_plots, plan_axes
-from sfm.report.findings.bundle_statistics import given_of, statistics_of
-from sfm.report.findings.calibrated_cameras import families, interior_parameters
-from sfm.report.findings.checks import (
+from sfm.judgement.bundle_statistics import given_of, statistics_of
+from sfm.judgement.calibrated_cameras import families, interior_parameters
+from sfm.judgement.checks import (
     MAX_LISTED,
     count_observations,
     largest_residuals,
@@ -42,7 +39,9 @@ from sfm.report.findings.checks import (
     precision_of,
     sigma0_of,
 )
-from sfm.report.findings.survey_remarks import findings_of
+from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.remarks.remark import kinds_of, of_kind
+from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.output import plot_data
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.phrases import (
@@ -58,6 +57,7 @@ from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
 from sfm.result import ControlCheck, Eccentricity, SurveyResult
+from tests.findings import findings_of
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of
 
@@ -377,10 +377,10 @@ def test_control_that_contradicts_is_separated_from_the_image_points(
     xyz[0, 0] += 0.02
     a = adjust(with_control(network, xyz, 1e-3), truth, datum=Datum("control"), reject="none")
     result = result_of(a)
-    own = sigma0_of(result).image_points_px
+    own = sigma0_of(result.adjustment).image_points_px
     assert a.sigma0_px > 1.05 * own
     assert own == pytest.approx(NOISE_PX, rel=0.1)  # whatever the control does
-    figure, words = describe_sigma0(sigma0_of(result))
+    figure, words = describe_sigma0(sigma0_of(result.adjustment))
     assert figure == f"{a.sigma0_px:.4f} px"
     assert f"image points alone {own:.4f} px" in words
     page = " ".join(html_of(findings_of(result)).split())
@@ -391,7 +391,7 @@ def test_control_that_contradicts_is_separated_from_the_image_points(
         NOISE_PX
     )
     free = result_of(adjust(network, truth, datum=Datum("free")))
-    assert "points alone" not in " ".join(describe_sigma0(sigma0_of(free)))
+    assert "points alone" not in " ".join(describe_sigma0(sigma0_of(free.adjustment)))
 
 
 def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywhere(
@@ -401,7 +401,7 @@ def test_each_kind_is_tested_against_what_was_stated_in_the_same_words_everywher
     a = adjust(with_bars(network, truth, (0.0, 1e-5), 1e-4), truth, datum=Datum("free"))
     for factor, passed in ((1.0, True), (0.8, False), (1.25, False)):
         result = result_of(multiplied(a, factor))
-        image, bars = statistics_of(result).global_tests
+        image, bars = statistics_of(result.adjustment).global_tests
         assert image.passed is passed and bars.passed
         r = float(np.nansum(a.redundancy_numbers))
         seen = a.network.image_points
@@ -433,7 +433,7 @@ def test_the_global_test_of_an_m_estimator_is_left_out_with_the_reason(
         (with_bars(network, truth, (0.0, 1e-5), 1e-4), "image points"),
     ):
         result = result_of(adjust(one, truth, datum=Datum("free"), reject=reject))
-        first, *other = statistics_of(result).global_tests
+        first, *other = statistics_of(result.adjustment).global_tests
         assert first.passed is None and all(test.passed for test in other)
         assert describe_test(first) == f"{of}: {reason}"
         written = summary(findings_of(result))["statistics"]["global_tests"][0]
@@ -604,7 +604,7 @@ def test_statistics_are_shown_and_written(synthetic: tuple[Network, Estimate]) -
     assert abs(worst[0][4]) == w.max()
     np.testing.assert_array_equal(np.sort(w.max(axis=1))[::-1][:10], [abs(one[4]) for one in worst])
     assert f"{worst[9][4]:+.2f}" in page
-    for pair in statistics_of(result).camera_correlations:
+    for pair in statistics_of(result.adjustment).camera_correlations:
         assert "of camera" in pair.first and f"{100 * pair.value:+.1f}" in page
 
 
@@ -629,7 +629,7 @@ def test_only_what_may_be_0_is_reported_over_its_standard_deviation(
     a = adjust(network, truth, datum=Datum("free"))
     told = {one.name: one.t for one in interior_parameters(a) if one.sigma > 0}
     assert told["c"] is None and len(told) > 3
-    by_name = {test.parameter: test for test in statistics_of(result_of(a)).significance}
+    by_name = {test.parameter: test for test in statistics_of(a).significance}
     assert {name: t for name, t in told.items() if t is not None} == {
         name: test.t for name, test in by_name.items()
     }

@@ -27,9 +27,9 @@ from sfm.adjustment.solve import adjust
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.remarks.catalogue import hypotheses
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from tests.findings import findings_of
 from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted
 from tests.surveys import survey_of
 

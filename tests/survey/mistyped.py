@@ -20,11 +20,11 @@ from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import SIZE_PX, make_network, seed_of
 

@@ -20,12 +20,12 @@ import numpy as np
 
 from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.calibration import Calibration
 from sfm.survey.inputs.survey import Survey, read_survey, with_calibration
 from sfm.survey.measuring.measured_store import MeasuredStore
+from tests.findings import findings_of
 from tests.places import DATASETS, SHARED
 
 PAIRS, SEED = 10, 16

@@ -18,11 +18,11 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import reverse_depth
 from sfm.survey.adjusting.settling import held_to_converge, nearer_start
 from sfm.survey.adjusting.solution_remarks import remarks_on_pixel_sides, remarks_on_principal_distances
 from sfm.survey.inputs.survey import CameraSetup
+from tests.findings import findings_of
 from tests.survey.weak_networks import _measured, _stations
 from tests.surveys import survey_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of

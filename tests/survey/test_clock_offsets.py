@@ -16,13 +16,13 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.survey_report import text_report
 from sfm.survey.clock_offsets import agree_on_clocks, rotation_spread
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.orientation import orient_with_models
 from sfm.survey.rigs import with_moments
+from tests.findings import findings_of
 from tests.rigs import make_rig
 from tests.survey.test_rigs import written
 from tests.surveys import SURVEY, camera, code_centres, plates, stations

@@ -14,12 +14,11 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.judgement.bundle_statistics import given_of
 from sfm.network import Estimate, ObjectPoints
 from sfm.observations.pose import MountObservations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
-from sfm.report.findings.bundle_statistics import given_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
@@ -27,6 +26,7 @@ from sfm.result import SurveyResult
 from sfm.survey import placing
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.rigs import make_rig
 from tests.surveys import OBSERVED, remarks_on_given, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of

@@ -15,9 +15,9 @@ from sfm.conventions import SWELLING
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.findings import findings_of
 from tests.survey import mistyped
 from tests.survey.mistyped import SIGMA, scene
 from tests.surveys import remarks_on_given, survey_of

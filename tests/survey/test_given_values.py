@@ -12,12 +12,11 @@ from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_tables as write_stored
 from datasets.camcal.reference import prepare
 from sfm.errors import SurveyFileError
+from sfm.judgement.checks import longest_residual
 from sfm.network import Estimate, Network
 from sfm.observations.given import ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.checks import longest_residual
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.result import SurveyResult
@@ -35,6 +34,7 @@ from sfm.survey.inputs.given import (
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.placing import place_on_control
+from tests.findings import findings_of
 from tests.places import DATASETS, SHARED
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import SIZE_PX, make_network, seed_of

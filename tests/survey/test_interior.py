@@ -18,13 +18,13 @@ from sfm.errors import GeometryError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
 from sfm.result import SurveyResult
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from tests.commands import kolinear
+from tests.findings import findings_of
 from tests.surveys import write_observed_survey
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of

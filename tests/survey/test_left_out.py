@@ -16,13 +16,13 @@ from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.settling import datum_carriers
 from sfm.survey.inputs.start import MARGIN_PX, MAX_OUTSIDE, measurements_from_observations, outside_photograph
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey
 from tests.synthetic import PIXEL_MM, SIZE_PX, add_narrow_points, make_network, observed_anew, seed_of
 from tests.tables import rows_of

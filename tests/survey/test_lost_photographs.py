@@ -15,7 +15,6 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.diagnosis.lost_photographs import (
     MIN_PARALLAX,
     explain_lost_photographs,
@@ -24,6 +23,7 @@ from sfm.survey.diagnosis.lost_photographs import (
     try_other_principal_distances,
 )
 from sfm.survey.inputs.survey import Survey
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

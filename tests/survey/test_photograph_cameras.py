@@ -19,7 +19,6 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.correspondences import restore_strayed
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
@@ -29,6 +28,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import FISHEYE, orient_with_models
+from tests.findings import findings_of
 from tests.survey.faults import planted
 from tests.survey.texture_scenes import Plane, upright, wall
 from tests.surveys import survey_of

@@ -19,7 +19,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Optics
-from sfm.report.findings.survey_remarks import Findings, findings_of
+from sfm.report.findings import Findings
 from sfm.report.pages import html_of
 from sfm.report.phrases import describe_calibration, significant
 from sfm.report.survey_report import text_report
@@ -27,6 +27,7 @@ from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import PlateFamily
+from tests.findings import findings_of
 from tests.plates import (
     BOARD,
     GRID,

@@ -16,7 +16,6 @@ from sfm.camera import camera_from_values, project
 from sfm.conventions import AnyArray, FloatArray
 from sfm.network import ObjectPoints, rows_of
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.drafting.target_trial import _side_by_side, try_targets
 from sfm.survey.inputs.calibration import plate_family
@@ -26,6 +25,7 @@ from sfm.targets.codes.plate_search import search_april_grids, search_checkerboa
 from sfm.targets.codes.plates import TAGGED, PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary
 from sfm.targets.detect import find_targets
+from tests.findings import findings_of
 from tests.plates import GRID, PITCH, PIXEL_MM, TRUTH, camera, plate_pictures, stations
 from tests.synthetic import seed_of
 from tests.targets.concentric_tags import draw_tag

@@ -14,9 +14,9 @@ from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from sfm.judgement.verdict import ray_remarks
 from sfm.network import Estimate, ObjectPoints
 from sfm.remarks.remark import Remark, kinds_of, of_kind
-from sfm.report.findings.survey_remarks import findings_of, ray_remarks
 from sfm.survey.adjusting.solution_remarks import datum_remarks, remarks_on_uncalibrated
 from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.calibration import plate_control
@@ -24,6 +24,7 @@ from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.targets.codes.plates import BOARDS, TAGGED, PlateFamily
 from sfm.targets.detect import find_targets
+from tests.findings import findings_of
 from tests.plates import SURVEY, camera
 from tests.survey.seen_plates import FREE, SIGMA_PX, Plates, about, plates_survey, run_plates
 from tests.surveys import survey_of
@@ -85,7 +86,7 @@ def test_projection_uncertainty_is_not_that_of_a_guess(tmp_path: Path) -> None:
     asked = plates_survey(tmp_path, 2)
     told = remarks_on_uncalibrated(asked, estimate)
     assert kinds_of(told) == ("calibration_failed",)
-    assert findings_of(replace(result, remarks=(*result.remarks, *told))).calibrated == ()
+    assert findings_of(replace(result, stage_remarks=(*result.stage_remarks, *told))).calibrated == ()
     free = replace(
         estimate, cameras=tuple(replace(one, free=np.ones_like(one.free)) for one in estimate.cameras)
     )

@@ -15,18 +15,18 @@ from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
 from sfm.remarks.remark import kinds_of
 from sfm.report.figures.plots import epipolar_figure
-from sfm.report.findings.calibrated_cameras import rigs_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
 from sfm.survey import rigs
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs, planned_mounts
+from tests.findings import findings_of
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 

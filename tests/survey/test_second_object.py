@@ -18,7 +18,6 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.lost_photographs import MOTION_POINTS, find_second_motion, find_second_objects
@@ -29,6 +28,7 @@ from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import refine
 from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily
+from tests.findings import findings_of
 from tests.survey.test_photograph_cameras import with_zoom
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, SURVEY, stations, survey_of
 from tests.synthetic import SIZE_PX as OF_NETWORK

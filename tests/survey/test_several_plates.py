@@ -18,7 +18,6 @@ from sfm.orientation.incremental.sequence import Orientation
 from sfm.pipeline import run_survey
 from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import settings_by_table
 from sfm.survey.board_turns import _is_certain, _Rig, agree_on_turns
@@ -32,6 +31,7 @@ from sfm.targets.codes import boards
 from sfm.targets.codes.plates import PlateFamily, group_plates
 from sfm.targets.detect import Targets, _of_crossings, find_targets
 from sfm.targets.fits.saddle import Saddles
+from tests.findings import findings_of
 from tests.plates import GRID, PITCH, PIXEL_MM, SIZE_PX, SURVEY, camera, plate_scene, stations
 from tests.synthetic import seed_of
 

@@ -14,11 +14,10 @@ from sfm.adjustment.quality import variance_components
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
+from sfm.judgement.bundle_statistics import statistics_of
 from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.bundle_statistics import statistics_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.tables.csv_files import write_tables
 from sfm.result import SurveyResult
@@ -26,6 +25,7 @@ from sfm.similarity import Similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.placing import object_scale
+from tests.findings import findings_of
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
@@ -103,7 +103,7 @@ def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) 
     freedom = 2 * np.nansum(a.redundancy_numbers)
     assert a.weight_factor == pytest.approx(0.01, rel=4 / np.sqrt(freedom))
     assert not a.remarks
-    image, bars = statistics_of(result).global_tests
+    image, bars = statistics_of(result.adjustment).global_tests
     assert image.passed is False and image.statistic < image.lower
     assert bars.passed
 

@@ -34,13 +34,13 @@ from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
 from sfm.similarity import Similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
+from tests.findings import findings_of
 from tests.rigs import make_rig
 from tests.survey.test_rigs import written
 from tests.synthetic import make_network, seed_of

@@ -18,13 +18,13 @@ from sfm.files import csv_tables
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.solution import Solution
 from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import measurements_from_observations, merge_repeated
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of

@@ -15,7 +15,7 @@ from sfm.errors import GeometryError
 from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
-from sfm.report.findings.survey_remarks import Findings, findings_of
+from sfm.report.findings import Findings
 from sfm.report.tables.csv_files import write_tables
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
@@ -25,6 +25,7 @@ from sfm.survey.inputs.measurements import Measurements, find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import measure_targets
+from tests.findings import findings_of
 from tests.survey.texture_scenes import (
     C_PX,
     NOISE,

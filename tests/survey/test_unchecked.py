@@ -14,13 +14,13 @@ from sfm.adjustment.solve import adjust
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import Similarity
 from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.hypotheses.given_scales import remarks_on_unchecked
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.findings import findings_of
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import add_narrow_points, make_network, observed_anew, seed_of
 

@@ -13,9 +13,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import remark
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.survey.adjusting.solution_remarks import remarks_on_held_c
 from sfm.survey.inputs.survey import CameraSetup
+from tests.findings import findings_of
 from tests.survey.weak_networks import outcome_of, study, weak_network
 from tests.synthetic import make_network, seed_of
 

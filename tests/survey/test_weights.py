@@ -11,14 +11,14 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.judgement.checks import Sigma0
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.report.findings.checks import Sigma0
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.phrases import describe_sigma0, describe_weights
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey
 from tests.synthetic import make_network, seed_of
 

@@ -8,9 +8,9 @@ import pytest
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from tests.findings import findings_of
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, seed_of
 

@@ -26,11 +26,11 @@ from sfm.errors import KolinearError
 from sfm.pipeline import run_survey
 from sfm.planning.stations import aim_camera
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.synthetic import seed_of
 from tests.textures import natural_texture
 

@@ -26,9 +26,9 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import CameraSetup, Survey
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, seed_of
 

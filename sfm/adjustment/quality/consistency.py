@@ -25,7 +25,7 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_isf, chi2_sf
@@ -57,6 +57,7 @@ class Consistency:
     doubtful: tuple[DoubtfulPoint, ...] = ()  # points with another ray that may be the wrong one
 
 
+@computed_once
 def consistency_of(adjustment: Adjustment) -> Consistency:
     """Return the results of the tests of points and photographs; empty without covariance or noise.
 

@@ -228,7 +228,7 @@ def _run_survey(
         from sfm.kernels.threads import cores
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
-        from sfm.report.findings.survey_remarks import findings_of
+        from sfm.report.findings import findings_of
         from sfm.report.output import (
             Origin,
             SurveyLog,

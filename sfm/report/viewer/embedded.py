@@ -30,11 +30,11 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_fr
 from sfm.files.covariance_file import MAX_POINTS
 from sfm.files.plain_text import or_none
 from sfm.geometry.tolerance import Deviations
+from sfm.judgement.checks import rms_of_groups
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.figures.overlays import nearest_image_points
-from sfm.report.findings.checks import rms_of_groups
-from sfm.report.findings.survey_remarks import Findings
+from sfm.report.findings import Findings
 from sfm.report.phrases import finer_unit
 from sfm.report.viewer.pictures import (
     COLUMNS,

@@ -16,10 +16,10 @@ from sfm.errors import SurveyFileError
 from sfm.files.result_tables import GIVEN
 from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
-from sfm.report.findings.survey_remarks import findings_of
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.survey import read_survey
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

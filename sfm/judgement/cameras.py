@@ -12,8 +12,8 @@ from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import Role
 from sfm.distributions import t_ppf
+from sfm.judgement.calibrated_cameras import CalibratedCamera
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
-from sfm.report.findings.calibrated_cameras import CalibratedCamera
 from sfm.result import PhotographTargets, SurveyResult
 
 SURE_SIGMAS = 3.0  # standard deviations beyond which a deviation of a camera is considered real

@@ -10,7 +10,7 @@ Studio.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,25 +21,16 @@ from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import f_sf
-from sfm.report.findings.bundle_statistics import Given
-from sfm.report.findings.checks import standard_deviations
+from sfm.judgement.bundle_statistics import Given
+from sfm.judgement.checks import (
+    ControlCoordinate,
+    check_coordinates,
+    compare_coordinate,
+    standard_deviations,
+)
 from sfm.result import ControlCheck, SurveyResult
 
 EDGE_STEPS = 9  # positions along a side of the photograph at which distortion is evaluated
-
-
-class ControlCoordinate(NamedTuple):
-    """A coordinate of a control or check point, before and after the adjustment."""
-
-    use: str  # control | check
-    point: str
-    coordinate: str
-    given: float  # object unit
-    prior: float  # stated standard deviation, 0 fixed, object unit
-    adjusted: float  # object unit
-    posterior: float  # standard deviation of the adjusted coordinate, object unit
-    difference: float  # adjusted minus given, object unit
-    test: float  # difference over its expected standard deviation, NaN if nothing checks it
 
 
 @dataclass(frozen=True)
@@ -164,35 +155,10 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
     )
     placed = [(check.points[n], k, check.differences[n]) for n, k in rows]
     return [
-        _check(name, c, given, prior[k, c], given + d[c], posterior[k, c], d[c])
+        compare_coordinate(name, c, given, prior[k, c], given + d[c], posterior[k, c], d[c])
         for name, k, d in placed
         for c, given in enumerate(control.xyz[k])
     ]
-
-
-def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
-    """Return the coordinates that check a datum of control, with the test of their differences."""
-    a = result.adjustment
-    index_of = {name: j for j, name in enumerate(a.network.points)}
-    posterior = standard_deviations(a.covariance.points)
-    points = a.estimate.points
-    return tuple(
-        _check(one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given)
-        for one in (result.check_points if a.datum == "control" else ())
-        if (j := index_of.get(one.point)) is not None
-        for c, given in enumerate(one.xyz)
-        if np.isfinite(given)
-    )
-
-
-def _check(
-    point: str, c: int, given: float, prior: float, adjusted: float, posterior: float, difference: float
-) -> ControlCoordinate:
-    """Return a coordinate that took no part, and its difference over the expected standard deviation."""
-    expected = float(np.hypot(prior, posterior))
-    test = difference / expected if expected > 0 else np.nan
-    numbers = map(float, (given, prior, adjusted, posterior, difference, test))
-    return ControlCoordinate("check", point, "XYZ"[c], *numbers)
 
 
 def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:

@@ -1,7 +1,8 @@
-"""Everything that the reports of a survey state, computed once: findings, remarks and verdict.
+"""Verdict: judges the result of a survey or of an adjustment by all that its image points show.
 
-Every renderer takes its numbers from `Findings`: statistics, checks, geometry, given values, precision,
-protocol and verdict.
+`judge_survey` adds the verdict to what the stages of a survey found, and `judge_adjustment` to an adjustment
+without a survey around it. Both ask the same questions of the adjustment: convergence, rank, residuals that
+were rejected or remain, rays, and consistency.
 
 Given values are judged by the image points alone before they take part. The tests here judge those that took
 part, and those that only check the result. They do not test given interior orientation. Whether it is wrong
@@ -12,8 +13,7 @@ points.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,41 +26,22 @@ from sfm.conventions import METRES
 from sfm.display import counted, program_name
 from sfm.distributions import normal_ppf
 from sfm.given_residuals import GivenResiduals, GivenValue
-from sfm.network import rows_of
-from sfm.remarks.remark import Remark, remark, unless_note
-from sfm.remarks.verdict import Level, Verdict, judge
-from sfm.report.findings.bundle_statistics import (
-    Geometry,
-    Given,
-    Statistics,
-    geometry_of,
-    given_of,
-    statistics_of,
-)
-from sfm.report.findings.calibrated_cameras import (
-    CalibratedCamera,
-    InteriorOrientation,
-    Rig,
-    calibrated_cameras,
-    interior_of,
-    rigs_of,
-)
-from sfm.report.findings.camera_remarks import camera_remarks, edges_of, sharpness_remarks
-from sfm.report.findings.checks import (
+from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
+from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
+from sfm.judgement.cameras import camera_remarks, edges_of, sharpness_remarks
+from sfm.judgement.checks import (
+    ControlCoordinate,
     LongestResidual,
-    ObservationCounts,
-    Precision,
     Sigma0,
-    count_observations,
-    largest_residuals,
+    check_coordinates,
     longest_residual,
-    precision_of,
     sigma0_of,
 )
-from sfm.report.findings.protocol import ControlCoordinate, Protocol, check_coordinates, protocol_of
+from sfm.network import rows_of
+from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.remarks.verdict import Level, judge
 from sfm.result import SurveyResult
 
-UNCODED = -1
 MM = 1e-3  # m
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # Below this redundancy number, the rest of a value's error is smaller than rounding and the neglected second
@@ -72,20 +53,69 @@ HEADLINES: Mapping[Level, str] = {
     "fair": "The survey worked, with remarks: {found}.",
     "bad": "The survey has no dependable result.",
 }
+ADJUSTMENT_HEADLINES: Mapping[Level, str] = {
+    "good": "The adjustment worked: {found}.",
+    "fair": "The adjustment worked, with remarks: {found}.",
+    "bad": "The adjustment has no dependable result.",
+}
 SIGMA0_LOW = 0.5  # sigma0 over the stated value below which this is called pessimistic
 
 
-def headlines_of(result: SurveyResult) -> dict[Level, str]:
-    """Return the headline of a survey for each level."""
+def judge_survey(result: SurveyResult) -> SurveyResult:
+    """Return the result of a survey with its verdict.
+
+    Args:
+        result: the remarks of its stages; an earlier verdict is replaced.
+    """
     a = result.adjustment
-    found = (
-        f"{len(a.network.images)} of {result.images_total} photographs oriented, "
-        f"{counted(len(a.network.points), 'object point')}"
+    statistics, consistency = statistics_of(a), consistency_of(a)
+    remarks = (
+        *convergence_remarks(a),
+        *photograph_remarks(result),
+        *result.stage_remarks,
+        *other_solution_remarks(result),
+        *sigma0_remarks(sigma0_of(a), statistics, a),
+        *residual_remarks(longest_residual(a)),
+        *(untested_remarks(a) if result.reject == "none" else ()),
+        *ray_remarks(a),
+        *consistency_remarks(consistency),
+        *sharpness_remarks(result, edges_of(result.photographs), consistency),
+        *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
+        *given_remarks(result, given_of(a, result.length_unit), statistics, check_coordinates(result)),
+        *comparison_remarks(result),
     )
-    return {level: text.format(found=found) for level, text in HEADLINES.items()}
+    photographs = f"{len(a.network.images)} of {result.images_total} photographs oriented"
+    return replace(result, verdict=judge(remarks, _headlines(HEADLINES, a, photographs)))
 
 
-def adjustment_remarks(a: Adjustment) -> tuple[Remark, ...]:
+def judge_adjustment(adjustment: Adjustment) -> Adjustment:
+    """Return the adjustment of a network, without a survey around it, with its verdict."""
+    a = adjustment
+    remarks = (
+        *convergence_remarks(a),
+        *a.remarks,
+        *sigma0_remarks(sigma0_of(a), statistics_of(a), a),
+        *residual_remarks(longest_residual(a)),
+        *(() if a.rejected.any() else untested_remarks(a)),
+        *ray_remarks(a),
+        *consistency_remarks(consistency_of(a)),
+    )
+    photographs = counted(len(a.network.images), "photograph")
+    return replace(a, verdict=judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs)))
+
+
+def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:
+    """Return a result with one more remark, judged again."""
+    return judge_survey(replace(result, stage_remarks=(*result.stage_remarks, new)))
+
+
+def _headlines(templates: Mapping[Level, str], a: Adjustment, photographs: str) -> dict[Level, str]:
+    """Return the headline of each level."""
+    found = f"{photographs}, {counted(len(a.network.points), 'object point')}"
+    return {level: text.format(found=found) for level, text in templates.items()}
+
+
+def convergence_remarks(a: Adjustment) -> tuple[Remark, ...]:
     """Return remarks on convergence, on undetermined unknowns, and on the rejected part."""
     remarks = []
     if not a.converged:
@@ -168,8 +198,8 @@ def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustmen
     return tuple(remarks)
 
 
-def residual_remarks(result: SurveyResult, worst: LongestResidual) -> tuple[Remark, ...]:
-    """Return the longest accepted residual, and gross errors if the survey rejects nothing."""
+def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
+    """Return the longest accepted residual where it is too long."""
     kept = remark(
         "residual_kept",
         point=worst.point,
@@ -177,14 +207,12 @@ def residual_remarks(result: SurveyResult, worst: LongestResidual) -> tuple[Rema
         length=(worst.length_px, "px"),
         over_sigma=worst.over_sigma,
     )
-    return (*(unless_note(kept) if np.isfinite(worst.over_sigma) else ()), *_untested(result))
+    return unless_note(kept) if np.isfinite(worst.over_sigma) else ()
 
 
-def _untested(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return the test of single image coordinates if the survey rejects nothing."""
-    if result.reject != "none":
-        return ()
-    found = robust_test(result.adjustment)
+def untested_remarks(a: Adjustment) -> tuple[Remark, ...]:
+    """Return the test of single image coordinates, for an adjustment that rejects nothing."""
+    found = robust_test(a)
     if not found.far_more:
         return ()
     return (
@@ -384,74 +412,3 @@ def _scale(result: SurveyResult) -> tuple[Remark, ...]:
     if not largest > MAX_MAGNIFICATION:
         return ()
     return (remark("scale_implausible", distance=(nearest / MM, "mm"), magnification=largest),)
-
-
-@dataclass(frozen=True)
-class Findings:
-    """A result and everything that is reported about it."""
-
-    result: SurveyResult
-    verdict: Verdict
-    sigma0: Sigma0
-    counts: ObservationCounts
-    largest: tuple[tuple[Any, ...], ...]  # photograph, point, vx and vy in px, w, tau of the accepted
-    statistics: Statistics
-    geometry: Geometry
-    interior: InteriorOrientation
-    calibrated: tuple[CalibratedCamera, ...]  # if the cameras are the result
-    given: Given
-    rigs: tuple[Rig, ...]
-    precision: Precision
-    object_size: float  # diagonal of the box around the points, object unit
-    consistency: Consistency  # tests of points and photographs
-    edges: Mapping[str, float]  # blur of each photograph with measured edges, px
-    protocol: Protocol  # entries of a bundle protocol
-
-
-def with_remark(findings: Findings, new: Remark) -> Findings:
-    """Return findings with one more remark, and the resulting verdict."""
-    result = findings.result
-    verdict = judge((*findings.verdict.remarks, new), headlines_of(result))
-    return replace(findings, result=replace(result, remarks=(*result.remarks, new)), verdict=verdict)
-
-
-def findings_of(result: SurveyResult) -> Findings:
-    """Return everything that the reports state about a result."""
-    a = result.adjustment
-    sigma0, longest, statistics = sigma0_of(result), longest_residual(a), statistics_of(result)
-    given = given_of(a, result.length_unit)
-    consistency, edges = consistency_of(a), edges_of(result.photographs)
-    geometry, precision, interior = geometry_of(a), precision_of(a), interior_of(a)
-    calibrated = calibrated_cameras(result, interior)
-    remarks = (
-        *adjustment_remarks(a),
-        *photograph_remarks(result),
-        *result.remarks,
-        *other_solution_remarks(result),
-        *sigma0_remarks(sigma0, statistics, a),
-        *residual_remarks(result, longest),
-        *ray_remarks(a),
-        *consistency_remarks(consistency),
-        *sharpness_remarks(result, edges, consistency),
-        *camera_remarks(result, calibrated),
-        *given_remarks(result, given, statistics, check_coordinates(result)),
-        *comparison_remarks(result),
-    )
-    return Findings(
-        result=result,
-        verdict=judge(remarks, headlines_of(result)),
-        sigma0=sigma0,
-        counts=count_observations(a),
-        largest=largest_residuals(a),
-        statistics=statistics,
-        geometry=geometry,
-        interior=interior,
-        calibrated=calibrated,
-        given=given,
-        rigs=rigs_of(a),
-        precision=precision,
-        object_size=float(np.linalg.norm(np.ptp(a.estimate.points, axis=0))),
-        consistency=consistency,
-        edges=edges,
-        protocol=protocol_of(result, given),
-    )

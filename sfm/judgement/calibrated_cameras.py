@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.quality.correlations import observed_part, projection_map
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import Camera, camera_families, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.distortion.models import MODELS, Parameter, Role
+from sfm.judgement.checks import root_mean_square
 from sfm.matching.epipolar import essential_matrices
-from sfm.report.findings.checks import root_mean_square
 from sfm.result import SeenPlate, SurveyResult
 
 TINY = float(np.finfo(float).tiny)
@@ -102,7 +102,7 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
     """
     adjustment = result.adjustment
     failed = {
-        name for one in result.remarks if one.kind == CALIBRATION_FAILED for name in one.names("camera")
+        name for one in result.stage_remarks if one.kind == CALIBRATION_FAILED for name in one.names("camera")
     }
     if not camera_is_result(adjustment, result.plates):
         return ()
@@ -186,6 +186,7 @@ class InteriorOrientation:
         return tuple(sorted({family.camera.model for family in self.families}))
 
 
+@computed_once
 def interior_of(adjustment: Adjustment) -> InteriorOrientation:
     """Return the interior orientation of an adjustment."""
     parameters, listed = interior_parameters(adjustment), families(adjustment)

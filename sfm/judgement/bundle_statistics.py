@@ -30,14 +30,13 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, computed_once
 from sfm.conventions import FloatArray, IntArray
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
+from sfm.judgement.calibrated_cameras import families, family_of_photographs
+from sfm.judgement.checks import rms_of_groups
 from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import ray_angles
-from sfm.report.findings.calibrated_cameras import families, family_of_photographs
-from sfm.report.findings.checks import rms_of_groups
-from sfm.result import SurveyResult
 
 WEAK_DEG = 10.0  # below this angle a point is eleven times less precise along its rays than across
 
@@ -85,13 +84,13 @@ class Statistics:
         return tuple(test for test in self.significance if not test.significant)
 
 
-def statistics_of(result: SurveyResult) -> Statistics:
-    """Return the statistics of a result with its covariance, relative to its stated standard deviations.
+@computed_once
+def statistics_of(adjustment: Adjustment) -> Statistics:
+    """Return the statistics of an adjustment with its covariance, relative to its stated standard deviations.
 
     Each kind of observation is tested separately. A test of all kinds together passes by construction if the
     image points have the weight that their residuals suggest.
     """
-    adjustment = result.adjustment
     kinds = by_kind(adjustment)
     found, w, tau, pairs = (
         reliability(adjustment),
@@ -242,6 +241,7 @@ class Given:
         return tuple(kind for kind in kinds if kind is not None)
 
 
+@computed_once
 def given_of(a: Adjustment, length_unit: str) -> Given:
     """Return the residuals of all given values that took part in an adjustment.
 

@@ -7,12 +7,12 @@ shows by how much they were wrong, and must not hide it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, computed_once
 from sfm.conventions import FloatArray, IntArray
 from sfm.observations.kind import is_observed
 from sfm.result import SurveyResult
@@ -61,6 +61,20 @@ class Sigma0:
         return abs(self.px - self.image_points_px) > TOLD_APART * self.image_points_px
 
 
+class ControlCoordinate(NamedTuple):
+    """A coordinate of a control or check point, before and after the adjustment."""
+
+    use: str  # control | check
+    point: str
+    coordinate: str
+    given: float  # object unit
+    prior: float  # stated standard deviation, 0 fixed, object unit
+    adjusted: float  # object unit
+    posterior: float  # standard deviation of the adjusted coordinate, object unit
+    difference: float  # adjusted minus given, object unit
+    test: float  # difference over its expected standard deviation, NaN if nothing checks it
+
+
 @dataclass(frozen=True)
 class LongestResidual:
     """The accepted image point with the longest residual in standard deviations."""
@@ -72,13 +86,14 @@ class LongestResidual:
     weight: float  # factor on its weight, below 1 after reweighting
 
 
-def sigma0_of(result: SurveyResult) -> Sigma0:
+@computed_once
+def sigma0_of(adjustment: Adjustment) -> Sigma0:
     """Return sigma0 of all observations, and of the image points alone.
 
     Sigma0 of the image points comes from their variance component. If they have no redundancy, it is sigma0
     of all observations.
     """
-    a = result.adjustment
+    a = adjustment
     factor = variance_components(a, np.zeros(len(a.rejected), dtype=np.int64), (IMAGE_POINTS,)).sigma0[0]
     ratio = float(factor if np.isfinite(factor) else a.sigma0_px / a.stated_px)
     size = np.array([camera.pixel_mm.mean() for camera in a.estimate.cameras])
@@ -263,3 +278,40 @@ def standard_deviations(covariance: FloatArray) -> FloatArray:
     """Return standard deviations of covariance matrices (..., d, d), shape (..., d)."""
     diagonal = np.einsum("...ii->...i", covariance)
     return np.asarray(np.sqrt(np.where(diagonal >= 0, diagonal, np.nan)))
+
+
+def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
+    """Return the coordinates that check a datum of control, with the test of their differences."""
+    a = result.adjustment
+    index_of = {name: j for j, name in enumerate(a.network.points)}
+    posterior = standard_deviations(a.covariance.points)
+    points = a.estimate.points
+    return tuple(
+        compare_coordinate(
+            one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given
+        )
+        for one in (result.check_points if a.datum == "control" else ())
+        if (j := index_of.get(one.point)) is not None
+        for c, given in enumerate(one.xyz)
+        if np.isfinite(given)
+    )
+
+
+def compare_coordinate(
+    point: str, c: int, given: float, prior: float, adjusted: float, posterior: float, difference: float
+) -> ControlCoordinate:
+    """Return a coordinate that took no part, and its difference over the expected standard deviation.
+
+    Args:
+        point: name of the point.
+        c: 0, 1 or 2 for X, Y or Z.
+        given: given coordinate, object unit.
+        prior: its standard deviation, object unit.
+        adjusted: adjusted coordinate, object unit.
+        posterior: its standard deviation, object unit.
+        difference: adjusted minus given, object unit.
+    """
+    expected = float(np.hypot(prior, posterior))
+    test = difference / expected if expected > 0 else np.nan
+    numbers = map(float, (given, prior, adjusted, posterior, difference, test))
+    return ControlCoordinate("check", point, "XYZ"[c], *numbers)
