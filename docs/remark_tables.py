@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from sfm.remarks.catalogue import SUBJECTS
-from sfm.remarks.kind import FIELD, Grade, Kind
+from sfm.remarks.kind import FIELD, Grade, Kind, Unless
 
 BEGIN, END = "<!-- remarks: written by docs/remark_tables.py -->", "<!-- end of remarks -->"
 VARIES = "…"
@@ -56,6 +56,8 @@ def _pattern(sentence: str) -> str:
 
 def _severity(kind: Kind) -> str:
     """Return the severity, or the limits of the number that it depends on."""
+    if isinstance(kind.severity, Unless):
+        return f"{kind.severity.severity}, {kind.severity.named} if the {kind.severity.part} is known"
     if not isinstance(kind.severity, Grade):
         return kind.severity
     grade: Grade | None = kind.severity

@@ -122,7 +122,11 @@ class _Fit:
 
 
 def find_cause(
-    pairs: PointPairs, *, reference: BoolArray | None = None, changed: bool = True
+    pairs: PointPairs,
+    *,
+    reference: BoolArray | None = None,
+    changed: bool = True,
+    deforms: bool = False,
 ) -> Cause | None:
     """Return the cause of the differences of two results; None if single points moved, or without a cause.
 
@@ -131,6 +135,8 @@ def find_cause(
         reference: points that may carry the datum, (n,); all if not given.
         changed: whether a test of all points shows a significant difference. If not, only the scale is
             tested, since a test of one parameter is sharper.
+        deforms: whether the object may change its shape between the results. A strain or a bending then
+            explains the differences only where no majority of the points stayed as it was.
     """
     if len(pairs.a) < MIN_STABLE:
         return None
@@ -145,7 +151,7 @@ def find_cause(
     if not changed:
         rows = [row for row in rows if row == Row(scale=True)]
     elif nothing.agreed:  # a majority agrees without any cause
-        rows = [row for row in rows if not row.mirror]
+        rows = [row for row in rows if not (row.mirror or (deforms and (row.strain or row.bending)))]
     best = nothing
     for row in rows:
         if row.names and best.agreed and best.stable.sum() == reference.sum():

@@ -116,6 +116,7 @@ def find_displacements(
             found.pairs,
             reference=tested.reference,
             changed=not (tested.agreed and tested.stable[tested.reference].all()),
+            deforms=True,
         ),
         alpha=alpha,
     )

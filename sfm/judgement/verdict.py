@@ -43,6 +43,7 @@ from sfm.remarks.verdict import Level, judge
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
+UNREADABLE = "photograph_unreadable"
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # Below this redundancy number, the rest of a value's error is smaller than rounding and the neglected second
 # order of other errors, and w magnifies those.
@@ -143,7 +144,9 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     found = (remark("copies", copies=copies),) if copies else ()
     if not missing:
         return found
-    missed = remark("photographs_missing", missing=missing, total=total, share=missing / total)
+    unreadable = sum(one.reason.kind == UNREADABLE for one in result.failed)  # perhaps no photographs at all
+    share = (missing - unreadable) / max(total - unreadable, 1)
+    missed = remark("photographs_missing", missing=missing, total=total, share=share)
     return (missed, *_mirrored(result), *found)
 
 

@@ -88,11 +88,24 @@ class Grade:
 
 
 @dataclass(frozen=True)
+class Unless:
+    """Severity of a remark, and a lower one of a remark that names a part, such as the cause of an error."""
+
+    part: str
+    severity: Severity
+    named: Severity
+
+    def severity_of(self, one: Remark) -> Severity:
+        """Return the severity of a remark."""
+        return self.named if one.names(self.part) else self.severity
+
+
+@dataclass(frozen=True)
 class Kind:
     """A row of the catalogue."""
 
     name: str
-    severity: Severity | Grade
+    severity: Severity | Grade | Unless
     sentence: str  # with fields, see the module docstring
     cause: str  # why it happens, with the same fields
     remedy: str  # advice, with the same fields
@@ -106,9 +119,9 @@ class Kind:
 
     def severity_of(self, one: Remark) -> Severity:
         """Return the severity of a remark of this kind."""
-        if isinstance(self.severity, Grade):
-            return self.severity.severity_of(one)
-        return self.severity
+        if isinstance(self.severity, str):
+            return self.severity
+        return self.severity.severity_of(one)
 
     def write(self, text: str, one: Remark) -> str:
         """Fill the fields of a text with the parts of a remark.

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sfm.display import MAX_LISTED, counted
-from sfm.remarks.kind import Grade
 from sfm.remarks.remark import SEVERITIES, Remark, Severity
 
 Level = Literal["good", "fair", "bad"]
@@ -90,14 +89,14 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
 
 def _explains(cause: Remark, one: Remark) -> bool:
     """Return whether `cause` explains a remark; a note with a grade explains only other notes."""
-    graded = isinstance(cause.row.severity, Grade)
+    graded = not isinstance(cause.row.severity, str)
     serious = cause.severity != "note" or one.severity == "note"
     return one.kind in cause.row.explains and (serious or not graded)
 
 
 def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
     """Return the worst severity of the remarks that a remark with a grade explains."""
-    graded = isinstance(cause.row.severity, Grade)
+    graded = not isinstance(cause.row.severity, str)
     explained = [one.severity for one in every if graded and _explains(cause, one)]
     return min((cause.at_least, *explained), key=SEVERITIES.index)
 

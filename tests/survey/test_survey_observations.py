@@ -391,6 +391,7 @@ def test_a_mistake_in_a_whole_table_is_named(
     both = {("kind_wrong", ("height differences",), ("exchanged",))} if open_with_heights else set()
     assert found == {("kind_wrong", (TABLES[kind].name,), (mistake,))} | both
     assert all("agree if" in one.text for one in said)
+    assert {one.severity for one in said if one.kind == "kind_wrong"} == {"warning"}  # it does no harm
 
 
 @pytest.mark.parametrize(
@@ -404,6 +405,14 @@ def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, a
     factors = np.array([lengths] * 3 + [angles] * 3)
     np.testing.assert_allclose(found.values, factors * right.values)
     np.testing.assert_allclose(found.sigma, factors * right.sigma)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.2])
+def test_a_unit_is_a_mistake_of_offsets_only_where_they_are_not_zero(offset: float) -> None:
+    """A standard deviation a thousand times larger made planes agree whose points were simply not there."""
+    points, value = np.arange(6), np.full((6, 1), offset)
+    planes = planes_and_lines.Planes("wall", points, value, np.full((6, 1), 1e-3))
+    assert ("thousandth" in planes.mistakes()) == (offset > 0)
 
 
 def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:

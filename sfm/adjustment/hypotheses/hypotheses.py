@@ -195,8 +195,8 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     of = "coordinates" if without is None else f"coordinates without {without}"
     if plain.datum == "control":
         of = "cameras"
-    size = {"rms": found.rms, "wrong": found.rms} if of != "cameras" else {"wrong": found.shift}
-    return remark(one.kind, of=of, shift=found.shift, **size, instead=instead or None, **parts)
+    size = {"shift": found.shift, "wrong": found.shift, "rms": None if of == "cameras" else found.rms}
+    return remark(one.kind, of=of, **size, instead=instead or None, **parts)
 
 
 def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:

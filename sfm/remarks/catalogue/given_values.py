@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sfm.conventions import SWELLING
-from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
+from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
 
 DATUM = (
     Kind(
@@ -109,7 +109,7 @@ PULLED = (
 ROWS = (
     Kind(
         "kind_wrong",
-        "error",
+        Unless("mistake", "error", "warning"),  # what is explained and not used does no harm
         "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:@}.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
         "Check the table: signs, units, and the point or photograph of each row.",
@@ -175,7 +175,7 @@ ROWS = (
     ),
     Kind(
         "mount_contradicted",
-        "error",
+        Unless("mistake", "error", "warning"),
         "The mount given for {camera} contradicts the photographs, by {angle} in its rotation and "
         "{direction} in the direction of its base, {sigmas} standard deviations: it was not used.[[ It fits "
         "if {mistake:@}.]]",

@@ -145,8 +145,8 @@ ADJUSTMENT = (
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),
 )
-# `shift`: standard deviations by which the result shifts with the alternative. `wrong`: how wrong it is, as
-# the root mean square shift of coordinates, or the largest shift of the few parameters of a camera.
+# `shift`: standard deviations by which the alternative moves the coordinate that it moves most, or the
+# parameter of a camera. `wrong`: the same; 0 where the image points concerned are rejected anyway.
 SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("wrong", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
 SHIFTED = "{of:@} shift by up to {shift} standard deviations[[, {rms} RMS]]."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
