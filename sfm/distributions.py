@@ -13,6 +13,11 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+# Three probabilities decide every test. A family of tests shares the first; one question has the second.
+FALSE_ALARM = 0.05  # that the tests of one kind, together, report anything in a result without errors
+LEVEL = 0.001  # that one question is answered wrongly although nothing is wrong; Baarda (1968)
+POWER = 0.8  # that an error of the size that is called detectable is found; Baarda (1968)
+
 
 def chi2_sf(x: Any, r: Any) -> Any:
     """Probability that chi-square of redundancy r is larger than x."""
@@ -75,3 +80,7 @@ def poisson_sf(k: Any, expected: Any) -> Any:
 def binomial_sf(k: Any, n: Any, p: Any) -> Any:
     """Probability of more than k events in n trials with probability p each."""
     return np.where(np.asarray(k) < 0, 1.0, special.bdtrc(np.maximum(k, 0), n, p))[()]
+
+
+# Error, in standard deviations, that a test at LEVEL finds with POWER: 4.13, Baarda (1968).
+NONCENTRALITY = float(normal_ppf(POWER) - normal_ppf(LEVEL / 2))

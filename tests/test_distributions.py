@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from scipy import stats
 
 from sfm import distributions
+from tests.places import ROOT
 
 X = np.array([-2.0, -1e-9, 0.0, 1e-6, 0.01, 0.5, 1.0, 4.0, 30.0, 250.0])
 P = np.array([1e-12, 1e-6, 1e-3, 0.05, 0.5, 0.95, 1 - 1e-6])
@@ -45,3 +47,28 @@ def test_f_is_exceeded_with_the_probability_asked_for() -> None:
     """scipy's own isf is the quantile of 1 - p, which loses five digits in the tail."""
     for r in ((1, 2), (3, 40), (200, 100_000)):
         np.testing.assert_allclose(stats.f.sf(distributions.f_isf(P, *r), *r), P, rtol=1e-9)
+
+
+def test_an_error_that_is_called_detectable_is_found_with_the_stated_power() -> None:
+    """Baarda (1968): 4.13 standard deviations at 0.1 % with 80 %."""
+    critical = -distributions.normal_ppf(distributions.LEVEL / 2)
+    assert pytest.approx(4.13, abs=0.005) == distributions.NONCENTRALITY
+    found = distributions.normal_sf(critical - distributions.NONCENTRALITY)
+    assert found == pytest.approx(distributions.POWER, abs=1e-6)
+
+
+def test_levels_have_one_home() -> None:
+    """Other modules import them; levels of families that are still their own are listed here."""
+    theirs = {
+        "adjustment/hypotheses/alternatives.py": "ALPHA",
+        "adjustment/hypotheses/moved.py": "FALSE_ALARM",
+        "adjustment/quality/consistency.py": "FAMILY",
+        "epochs/together.py": "ALPHA",
+        "targets/fits/outline_noise.py": "LEVEL",
+    }
+    found = {}
+    for path in sorted((ROOT / "sfm").rglob("*.py")):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if named := re.match(r"(\w*(?:ALPHA|LEVEL|ALARM|FAMILY|POWER))\b(?:: float)? = \(?0?\.\d", line):
+                found[path.relative_to(ROOT / "sfm").as_posix()] = named.group(1)
+    assert found == {**theirs, "distributions.py": "POWER"}

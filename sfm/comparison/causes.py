@@ -46,6 +46,7 @@ from sfm.comparison.stable_points import (
     tests_in_datum,
 )
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray, UnitFactor, find_unit
+from sfm.distributions import LEVEL
 from sfm.errors import GeometryError
 from sfm.similarity import MAX_COLLINEAR_RATIO, Similarity, extended_axes, fit_similarity, mean_distance
 
@@ -54,7 +55,6 @@ TRIANGLES = 100  # of the first set that are tried
 SIMILAR_TRIANGLES = 5  # triangles of the second set that are tried for each triangle of the first
 ROUNDS = 5  # of pairing and fitting after a proposal
 ENOUGH_FRACTION = 0.9  # of the points; if so many match, the search ends
-ALPHA = 0.001  # probability of finding a cause where there is none, over all rows
 PERMUTATIONS = 999  # of the names; the level of the permutation test is then 0.001
 MIN_PERMUTED = 7  # points; fewer have no more than PERMUTATIONS permutations
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -147,7 +147,7 @@ def find_cause(
         nothing = _fitted(pairs, NOTHING, reference, cost)
     except GeometryError:
         return None
-    limit = math.log(len(rows) / ALPHA)
+    limit = math.log(len(rows) / LEVEL)
     if not changed:
         rows = [row for row in rows if row == Row(scale=True)]
     elif nothing.agreed:  # a majority agrees without any cause
@@ -244,14 +244,14 @@ def _fitted(
     least = max(MIN_STABLE, math.ceil(STABLE_FRACTION * reference.sum()))
     if 2 * G.shape[1] > 3 * n or G.shape[1] >= 3 * least:  # too many parameters for so few points
         return failed
-    single = critical_value(ALPHA / max(1, int(reference.sum())), 3, pairs.redundancy)
+    single = critical_value(LEVEL / max(1, int(reference.sum())), 3, pairs.redundancy)
     weight = robust_weights(d, G, reference)
     fits = reference & (tests_in_datum(d, Q, G, weight) <= single)
     if fits.sum() < least:
         return failed
     among = candidates_of(d, Q, G, reference)
     found = find_stable_points(
-        among, least=least, start=fits, redundancy=pairs.redundancy, alpha=ALPHA, alpha_single=ALPHA
+        among, least=least, start=fits, redundancy=pairs.redundancy, alpha=LEVEL, alpha_single=LEVEL
     )
     if not found.agreed:
         return failed
@@ -265,7 +265,7 @@ def _fitted(
     unit = None
     if pairs.scale is not None:
         size, sigma = lengths if row.scale else (pairs.scale / T.scale, 0.0)
-        beside = max(SWELLING, math.sqrt(critical_value(ALPHA, 1, r)) * sigma / size)
+        beside = max(SWELLING, math.sqrt(critical_value(LEVEL, 1, r)) * sigma / size)
         unit = find_unit(size, beside)  # the remaining difference is reported
     factor = unit.factor if unit else 1.0
     stretches = _stretches(pairs, T, d, Q, similarity, found.stable, factor) if row.strain else ()
@@ -332,7 +332,7 @@ def _stretches(
     sigma = lengths * np.sqrt(np.einsum("ak,kl,al->a", gradient, covariance, gradient))
     if pairs.scale is None:
         sigma, lengths = sigma / np.median(lengths), lengths / np.median(lengths)
-    limit = math.sqrt(critical_value(ALPHA / 3, 1, pairs.redundancy))
+    limit = math.sqrt(critical_value(LEVEL / 3, 1, pairs.redundancy))
     order = np.argsort(-np.abs(lengths - 1))
     return tuple(
         Stretch(directions[:, k], float(lengths[k]), float(sigma[k]))
@@ -344,7 +344,7 @@ def _stretches(
 def _cause(fit: _Fit, pairs: PointPairs, gain: float) -> Cause:
     """Return the cause that a fitted row stands for."""
     row, (lengths, sigma), unit = fit.row, fit.lengths, fit.unit
-    limit = math.sqrt(critical_value(ALPHA, 1, pairs.redundancy))
+    limit = math.sqrt(critical_value(LEVEL, 1, pairs.redundancy))
     rest = row.scale and (unit is None or abs(lengths - unit.factor) > limit * sigma)
     renamed: tuple[tuple[str, str], ...] = ()
     if fit.other is not None:

@@ -36,6 +36,7 @@ from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.display import html_table, text_table
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.network import Network
 from sfm.remarks.remark import Remark, remark
@@ -46,7 +47,6 @@ FREE_DATUMS = ("free", "")  # in which the covariance of single points gives abo
 ALIGNMENTS = ("points", "cameras", "control", "none")
 SAME_PX = 1e-3  # closer image points are one measurement
 SAME_SHARE = 0.5  # of a's image points; if b has more of them, the results are not independent
-ALPHA = 0.05  # level of the global test; single points are tested at ALPHA / number of points (Bonferroni)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,12 @@ class ResultComparison:
 
 @checked_arguments()
 def compare_results(
-    a: Solution, b: Solution, *, align: str = "points", control: tuple[str, ...] = (), alpha: float = ALPHA
+    a: Solution,
+    b: Solution,
+    *,
+    align: str = "points",
+    control: tuple[str, ...] = (),
+    alpha: float = FALSE_ALARM,
 ) -> ResultComparison:
     """Align b to a and test the differences.
 

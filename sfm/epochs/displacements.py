@@ -15,16 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ncfdtr
 
-from sfm.adjustment.quality.statistics import POWER
 from sfm.arguments import checked_arguments
 from sfm.comparison.causes import Cause, find_cause
 from sfm.comparison.congruency import Congruency, congruency
 from sfm.comparison.stable_points import critical_value, point_blocks
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import chi2_isf
+from sfm.distributions import FALSE_ALARM, POWER, chi2_isf
 from sfm.epochs.differences import Differences
 
-ALPHA = 0.05  # level of all tests of a pair of epochs together
 MAX_F_REDUNDANCY = 10**6  # redundancy above which Fisher's F is chi-square
 
 
@@ -89,7 +87,7 @@ class Displacements:
 
 @checked_arguments()
 def find_displacements(
-    found: Differences, *, reference: BoolArray | None = None, alpha: float = ALPHA
+    found: Differences, *, reference: BoolArray | None = None, alpha: float = FALSE_ALARM
 ) -> Displacements:
     """Test which points moved.
 

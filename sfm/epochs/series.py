@@ -25,8 +25,9 @@ from sfm.comparison.findings import remarks_of_cause
 from sfm.comparison.stable_points import critical_value, in_datum
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
+from sfm.distributions import FALSE_ALARM
 from sfm.epochs.differences import Differences, Epoch, MountChange, epoch_differences, mount_changes
-from sfm.epochs.displacements import ALPHA, Displacements, find_displacements
+from sfm.epochs.displacements import Displacements, find_displacements
 from sfm.epochs.together import SharedCamera, adjust_together
 from sfm.errors import GeometryError
 from sfm.geometry.measured import matches
@@ -136,7 +137,7 @@ def analyse_epochs(
     reference: Sequence[str] = (),
     groups: Mapping[str, Sequence[str]] | None = None,
     model: str = "rigid",
-    alpha: float = ALPHA,
+    alpha: float = FALSE_ALARM,
     together: bool = False,
 ) -> EpochSeries:
     """Test which points moved between epochs.

@@ -23,6 +23,7 @@ from sfm.comparison.pairing import fit_robustly
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.display import counted
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints, coordinates_of, join_functions
 from sfm.similarity import Similarity, fit_similarity, similarity_motions
@@ -31,7 +32,6 @@ ITERATIONS = 50
 CONVERGED = 1e-13
 REJECTED = 4.685  # robust standard deviations beyond which a point takes no part
 MEDIAN_OF_LENGTH = 1.538  # median length of a vector of three independent normal deviations, in sigmas
-ALPHA = 0.05  # level of the global test
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def align_points(
     statistic = critical = np.nan
     if weights == "network" and redundancy:
         statistic = omega / redundancy
-        critical = critical_value(ALPHA, redundancy, points.redundancy)
+        critical = critical_value(FALSE_ALARM, redundancy, points.redundancy)
     sigma0 = float(np.sqrt(omega / redundancy)) if redundancy else np.nan
     fit = BestFit(tuple(common), used, difference, T.scale, sigma0, redundancy, float(statistic), critical)
     return Alignment("points", T, rows[used], linear, of_nominal, scale, fit)

@@ -18,13 +18,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.quality.consistency import FAMILY, Consistency, consistency_of
-from sfm.adjustment.quality.given_values import LEVEL
-from sfm.adjustment.quality.statistics import ALPHA, component_tests, more_than_chance, robust_test
+from sfm.adjustment.quality.statistics import component_tests, more_than_chance, robust_test
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES
 from sfm.display import counted, program_name
-from sfm.distributions import normal_ppf
+from sfm.distributions import LEVEL, normal_ppf
 from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
@@ -193,7 +192,7 @@ def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustmen
         parts["length"] = (shared.length_px, "px")
     stated = (sigma0.stated_px, "px")
     remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=stated, **parts))]
-    image = component_tests(statistics.kinds, alpha=2 * ALPHA)[0]
+    image = component_tests(statistics.kinds, alpha=2 * LEVEL)[0]
     if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
         remarks.append(
             remark("sigma_px_cautious", stated=(sigma0.stated_px, "px"), found=(sigma0.image_points_px, "px"))

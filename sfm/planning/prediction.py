@@ -26,13 +26,13 @@ from functools import cached_property
 import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
-from sfm.adjustment.quality.statistics import POWER
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.arguments import checked_arguments
 from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
+from sfm.distributions import LEVEL, POWER
 from sfm.epochs.displacements import detectable_shift
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of, values_of
@@ -44,7 +44,6 @@ from sfm.planning.visibility import Seeing, Sight, sight_of
 from sfm.similarity import similarity_motions
 
 MIN_RAYS = 3  # of a point: with two rays a gross error cannot be located
-ALPHA = 0.001  # of the test of one point among many
 MIN_POINTS = 4  # points that a photograph must show to be oriented
 MAX_OFF_SIGMAS = 5.0  # largest misfit of planned points to their observations, such as a line, in sigmas
 MAX_JOINT = 1000  # points with a joint covariance; if there are more, evenly spread ones are used
@@ -427,7 +426,7 @@ class WantedPrecision:
 
 def displacement_per_sigma() -> float:
     """Return the length of a detectable displacement between two surveys, over sigma of one survey."""
-    return math.sqrt(2) * detectable_shift(ALPHA, POWER, 3, None)
+    return math.sqrt(2) * detectable_shift(LEVEL, POWER, 3, None)
 
 
 def found_displacement(prediction: Prediction) -> FloatArray:

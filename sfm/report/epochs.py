@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import POWER
 from sfm.conventions import FloatArray
 from sfm.display import counted, listed
+from sfm.distributions import POWER
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
 from sfm.report.figures.comparisons import difference_figure, plot_series

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import GLOBAL_ALPHA, GlobalTest
+from sfm.adjustment.quality.statistics import GlobalTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import SUPERSCRIPTS, FloatArray
 from sfm.conventions import finer_unit as finer_unit
 from sfm.display import NO_BREAK, counted, listed
-from sfm.distributions import normal_ppf
+from sfm.distributions import FALSE_ALARM, normal_ppf
 from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
 from sfm.judgement.checks import Precision, Sigma0
 from sfm.remarks.kind import probability as probability
@@ -63,7 +63,7 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         said = f"better than stated, {_fitting_sigmas(test, adjustment)} would fit"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
-        f"{test.upper:.2f} ({100 * (1 - GLOBAL_ALPHA):.0f} %)"
+        f"{test.upper:.2f} ({100 * (1 - FALSE_ALARM):.0f} %)"
     )
 
 

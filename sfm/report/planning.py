@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import POWER, reliability
+from sfm.adjustment.quality.statistics import reliability
 from sfm.camera import Camera
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.display import counted
+from sfm.distributions import LEVEL, POWER
 from sfm.files.result_tables import IN_FILES
 from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.observations.given import ScaleBars
@@ -19,7 +20,7 @@ from sfm.observations.pose import MountObservations
 from sfm.observations.tables import TABLES
 from sfm.planning import MIN_PIXELS
 from sfm.planning.plan import Plan, verdict_of_plan
-from sfm.planning.prediction import ALPHA, found_displacement
+from sfm.planning.prediction import found_displacement
 from sfm.planning.stations import Shot, Stations
 from sfm.planning.weakness import Calibratability, Contribution
 from sfm.report.page import (
@@ -281,7 +282,7 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             f"{length_of(along, unit)} in its worst direction",
         ),
         (
-            f"displacement detectable between two such surveys ({POWER:.0%} power, {ALPHA:.1%} significance)",
+            f"displacement detectable between two such surveys ({POWER:.0%} power, {LEVEL:.1%} significance)",
             f"{length_of(float(np.median(d)), unit)} (median), {length_of(float(d.max()), unit)} (worst)",
         ),
         (

@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import f_isf
+from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate, rows_of
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
@@ -32,7 +32,6 @@ from sfm.targets.codes.plates import PlateFamily
 
 RIGS_TRIED = 12  # evenly spread pairs of photographs whose relative orientation is tried on the others
 OF_A_RIG = 6  # parameters of a relative orientation with its scale
-ALPHA = 0.001  # probability of accepting turns as certain although others are equally likely
 
 
 class Pair(NamedTuple):
@@ -179,7 +178,7 @@ def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int) -> bool:
     if agreeing < 2 or 2 * agreeing <= pairs:
         return False
     redundancy = OF_A_RIG * (agreeing - 1)
-    limit = float(f_isf(ALPHA, redundancy, redundancy))
+    limit = float(f_isf(LEVEL, redundancy, redundancy))
     rivals = [other for other in others if (other.turn != best.turn)[best.agrees].any()]
     return all(other.squares(best.agrees) > limit * best.squares(best.agrees) for other in rivals)
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.conventions import IntArray
-from sfm.distributions import f_isf
+from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
@@ -21,7 +21,6 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import orient_with_models
 from sfm.survey.rigs import middle_rotation, with_moments
 
-ALPHA = 0.001  # probability of changing the offset although both fit equally
 MIN_MOMENTS = 3  # of two cameras, whose relative rotations are compared
 
 
@@ -47,7 +46,7 @@ def agree_on_clocks(
     now, count = rotation_spread(measured.network.camera, measured.network.moment, start.estimate)
     then, of_other = rotation_spread(network.camera, network.moment, start.estimate)
     dof = 3 * (min(count, of_other) - 1)
-    if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(ALPHA, dof, dof):
+    if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(LEVEL, dof, dof):
         return survey, measured, start
     said = tuple(
         remark("clock_differs", **one.subjects, ahead=one.numbers["ahead"])

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from sfm.adjustment.result import Adjustment, ObservedResiduals
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import listed
-from sfm.distributions import normal_ppf
+from sfm.distributions import LEVEL, normal_ppf
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
 from sfm.network import Estimate, Network
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 DISTANCE = "distance"
 MAX_WRONG = 1 / 3  # share of wrong observations of a kind beyond which none of this kind is trusted
-ALARM = 0.001  # probability of rejecting any of the correct observations of the tables
 MIN_REDUNDANCY = 0.01  # redundancy number below which others hardly check an observation
 
 
@@ -395,9 +394,9 @@ def _agrees(a: Adjustment, first: int) -> bool:
 
 
 def _critical(a: Adjustment, first: int) -> float:
-    """Return the critical |w|: the chance that any correct observation of these kinds exceeds it is ALARM."""
+    """Return the critical |w|: the chance that any correct observation of these kinds exceeds it is LEVEL."""
     count = sum(one.count for one in a.observed if one.index >= first)
-    return -float(normal_ppf(ALARM / (2 * max(count, 1))))
+    return -float(normal_ppf(LEVEL / (2 * max(count, 1))))
 
 
 def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:

@@ -33,9 +33,7 @@ def stub(**parts: Any) -> Any:
     return SimpleNamespace(**parts)
 
 
-def test_levels_are_the_usual_ones() -> None:
-    assert statistics.ALPHA == 0.001 and statistics.POWER == 0.8  # Baarda
-    assert statistics.GLOBAL_ALPHA == 0.05  # as in textbooks
+def test_limits_of_what_is_reported() -> None:
     assert statistics.MIN_REPORTED_CORRELATION == 0.9 and statistics.MIN_EXCESS_RATIO == 2.0
     assert numbers.MIN_CHECKED_REDUNDANCY == 1e-6  # the rounding of normal equations is 1e-8
 
@@ -202,8 +200,8 @@ def test_given_unknowns_are_standardised_by_hand() -> None:
 
 def test_the_level_of_single_tests_is_that_of_all() -> None:
     """Pope (1976) and Sidak (1967): 5 % that any of them rejects what is good."""
-    assert numbers.level_of_single(numbers.FALSE_ALARM, 1) == pytest.approx(0.05)
-    assert numbers.level_of_single(numbers.FALSE_ALARM, 1000) == pytest.approx(5.129e-5, rel=1e-4)
+    assert numbers.level_of_single(0.05, 1) == pytest.approx(0.05)
+    assert numbers.level_of_single(0.05, 1000) == pytest.approx(5.129e-5, rel=1e-4)
 
 
 def test_tau_by_students_t() -> None:

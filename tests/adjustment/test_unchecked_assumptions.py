@@ -20,7 +20,6 @@ from sfm.adjustment.hypotheses.score import reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -42,7 +41,6 @@ def test_the_gain_that_is_needed_is_that_of_the_test_and_of_the_price() -> None:
         max(stats.chi2.isf(1e-6, 1), np.log(4) + 4 * np.log(100))
     )
     assert needed_gain(3, 500, 2.0, 30) == pytest.approx(3 * np.log(1000) + 4.0 + 2 * np.log(100))
-    assert (unchecked.POWER, WRONG_SIGMAS) == (0.80, 5.0)
 
 
 def shift_of(a: Adjustment, moved_px: FloatArray) -> tuple[float, float]:

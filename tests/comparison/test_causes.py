@@ -204,10 +204,6 @@ def test_a_pattern_is_found_whatever_the_names() -> None:
     assert find_pattern(a[:3], b[:3]) is None
 
 
-def test_the_level_is_that_of_all_rows() -> None:
-    assert causes.ALPHA == 0.001 and len(causes.ROWS) == 9 and causes.PERMUTATIONS == 999
-
-
 def test_every_parameter_of_a_cause_has_the_price_of_bic() -> None:
     """Of equal points nothing is left to gain; a scale that is known already costs one parameter."""
     a = seed_of("price").uniform(-1, 1, (20, 3))

@@ -51,12 +51,12 @@ from sfm.adjustment.hypotheses.score import (
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
+from sfm.distributions import POWER
 from sfm.errors import GeometryError
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity, without_motions
 
-POWER = 0.80  # probability of finding a detectable error; Baarda (1968)
 ROUNDS = 6
 HALVINGS = 4  # most halvings of a step, because a linear step may go too far for a large error
 MAX_ITERATIONS = 15  # the start is near the optimum; half of the adjustments that converge need 3

@@ -28,10 +28,9 @@ from sfm.adjustment.quality.variance_components import VarianceComponents, by_ph
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import chi2_isf, chi2_sf
+from sfm.distributions import LEVEL, chi2_isf, chi2_sf
 from sfm.network import Estimate, rows_of
 
-CHANCE = 1e-3  # probability of such a larger misfit if the other explanation is true
 MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
 FAMILY = 0.01  # probability that a test reports anything in a survey without errors
 # Ratio of the largest component of a photograph to the median below which a difference does not matter.
@@ -128,7 +127,7 @@ def doubtful_points(
         rows_of: usable image points of each object point.
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
-    limit = float(chi2_isf(CHANCE, 1))
+    limit = float(chi2_isf(LEVEL, 1))
     found = []
     for j in np.unique(seen.point[adjustment.rejected]).tolist():
         rows = rows_of[j]

@@ -23,11 +23,9 @@ from math import comb, log
 import numpy as np
 
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
-from sfm.distributions import f_sf
+from sfm.distributions import LEVEL, NONCENTRALITY, f_sf
 
-LEVEL = 0.001  # probability that a test of a survey rejects correct given values; Baarda (1968)
 MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
-NONCENTRALITY = 4.13  # noncentrality of an error that a test at LEVEL finds with 80 %; Baarda (1968)
 MIN_LEAD = log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 # An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
 # not explain are errors of the values. The best-fitting factor may be larger by chance.

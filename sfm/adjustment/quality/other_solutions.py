@@ -27,14 +27,13 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import f_isf
+from sfm.distributions import LEVEL, f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity, reverse_depth
 
 STEP = 1.3  # ratio of successive principal distances that are tried
 STEPS = 6  # steps in each direction, from a fifth of c to five times c
-ALPHA = 0.001  # probability of such a larger v'Pv if the other solution is true
 STATED_FREEDOM = 10  # number of observations that the stated weights count for in the estimated variance
 WEAK_C = 5e-4  # relative standard deviation of c; a network is not weak below it,
 MIN_STRONG_PHOTOGRAPHS = 5  # if it has at least this number of photographs
@@ -116,7 +115,7 @@ def _allowed(base: Adjustment) -> float:
     """
     freedom = base.redundancy + STATED_FREEDOM
     variance = (base.vPv + STATED_FREEDOM) / freedom
-    return float(variance * f_isf(ALPHA, 1, freedom))
+    return float(variance * f_isf(LEVEL, 1, freedom))
 
 
 def _weak(a: Adjustment) -> bool:

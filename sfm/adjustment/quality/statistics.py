@@ -30,13 +30,21 @@ from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import MODELS
-from sfm.distributions import binomial_sf, chi2_ppf, nct_parameter, normal_ppf, poisson_sf, t_ppf, t_sf
+from sfm.distributions import (
+    FALSE_ALARM,
+    LEVEL,
+    POWER,
+    binomial_sf,
+    chi2_ppf,
+    nct_parameter,
+    normal_ppf,
+    poisson_sf,
+    t_ppf,
+    t_sf,
+)
 from sfm.errors import GeometryError
 
-ALPHA = 0.001  # Baarda's usual probability of rejecting a good observation
 MIN_EXCESS_RATIO = 2.0  # coordinates beyond the critical value, relative to the number expected by chance
-GLOBAL_ALPHA = 0.05  # level of the global test and of the significance of parameters
-POWER = 0.8  # probability of finding a gross error of the minimal detectable size
 MIN_REPORTED_CORRELATION = 0.9  # absolute correlation from which two parameters are reported
 Untested = Literal["redundancy", "reweighted"]  # redundancy too small; weights computed from the residuals
 
@@ -74,7 +82,7 @@ class CoordinateTest:
         """Whether more than MIN_EXCESS_RATIO times as many are beyond it, which chance makes unlikely."""
         return bool(
             self.beyond > MIN_EXCESS_RATIO * self.expected
-            and poisson_sf(self.beyond - 1, self.expected) < ALPHA
+            and poisson_sf(self.beyond - 1, self.expected) < LEVEL
         )
 
 
@@ -111,7 +119,7 @@ class Correlation:
     value: float
 
 
-def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> GlobalTest:
+def global_test(adjustment: Adjustment, *, alpha: float = FALSE_ALARM) -> GlobalTest:
     """Return the two-sided chi-square test of v'Pv of all observations.
 
     Args:
@@ -123,7 +131,7 @@ def global_test(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> Globa
 
 
 def component_tests(
-    components: VarianceComponents, *, alpha: float = GLOBAL_ALPHA, reweighted: bool = False
+    components: VarianceComponents, *, alpha: float = FALSE_ALARM, reweighted: bool = False
 ) -> tuple[GlobalTest, ...]:
     """Return the two-sided chi-square test of the variance component of each group against 1.
 
@@ -158,7 +166,7 @@ def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> Glob
 
 
 @checked_arguments()
-def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+def w_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
     """Return Baarda's test of each image coordinate; w is standard normal if the stated sigma0 is correct.
 
     Args:
@@ -169,7 +177,7 @@ def w_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
 
 
 @checked_arguments()
-def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+def tau_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
     """Return Pope's test of each image coordinate, which uses sigma0 of the adjustment.
 
     Args:
@@ -180,7 +188,7 @@ def tau_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
     return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
 
 
-def robust_test(adjustment: Adjustment, *, alpha: float = ALPHA) -> CoordinateTest:
+def robust_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
     """Return the test of w over its standard deviation from the median, which half of the coordinates fix.
 
     It finds gross errors that were not rejected. Tau misses them if they are so many that they determine
@@ -227,7 +235,7 @@ def _coordinate_test(
     return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
 
 
-def non_centrality(alpha: float = ALPHA, power: float = POWER, redundancy: int | None = None) -> float:
+def non_centrality(alpha: float = LEVEL, power: float = POWER, redundancy: int | None = None) -> float:
     """Return delta0, the non-centrality with which the test of an observation finds an error.
 
     Args:
@@ -283,7 +291,7 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     )
 
 
-def significance(adjustment: Adjustment, *, alpha: float = GLOBAL_ALPHA) -> tuple[Significance, ...]:
+def significance(adjustment: Adjustment, *, alpha: float = FALSE_ALARM) -> tuple[Significance, ...]:
     """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
 
     A parameter shared by several cameras is tested once, under the name of their group.
@@ -460,9 +468,6 @@ def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> Floa
             mixed = np.where(r & ~c, mixed, 0.0)
             Q += mixed + np.swapaxes(mixed, 1, 2)
     return np.asarray(J @ Q @ np.swapaxes(J, 1, 2))
-
-
-FALSE_ALARM = 0.05  # probability that a survey without gross errors loses an image coordinate; Pope (1976)
 
 
 def level_of_single(family: float, tests: int) -> float:

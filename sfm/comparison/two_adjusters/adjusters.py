@@ -35,7 +35,7 @@ from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted, program_name
 from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf, f_isf
+from sfm.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.reduced_network import reduce_network, select_supported
@@ -46,11 +46,7 @@ MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that d
 # thousandfold, they may still converge: of 32 random networks that had not converged after 40 steps, 25 did
 # so by step 200.
 MAX_ITERATIONS = 200
-ALPHA = (
-    0.05  # of the chi-square test, with 1 degree of freedom, whether image points distinguish two solutions
-)
 Outcome = Literal["agrees", "fits alike", "differs"]
-CAMERA_ALPHA = 0.001  # error probability of the F-test whether one camera fits better
 MIN_RMS_RATIO = 1.1  # of residuals; a smaller ratio has no visible effect on the coordinates
 
 
@@ -108,7 +104,7 @@ class AdjusterComparison:
         """Whether they agree, fit alike (image points do not distinguish them), or differ."""
         if self.agree:
             return "agrees"
-        return "fits alike" if self.gap <= chi2_isf(ALPHA, 1) else "differs"
+        return "fits alike" if self.gap <= chi2_isf(FALSE_ALARM, 1) else "differs"
 
 
 class BackendAdjustment(Protocol):
@@ -330,7 +326,7 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
         return None
     F = (freer.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
     found = BetterFit(freer.rms_px, compared.rms_px, more)
-    if f_isf(CAMERA_ALPHA, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
+    if f_isf(LEVEL, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
         return None
     tested = contradicted_parameters(adjusted(freer.estimate, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))

@@ -20,6 +20,7 @@ from sfm.arguments import check_indices, checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.geometry.measured import Function, MeasuredPoints, measured_points
 from sfm.geometry.shapes.gauss_helmert import constraint_covariance, refine_orthogonal, refine_weighted
@@ -36,7 +37,6 @@ START_STEPS = 25
 COLLINEAR = 1e-9  # spread of points, relative to their size, below which they lie on a line or plane
 UNCERTAIN = 3.0  # the same, relative to the standard deviation of the points
 RANK = 1e-9  # ratio of singular values of the scaled design matrix below which a parameter is undetermined
-ALPHA = 0.05  # level of the global test
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,10 @@ def _fit(
         w[used] = fit.standardised
         sigma0 = np.sqrt(fit.omega / redundancy) if redundancy else np.nan
         if redundancy:
-            statistic, critical = fit.omega / redundancy, critical_value(ALPHA, redundancy, points.redundancy)
+            statistic, critical = (
+                fit.omega / redundancy,
+                critical_value(FALSE_ALARM, redundancy, points.redundancy),
+            )
     else:
         inverse: FloatArray = np.asarray(np.linalg.inv(A.T @ A))
         linear[:, used] = -np.einsum("up,pnc,nci->uni", inverse, A.T.reshape(-1, *d.shape), B)

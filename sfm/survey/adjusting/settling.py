@@ -22,7 +22,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import scale_estimate
-from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -30,7 +30,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf
+from sfm.distributions import FALSE_ALARM, chi2_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed

@@ -16,12 +16,11 @@ from datetime import datetime, timedelta
 import numpy as np
 
 from sfm.conventions import FloatArray
-from sfm.distributions import binomial_sf, normal_sf
+from sfm.distributions import LEVEL, binomial_sf, normal_sf
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.from_exif import clock_offsets, named_moments
 from sfm.survey.inputs.settings import RigSettings
 
-ALPHA = 0.001  # probability of as many pairs without a rig
 # Smallest share of the photographs of a camera in pairs. With more than half, 1 of 300 simulated surveys by
 # two people was a rig (eight stations, photographs within 10 s, times in whole seconds); with this, none.
 MIN_PAIRED = 0.75
@@ -126,7 +125,7 @@ def _paired_at(reference: FloatArray, times: FloatArray) -> float | None:
     if abs(ahead) > half:
         within = 1 - 2 * float(normal_sf(width / 2 / BY_HAND_S))
         in_turn = float(binomial_sf(pairs - 2, fewest - 1, within))  # one pair gives the difference
-    return ahead if max(independent, in_turn) < ALPHA else None
+    return ahead if max(independent, in_turn) < LEVEL else None
 
 
 def _is_whole(seconds: FloatArray) -> bool:

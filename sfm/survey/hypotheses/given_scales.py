@@ -21,7 +21,6 @@ from sfm.adjustment.quality.given_points import (
     parameters_of,
 )
 from sfm.adjustment.quality.given_values import (
-    LEVEL,
     UNSTATED_FRACTION,
     GivenModel,
     GivenTest,
@@ -29,7 +28,7 @@ from sfm.adjustment.quality.given_values import (
     judge_values,
 )
 from sfm.conventions import BoolArray, FloatArray, IntArray, find_unit
-from sfm.distributions import chi2_isf, chi2_sf
+from sfm.distributions import LEVEL, chi2_isf, chi2_sf
 from sfm.network import Network, ScaleBars
 from sfm.remarks.kind import WRONG_SIGMAS, significant
 from sfm.remarks.remark import Remark, remark

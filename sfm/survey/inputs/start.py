@@ -19,7 +19,7 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
 from sfm.display import listed
-from sfm.distributions import chi2_ppf
+from sfm.distributions import LEVEL, chi2_ppf
 from sfm.errors import SurveyFileError
 from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.observations.pose import MountObservations
@@ -34,7 +34,6 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import with_tables
 from sfm.survey.rigs import with_moments
 
-ALPHA = 0.001  # probability of taking agreeing measurements as contradicting
 MARGIN_PX = 1.0  # difference to programs that count pixels from 1 or from corners
 MAX_OUTSIDE = 0.05  # of the image points; measuring never makes more gross errors
 MIN_RAYS = 2  # photographs that a point with a name needs
@@ -308,7 +307,7 @@ def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
             mean = Q @ np.einsum("nab,nb->a", P, seen.xy[rows[different]])
             d = seen.xy[rows[different]] - mean
             chi2 = float(np.einsum("na,nab,nb->", d, P, d))
-            kind = 1 if chi2 <= chi2_ppf(1 - ALPHA, 2 * (len(different) - 1)) else 2
+            kind = 1 if chi2 <= chi2_ppf(1 - LEVEL, 2 * (len(different) - 1)) else 2
             xy[one], covariance[one] = mean, Q
         if kind == 2:
             keep[one] = False

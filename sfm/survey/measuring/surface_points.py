@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import with_neighbours
-from sfm.adjustment.quality.statistics import FALSE_ALARM, level_of_single
+from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -22,6 +22,7 @@ from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
-from sfm.distributions import f_sf
+from sfm.distributions import LEVEL, f_sf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, rows_of
 from sfm.reduced_network import reduce_network
@@ -33,7 +33,6 @@ from sfm.remarks.remark import remark
 from sfm.result import FailedImage
 from sfm.survey.inputs.measurements import Measurements
 
-ALPHA = 0.001  # probability of taking two exposures for one, over all pairs
 MIN_CORRELATION = 0.7  # of the errors; it is 0.99 for real photographs saved as JPEG of quality 40
 SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are not copies
 MIN_COMMON = 4  # image points that must agree
@@ -61,7 +60,7 @@ def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
         if names[0] in copies or names[1] in copies:
             continue
         rho, p = _correlation(adjustment, of_image[i], of_image[j])
-        if rho > MIN_CORRELATION and p < ALPHA / len(pairs):
+        if rho > MIN_CORRELATION and p < LEVEL / len(pairs):
             copies[names[1]] = names[0], rho
     return copies
 
