@@ -21,7 +21,7 @@ from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
-from sfm.judgement.verdict import judge_adjustment
+from sfm.judgement.verdict import judge_adjustment, judge_survey
 from sfm.kernels.threads import cores
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
@@ -155,7 +155,7 @@ def write_result(
 
     with one_blas_thread():
         return write(
-            findings_of(result),
+            findings_of(judge_survey(result)),  # parts of a result may have been replaced
             Path(folder),
             write_colmap=colmap_writer(result),
             jobs=jobs or cores(),
@@ -164,12 +164,13 @@ def write_result(
 
 
 def judged(solve: Callable[Options, Adjustment]) -> Callable[Options, Adjustment]:
-    """Return a function that adjusts a network and judges the result."""
+    """Return a function that adjusts a network and judges the result; `Adjustment.verdict` states it."""
 
     @wraps(solve)
     def adjust(*args: Options.args, **options: Options.kwargs) -> Adjustment:
-        return judge_adjustment(solve(*args, **options))
+        return judge_adjustment(solve(*args, **options), rejects=options.get("reject") != "none")
 
+    adjust.__module__ = __name__  # where pickle finds it
     return adjust
 
 

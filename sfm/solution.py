@@ -21,7 +21,7 @@ from sfm.display import counted, html_table, text_table
 from sfm.errors import BackendError, GeometryError
 from sfm.files.covariance_file import points_kept_together
 from sfm.network import Estimate, Network, index_of
-from sfm.remarks.verdict import NOT_JUDGED, Verdict
+from sfm.remarks.verdict import Verdict
 
 if TYPE_CHECKING:
     import pandas
@@ -108,7 +108,7 @@ class Solution:
     # rad, (s, s)
     rig_covariance: FloatArray | None = None
     joint: JointCovariance | None = None  # joint covariance of an adjustment in memory; otherwise None
-    verdict: Verdict = NOT_JUDGED  # level, headline and all remarks
+    verdict: Verdict | None = None  # level, headline and all remarks; None if it was not judged
     sigma0: float = 1.0  # of unit weight: the covariances are its square times those of the stated weights
 
     @property
@@ -256,7 +256,7 @@ class Solution:
             ("image points", str(len(self.network.image_points))),
             ("cameras", ", ".join(f"{c.name} ({c.model})" for c in self.estimate.cameras)),
         ]
-        if self.verdict is NOT_JUDGED:
+        if self.verdict is None:
             return rows
         return [*rows, ("verdict", self.verdict.summary)]
 

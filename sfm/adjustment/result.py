@@ -11,10 +11,11 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
+from sfm.distributions import LEVEL
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
-from sfm.remarks.verdict import NOT_JUDGED, Verdict
+from sfm.remarks.verdict import Verdict
 from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
 # Relative rounding of an image coordinate. Computed coordinates are exact to about 1e-15, or to 1e-10 if
@@ -139,12 +140,16 @@ class Adjustment:
     datum_points: BoolArray | None = None  # object points that carry the datum; all if None, (n,)
     unknown_counts: tuple[int, int, int] = (0, 0, 0)  # exterior orientation, interior orientation, points
     # probability that the applied test rejects a good image coordinate; Baarda's usual value without a test
-    test_alpha: float = 0.001
+    test_alpha: float = LEVEL
     start_sigma0: float = float("nan")  # sigma0 at the start values
     remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation
-    verdict: Verdict = NOT_JUDGED  # level, headline and all remarks
+    verdict: Verdict | None = None  # level, headline and all remarks; None if it was not judged
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return what is pickled: not the figures that are computed again when needed."""
+        return {name: value for name, value in self.__dict__.items() if name != "_figures"}
 
     @cached_property
     def solution(self) -> Solution:
@@ -297,7 +302,7 @@ class Adjustment:
             ("image points", f"{int((~self.rejected).sum())} accepted, {int(self.rejected.sum())} rejected"),
             ("sigma0", f"{self.sigma0_px:.4f} px, redundancy {self.redundancy}"),
         ]
-        if self.verdict is not NOT_JUDGED:
+        if self.verdict is not None:
             return [*rows, ("verdict", self.verdict.summary)]
         return rows + [("undetermined", name) for name in self.undetermined]
 

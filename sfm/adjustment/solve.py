@@ -51,7 +51,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
-from sfm.distributions import normal_sf
+from sfm.distributions import LEVEL, normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
@@ -75,7 +75,7 @@ def adjust(
     sigma_px: float = 0.1,
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
-    alpha: float = 0.001,
+    alpha: float = LEVEL,
     rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = 50,

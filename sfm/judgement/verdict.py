@@ -17,11 +17,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm.adjustment.engine.unknowns import NO_START
 from sfm.adjustment.quality.consistency import FAMILY, Consistency, consistency_of
 from sfm.adjustment.quality.statistics import component_tests, more_than_chance, robust_test
-from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
+from sfm.adjustment.quality.variance_components import (
+    IMAGE_POINTS,
+    INTERIOR,
+    VarianceComponents,
+    by_kind,
+)
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import METRES
+from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
 from sfm.distributions import LEVEL, normal_ppf
 from sfm.given_residuals import GivenResiduals, GivenValue
@@ -65,7 +71,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     """Return the result of a survey with its verdict.
 
     Args:
-        result: the remarks of its stages; an earlier verdict is replaced.
+        result: a result with the remarks of its stages; an earlier verdict is replaced.
     """
     a = result.adjustment
     statistics, consistency = statistics_of(a), consistency_of(a)
@@ -74,7 +80,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *photograph_remarks(result),
         *result.stage_remarks,
         *other_solution_remarks(result),
-        *sigma0_remarks(sigma0_of(a), statistics, a),
+        *sigma0_remarks(sigma0_of(a), statistics.kinds, a),
         *residual_remarks(longest_residual(a)),
         *(untested_remarks(a) if result.reject == "none" else ()),
         *ray_remarks(a),
@@ -88,19 +94,33 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     return replace(result, verdict=judge(remarks, _headlines(HEADLINES, a, photographs)))
 
 
-def judge_adjustment(adjustment: Adjustment) -> Adjustment:
-    """Return the adjustment of a network, without a survey around it, with its verdict."""
+def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustment:
+    """Return the adjustment of a network, without a survey around it, with its verdict.
+
+    Photographs and points without start values take no part; such photographs are missing.
+
+    Args:
+        adjustment: adjustment of a network; an earlier verdict is replaced.
+        rejects: whether gross errors were rejected or weighted down.
+    """
     a = adjustment
+    total, oriented = len(a.network.images), int(a.estimate.oriented.sum())
+    missing = total - oriented
     remarks = (
         *convergence_remarks(a),
+        *(
+            (remark("photographs_missing", missing=missing, total=total, share=missing / total),)
+            if missing
+            else ()
+        ),
         *a.remarks,
-        *sigma0_remarks(sigma0_of(a), statistics_of(a), a),
+        *sigma0_remarks(sigma0_of(a), by_kind(a), a),
         *residual_remarks(longest_residual(a)),
-        *(() if a.rejected.any() else untested_remarks(a)),
+        *(() if rejects else untested_remarks(a)),
         *ray_remarks(a),
         *consistency_remarks(consistency_of(a)),
     )
-    photographs = counted(len(a.network.images), "photograph")
+    photographs = f"{oriented} of {counted(total, 'photograph')}"
     return replace(a, verdict=judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs)))
 
 
@@ -111,8 +131,14 @@ def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:
 
 def _headlines(templates: Mapping[Level, str], a: Adjustment, photographs: str) -> dict[Level, str]:
     """Return the headline of each level."""
-    found = f"{photographs}, {counted(len(a.network.points), 'object point')}"
+    found = f"{photographs}, {counted(int(a.estimate.determined.sum()), 'object point')}"
     return {level: text.format(found=found) for level, text in templates.items()}
+
+
+def _took_part(a: Adjustment) -> BoolArray:
+    """Return which image points are of photographs and points with start values, (k,)."""
+    seen = a.network.image_points
+    return np.asarray(a.estimate.oriented[seen.image] & a.estimate.determined[seen.point])
 
 
 def convergence_remarks(a: Adjustment) -> tuple[Remark, ...]:
@@ -120,33 +146,39 @@ def convergence_remarks(a: Adjustment) -> tuple[Remark, ...]:
     remarks = []
     if not a.converged:
         remarks.append(remark("not_converged", iterations=a.iterations))
-    if a.defect != a.expected_defect or a.undetermined:
+    undetermined = [name for name in a.undetermined if not name.endswith(NO_START)]  # the others took no part
+    without_start = len(undetermined) < len(a.undetermined)
+    if undetermined or (a.defect != a.expected_defect and not without_start):
         remarks.append(
             remark(
                 "rank_defect",
                 defect=a.defect,
                 expected=a.expected_defect,
-                undetermined=a.undetermined or None,
+                undetermined=undetermined or None,
             )
         )
-    rejected, total = int(a.rejected.sum()), len(a.rejected)
+    took_part = _took_part(a)
+    rejected, total = int((a.rejected & took_part).sum()), int(took_part.sum())
     share = rejected / max(total, 1)
     remarks += unless_note(remark("image_points_rejected", rejected=rejected, total=total, share=share))
     return tuple(remarks)
 
 
 def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return remarks on photographs that are not in the result, and on copies."""
-    oriented, total = len(result.adjustment.network.images), result.images_total
-    missing = total - oriented
+    """Return remarks on photographs that are not in the result, on unreadable files, and on copies."""
     copies = [one.image for one in result.failed if one.is_copy]
-    found = (remark("copies", copies=copies),) if copies else ()
-    if not missing:
-        return found
-    unreadable = sum(one.reason.kind == UNREADABLE for one in result.failed)  # perhaps no photographs at all
-    share = (missing - unreadable) / max(total - unreadable, 1)
-    missed = remark("photographs_missing", missing=missing, total=total, share=share)
-    return (missed, *_mirrored(result), *found)
+    unreadable = [one.image for one in result.failed if one.reason.kind == UNREADABLE]
+    total = result.images_total - len(unreadable)  # they may be no photographs
+    missing = total - len(result.adjustment.network.images)
+    remarks: list[Remark] = []
+    if missing:
+        remarks.append(remark("photographs_missing", missing=missing, total=total, share=missing / total))
+        remarks += _mirrored(result)
+    if unreadable:
+        remarks.append(remark("photographs_unreadable", photographs=unreadable))
+    if copies:
+        remarks.append(remark("copies", copies=copies))
+    return tuple(remarks)
 
 
 def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
@@ -184,7 +216,7 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     return tuple(found)
 
 
-def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustment) -> tuple[Remark, ...]:
+def sigma0_remarks(sigma0: Sigma0, kinds: VarianceComponents, adjustment: Adjustment) -> tuple[Remark, ...]:
     """Return remarks on a sigma0 far from its a priori value, and on errors shared by neighbours."""
     parts, shared = {}, adjustment.error_correlation
     if shared is not None and shared.common > shared.alone:
@@ -192,7 +224,7 @@ def sigma0_remarks(sigma0: Sigma0, statistics: Statistics, adjustment: Adjustmen
         parts["length"] = (shared.length_px, "px")
     stated = (sigma0.stated_px, "px")
     remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=stated, **parts))]
-    image = component_tests(statistics.kinds, alpha=2 * LEVEL)[0]
+    image = component_tests(kinds, alpha=2 * LEVEL)[0]
     if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
         remarks.append(
             remark("sigma_px_cautious", stated=(sigma0.stated_px, "px"), found=(sigma0.image_points_px, "px"))
@@ -235,7 +267,9 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     """
     network, rejected = a.network, a.rejected
     n, point = len(network.points), network.image_points.point
-    lost, rays = np.bincount(point[rejected], minlength=n), network.rays()
+    took_part = _took_part(a)
+    lost = np.bincount(point[rejected & took_part], minlength=n)
+    rays = np.bincount(point[took_part], minlength=n)
     most = np.flatnonzero(more_than_chance(lost, rays, FAMILY))
     remarks = []
     if len(most):

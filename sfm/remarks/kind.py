@@ -24,8 +24,8 @@ from sfm.conventions import METRES, finer_unit
 from sfm.display import agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
-# A value that is further off than this number of standard deviations is wrong. Noise causes an error of this
-# size once in a million coordinates. If it is the root mean square of all errors, the whole result is wrong.
+# A value that is further off than this number of standard deviations is wrong, and a result with such a
+# coordinate too. Noise causes an error of this size once in a million coordinates.
 WRONG_SIGMAS = 5.0
 DIGITS, MAX_DIGITS = 3, 12  # significant digits of a number; more distinguish it from others of its unit
 # Square of the largest over the smallest length that a survey may state: no number of a survey is larger.

@@ -1,4 +1,4 @@
-"""Reports: the findings of a result (`findings/`), and the pages, tables and figures that show them.
+"""Reports: the findings of a result (`findings`), and the pages, tables and figures that show them.
 
 `findings.findings_of` computes every number once. `pages.PAGES` names, for each type of
 result, the module that declares its page in the terms of `page`. `pages` renders a page as HTML and as plain

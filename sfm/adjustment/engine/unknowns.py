@@ -29,6 +29,7 @@ from sfm.network import Estimate, Mounts, Network
 from sfm.observations.kind import POINT
 from sfm.observations.pose import exterior_jacobian
 
+NO_START = ": no start value"  # behind the names of photographs and points that take no part
 MIN_RAYS = 2  # fewest rays of an object point that nothing else determines
 MIN_POINTS = 3  # fewest points of a pose that nothing else determines
 MOUNT_PARTS = ("X", "Y", "Z", "x rotation", "y rotation", "z rotation")
@@ -398,8 +399,8 @@ def _hold_undetermined(
     n, poses = len(network.points), len(pose_free)
     pose_on = np.bincount(pose_of[estimate.oriented], minlength=poses) > 0
     point_on, pose = estimate.determined.copy(), pose_of[k.image]
-    held = [f"photograph {network.images[i]}: no start value" for i in np.flatnonzero(~pose_on[pose_of])]
-    held += [f"point {network.points[j]}: no start value" for j in np.flatnonzero(~point_on)]
+    held = [f"photograph {network.images[i]}{NO_START}" for i in np.flatnonzero(~pose_on[pose_of])]
+    held += [f"point {network.points[j]}{NO_START}" for j in np.flatnonzero(~point_on)]
     needs_points = pose_free.any(axis=1) & ~pose_known
     needs_rays = point_free.any(axis=1) & ~point_known.all(axis=1)
     defect = int(pose_free[~pose_on].sum() + point_free[~point_on].sum())

@@ -319,6 +319,13 @@ ROWS = (
         "Copy it again, or convert it to JPEG or TIFF.",
     ),
     Kind(
+        "photographs_unreadable",
+        "warning",
+        "{photographs} could not be read.",
+        "damaged files, or files that are no photographs",
+        "Copy {photographs:it|them} again, or remove {photographs:it|them} from the folder.",
+    ),
+    Kind(
         "photographs_not_drawn",
         "note",
         "{photographs} {photographs:has|have} no overlay: {photographs:the file|the files} could not be read "

@@ -65,18 +65,22 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
         needed: image points that determine and check the pose of each photograph without its rig, (m,).
     """
     network = adjustment.network
+    if network.moment is None:
+        return ()
     of_accepted = network.image_points.image[~adjustment.rejected]
     accepted = np.bincount(of_accepted, minlength=len(network.images))
-    few = np.flatnonzero(accepted < needed)
+    together = np.bincount(network.moment)[network.moment] > 1
+    few = np.flatnonzero(together & (accepted < needed))
     if not len(few):
         return ()
+    fewest = few[np.argmax((needed - accepted)[few])]
     names = [network.images[i] for i in few]
     return (
         remark(
             "photographs_posed_by_rig",
             photographs=names,
-            accepted=int(accepted[few].min()),
-            needed=int(needed[few].max()),
+            accepted=int(accepted[fewest]),
+            needed=int(needed[fewest]),
         ),
     )
 

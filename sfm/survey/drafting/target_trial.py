@@ -154,7 +154,7 @@ def try_targets(
                     counts[family] = _repeated_codes([one.code for one in read])
                     if len(counts[family]) > most:
                         most = len(counts[family])
-                        unread = max(int((one.ringed & (one.code < 0)).sum()) for one in read)
+                        unread = sum(int((one.ringed & (one.code < 0)).sum()) for one in read)
                 if number and most >= max(MIN_REPEATED, unread + 1):  # arcs have few numbers
                     break  # fewer rings are left for families of other numbers of cells
     progress.advance("rings")

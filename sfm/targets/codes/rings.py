@@ -331,6 +331,7 @@ class RingReader:
         of = unread[rings.row]
         seen = replace(family, inner=rings.inner, outer=rings.outer)
         again = self._read_with_radii(of, rings.shape, rings.tilt, seen, as_seen=True)
+        found.ringed[of] |= again.ringed
         read = again.code >= 0
         if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
             for part, values in zip(found, again, strict=True):
