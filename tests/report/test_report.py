@@ -311,7 +311,7 @@ def test_page_is_whole_escaped_and_self_contained(result: SurveyResult) -> None:
     ):
         assert question in tags.text
     assert "too small" in tags.text
-    assert "1 of 9 photographs is not in the result." in tags.text
+    assert f"{EVIL}.jpg could not be read." in tags.text
     assert f"{result.adjustment.sigma0_px:.4f}\N{NO-BREAK SPACE}px" in tags.text
 
 
@@ -485,7 +485,10 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
 
 def test_verdict(result: SurveyResult) -> None:
     assert findings_of(result).verdict.level == "fair"
-    assert set(kinds_of(findings_of(result).verdict.remarks)) >= {"scale_bars_missing", "photographs_missing"}
+    assert set(kinds_of(findings_of(result).verdict.remarks)) >= {
+        "scale_bars_missing",
+        "photographs_unreadable",
+    }
     fine = replace(result, images_total=8, failed=(), stage_remarks=())
     assert findings_of(fine).verdict.level == "good"
     assert (
