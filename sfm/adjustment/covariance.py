@@ -284,7 +284,7 @@ def with_error_correlation(adjustment: Adjustment, correlation: ErrorCorrelation
 def _with_covariance(m: Marginal) -> Adjustment:
     """Return the adjustment with the covariance in the datum of the marginal."""
     independent = None if m.correlated is None else m.of_independent_errors()
-    return replace(m.adjustment, covariance=m.covariance(), independent=independent, verdict=None)
+    return replace(m.adjustment, covariance=m.covariance(), independent=independent, judge=None)
 
 
 def determines_cameras(marginal: Marginal) -> bool:

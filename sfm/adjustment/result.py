@@ -145,7 +145,12 @@ class Adjustment:
     remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation
-    verdict: Verdict | None = None  # level, headline and all remarks; None if it was not judged
+    judge: Callable[[Adjustment], Verdict] | None = None  # judges it when its verdict is asked for
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Level, headline and all remarks; None if it was not judged."""
+        return None if self.judge is None else self.judge(self)
 
     def __getstate__(self) -> dict[str, object]:
         """Return what is pickled: not the figures that are computed again when needed."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -44,7 +45,7 @@ from sfm.judgement.checks import (
 )
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark, unless_note
-from sfm.remarks.verdict import Level, judge
+from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
@@ -97,13 +98,19 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
 def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustment:
     """Return the adjustment of a network, without a survey around it, with its verdict.
 
+    The verdict is computed when it is asked for.
+
     Photographs and points without start values take no part; such photographs are missing.
 
     Args:
         adjustment: adjustment of a network; an earlier verdict is replaced.
         rejects: whether gross errors were rejected or weighted down.
     """
-    a = adjustment
+    return replace(adjustment, judge=partial(_verdict_of_adjustment, rejects=rejects))
+
+
+def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
+    """Return the verdict on an adjustment, see `judge_adjustment`."""
     total, oriented = len(a.network.images), int(a.estimate.oriented.sum())
     missing = total - oriented
     remarks = (
@@ -121,7 +128,7 @@ def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustm
         *consistency_remarks(consistency_of(a)),
     )
     photographs = f"{oriented} of {counted(total, 'photograph')}"
-    return replace(a, verdict=judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs)))
+    return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))
 
 
 def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:
