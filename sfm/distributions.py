@@ -82,7 +82,3 @@ def poisson_sf(k: Any, expected: Any) -> Any:
 def binomial_sf(k: Any, n: Any, p: Any) -> Any:
     """Probability of more than k events in n trials with probability p each."""
     return np.where(np.asarray(k) < 0, 1.0, special.bdtrc(np.maximum(k, 0), n, p))[()]
-
-
-# Error, in standard deviations, that a test at LEVEL finds with POWER: 4.13, Baarda (1968).
-NONCENTRALITY = float(normal_ppf(POWER) - normal_ppf(LEVEL / 2))

@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 from sfm import distributions
+from sfm.adjustment.quality.given_values import NONCENTRALITY
 from tests.places import ROOT
 
 LEVELS = (
@@ -55,8 +56,8 @@ def test_f_is_exceeded_with_the_probability_asked_for() -> None:
 def test_an_error_that_is_called_detectable_is_found_with_the_stated_power() -> None:
     """Baarda (1968): 4.13 standard deviations at 0.1 % with 80 %."""
     critical = -distributions.normal_ppf(distributions.LEVEL / 2)
-    assert pytest.approx(4.13, abs=0.005) == distributions.NONCENTRALITY
-    found = distributions.normal_sf(critical - distributions.NONCENTRALITY)
+    assert pytest.approx(4.13, abs=0.005) == NONCENTRALITY
+    found = distributions.normal_sf(critical - NONCENTRALITY)
     assert found == pytest.approx(distributions.POWER, abs=1e-6)
 
 

@@ -22,10 +22,12 @@ from math import comb, log
 
 import numpy as np
 
+from sfm.adjustment.quality.statistics import non_centrality
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, NONCENTRALITY, f_sf
+from sfm.distributions import LEVEL, f_sf
 
 MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
+NONCENTRALITY = non_centrality()  # of an error that a test at LEVEL finds with POWER: 4.13, Baarda (1968)
 MIN_LEAD = log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 # An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
 # not explain are errors of the values. The best-fitting factor may be larger by chance.

@@ -22,10 +22,10 @@ from scipy.linalg import block_diag
 from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.given_points import GivenPoints, judge_points, parameters_of
-from sfm.adjustment.quality.given_values import GivenModel, GivenTest
+from sfm.adjustment.quality.given_values import NONCENTRALITY, GivenModel, GivenTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
-from sfm.distributions import LEVEL, NONCENTRALITY
+from sfm.distributions import LEVEL
 from sfm.errors import GeometryError
 from sfm.network import ExteriorObservations, Network
 from sfm.observations.pose import MountObservations, exterior_jacobian
