@@ -143,20 +143,9 @@ def try_targets(
         tagged, _ = _shared_family([look.tags for look in looks])
     plain = [_measure(path, tagged or "none", store) for path in tried]  # with tags: not measured twice
     readers = list(map(_ring_reader, photographs, plain))
-    counts: dict[str, tuple[int, ...]] = {}
-    for families in (RINGS, NECKLACES):  # necklaces have no parity, and also read rings of other families
-        if all(len(codes) < MIN_REPEATED for codes in counts.values()):
-            cells = families.__getitem__
-            for number, alike in groupby(sorted(families, key=cells), key=cells):
-                most, unread = 0, 0
-                for family in alike:
-                    read = [_read_rings(family, reader) for reader in readers]
-                    counts[family] = _repeated_codes([one.code for one in read])
-                    if len(counts[family]) > most:
-                        most = len(counts[family])
-                        unread = sum(int((one.ringed & (one.code < 0)).sum()) for one in read)
-                if number and most >= max(MIN_REPEATED, unread + 1):  # arcs have few numbers
-                    break  # fewer rings are left for families of other numbers of cells
+    counts = _repeated_rings(readers, RINGS)
+    if all(len(codes) < MIN_REPEATED for codes in counts.values()):
+        counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of other families
     progress.advance("rings")
     best, measured = max(counts, key=lambda family: len(counts[family])), plain
     plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
@@ -253,11 +242,47 @@ def _ring_reader(photograph: AnyArray, targets: Targets) -> RingReader:
     return RingReader(photograph, targets.xy[circle], shape, levels, blur_px=targets.blur[circle])
 
 
-def _read_rings(family: str, reader: RingReader) -> RingCodes:
-    """Return the codes of the circles of a photograph in a family of rings."""
+def _read_rings(family: str, reader: RingReader, *, as_seen: bool = True) -> RingCodes:
+    """Return the codes of the circles of a photograph in a family of rings, see `RingReader.read`."""
     rings = code_family(family)
     assert isinstance(rings, CodeFamily)
-    return reader.read(rings)
+    return reader.read(rings, as_seen=as_seen)
+
+
+def _repeated_rings(readers: Sequence[RingReader], families: Sequence[str]) -> dict[str, tuple[int, ...]]:
+    """Return the repeated codes of families of rings that photographs show.
+
+    Rings are first read with the radii of each family. With the radii that the photographs show they are read
+    in the families with the number of cells that was then found, and in all if there was none: a search in a
+    wrong number of cells finds nothing and takes longest.
+    """
+
+    def read(alike: Sequence[str], *, as_seen: bool) -> tuple[int, int]:
+        """Read families alike in cells; return the most repeated codes, and rings that are then unread."""
+        most, unread = 0, 0
+        for family in alike:
+            rings = [_read_rings(family, reader, as_seen=as_seen) for reader in readers]
+            counts[family] = _repeated_codes([photograph.code for photograph in rings])
+            if len(counts[family]) > most:
+                most = len(counts[family])
+                unread = sum(int((photograph.ringed & (photograph.code < 0)).sum()) for photograph in rings)
+        return most, unread
+
+    counts: dict[str, tuple[int, ...]] = {}
+    cells = {**RINGS, **NECKLACES}.__getitem__
+    likely, groups = list[list[str]](), list[list[str]]()
+    for number, members in groupby(sorted(families, key=cells), key=cells):
+        groups.append(list(members))
+        most, unread = read(groups[-1], as_seen=False)
+        if most >= MIN_REPEATED:
+            likely.append(groups[-1])
+            if number and most > unread:  # arcs have few numbers
+                break  # fewer rings are left for families of other numbers of cells
+    for alike in likely or groups:
+        most, unread = read(alike, as_seen=True)
+        if cells(alike[0]) and most >= max(MIN_REPEATED, unread + 1):
+            break
+    return counts
 
 
 def _ringed(name: str, grey: AnyArray, targets: Targets) -> Ringed:
@@ -379,28 +404,40 @@ def _look(grey: AnyArray) -> _Look:
     height, width = grey.shape
     top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
     whole, middle = reduce_photograph(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
+    reduced, middle = reduce_photograph(grey, FEW_PX)[0], np.ascontiguousarray(middle)
+    many = [find_targets(picture, min_diameter_px=MANY_DIAMETER_PX) for picture in (whole, middle)]
+    circles = max(map(len, many))
+    if any(map(_shows_rings, (whole, middle), many)):  # read faster than tags of a whole photograph
+        return _Look(True, circles)
     for picture in (whole, grey):
         tags = read_dictionaries(picture)
         if any(len(number) >= MIN_CODES for number, _ in tags.values()):
             return _Look(True, 0, tags)
-    circles, less = 0, reduce_photograph(grey, FEW_PX)[0]
-    for picture in (whole, np.ascontiguousarray(middle), less):
-        smallest = FEW_DIAMETER_PX if picture is less else MANY_DIAMETER_PX
-        targets = find_targets(picture, min_diameter_px=smallest)
-        circles = max(circles, len(targets))
-        many = shows_a_lattice(targets.xy) if picture is less else len(targets) >= MIN_TARGETS
-        rings = (*RINGS, *NECKLACES)
-        reader = _ring_reader(picture, targets)
-        if (
-            many
-            or any((_read_rings(family, reader).code >= 0).sum() >= MIN_CODES for family in rings)
-            or any(len(codes) for codes in read_resolved(picture).values())
-        ):
-            return _Look(True, circles, tags)
+    if circles >= MIN_TARGETS:
+        return _Look(True, circles, tags)
+    few = find_targets(reduced, min_diameter_px=FEW_DIAMETER_PX)
+    circles = max(circles, len(few))
+    if (
+        shows_a_lattice(few.xy)
+        or _shows_rings(reduced, few)
+        or any(map(_shows_concentric_tags, (whole, middle, reduced)))
+    ):
+        return _Look(True, circles, tags)
     part = part_of_checkerboard(grey)
     board = part is not None and part[0][0] * part[0][1] >= MANY_DOTS
     searched, _ = reduce_photograph(grey, SEARCHED_PX)
     return _Look(board or len(read_april_tags(searched, KALIBR_TAGS)[0]) >= MIN_CODES, circles, tags, part)
+
+
+def _shows_rings(picture: AnyArray, targets: Targets) -> bool:
+    """Return whether a picture shows codes of a family of rings."""
+    reader = _ring_reader(picture, targets)
+    return any((_read_rings(family, reader).code >= 0).sum() >= MIN_CODES for family in (*RINGS, *NECKLACES))
+
+
+def _shows_concentric_tags(picture: AnyArray) -> bool:
+    """Return whether a picture shows a concentric tag."""
+    return any(len(codes) for codes in read_resolved(picture).values())
 
 
 def _read_spread(

@@ -318,14 +318,14 @@ class RingReader:
         """Radii where rays cross a ring, see `trace_crossings`, (k, ANGLES, 2)."""
         return trace_crossings(self.grey, self.xy, self.shape, self.levels)
 
-    def read(self, family: CodeFamily) -> RingCodes:
-        """Return the codes of a family, see `read_codes`."""
+    def read(self, family: CodeFamily, *, as_seen: bool = True) -> RingCodes:
+        """Return the codes of a family, see `read_codes`; with its own radii only if not `as_seen`."""
         if family.cells == 0:
             return _read_arcs(self.grey, self.xy, self.shape, self.levels, family)
         every = np.arange(len(self.xy))
         found = self._read_with_radii(every, self.shape, np.zeros((len(every), 2)), family, as_seen=False)
         unread = np.flatnonzero(found.code < 0)
-        if not len(unread):
+        if not (as_seen and len(unread)):
             return found
         rings = measure_rings(self.crossings[unread], self.shape[unread], (family.inner, family.outer))
         of = unread[rings.row]
