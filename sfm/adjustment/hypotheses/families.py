@@ -208,13 +208,17 @@ class CameraFamily(OfPhotographs):
 
     def _of_each(self, beta: FloatArray, half: float) -> Parts:
         """Return the largest deviations of photographs from their mean; beta are their parameters, (m, f)."""
-        off = beta - beta.mean(axis=0)
+        off = np.abs(beta - beta.mean(axis=0))  # a column of 1 moves an image point at the edge by 1 px
+        of_c, of_point = (np.isin(self.places, places) for places in ((0,), (1, 2)))
         parts: Parts = {}
-        if 0 in self.places:
-            parts["change"] = (100 * float(np.abs(off[:, self.places.index(0)]).max()) / half, "%")
-        if {1, 2} <= set(self.places):
-            x0, y0 = off[:, self.places.index(1)], off[:, self.places.index(2)]
-            parts["away"] = (float(np.hypot(x0, y0).max()), "px")
+        if off[:, of_c].max(initial=0.0) > SEEN_PX:
+            parts["change"] = (100 * float(off[:, of_c].max()) / half, "%")
+        away = np.linalg.norm(off[:, of_point], axis=1).max()
+        if away > SEEN_PX:
+            parts["away"] = (float(away), "px")
+        distortion = off[:, ~of_c & ~of_point].max(initial=0.0)
+        if distortion > SEEN_PX:
+            parts["distortion"] = (float(distortion), "px")
         return parts
 
 

@@ -28,7 +28,13 @@ from sfm.adjustment.hypotheses.alternatives import (
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
 from sfm.adjustment.hypotheses.moved import MIN_GROUP
-from sfm.adjustment.hypotheses.refit import Refit, refit, shifts_of, unchecked_assumptions
+from sfm.adjustment.hypotheses.refit import (
+    Refit,
+    precision_factor,
+    refit,
+    shifts_of,
+    unchecked_assumptions,
+)
 from sfm.adjustment.hypotheses.score import (
     Reduced,
     log_likelihood_gain,
@@ -196,7 +202,11 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     of = "coordinates" if without is None else f"coordinates without {without}"
     if plain.datum == "control":
         of = "cameras"
-    size = {"shift": found.shift, "wrong": found.shift, "rms": None if of == "cameras" else found.rms}
+    wrong, factor = found.shift, None
+    if one.pattern == "each":  # a random error of each photograph biases nothing, but widens the scatter
+        wrong = factor = precision_factor(plain)
+    rms = None if of == "cameras" else found.rms
+    size = {"shift": found.shift, "wrong": wrong, "rms": rms, "factor": factor}
     return remark(one.kind, of=of, **size, instead=instead or None, **parts)
 
 

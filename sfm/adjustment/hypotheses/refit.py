@@ -220,6 +220,35 @@ def _shifts_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment)
     return float(np.abs(every).max(initial=0.0)), float(np.sqrt((every**2).mean())) if len(every) else 0.0
 
 
+def precision_factor(a: Adjustment) -> float:
+    """Return the factor by which errors common to a photograph exceed the stated precision, RMS.
+
+    It is the standard deviation of a coordinate from the scatter of what the photographs contribute to it,
+    over the stated one; with control, of an interior parameter. Errors that groups of photographs have in
+    common are not in it.
+
+    Args:
+        a: adjustment of image points, alone or with control.
+
+    Raises:
+        numpy.linalg.LinAlgError: the network is not determined.
+
+    Source: Liang and Zeger (1986), Biometrika 73 (covariance from the scatter of groups).
+    """
+    reduced = reduce_adjustment(a, columns_of(a))
+    of_points, of_interior = reduced.contributions()
+    m = reduced.photographs
+    if a.datum == "control":
+        relative = of_interior
+    else:
+        X = a.estimate.points
+        sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+        known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)
+        relative = (without_motions(X, of_points)[known] / sigma[known][:, :, None]).reshape(-1, m)
+    squares = (relative**2).sum(axis=1) * m / (m - 1) * reduced.count / reduced.redundancy
+    return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
+
+
 def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = None) -> tuple[Remark, ...]:
     """Return remarks on assumptions that the tests hardly check, with the shift of an undetected error.
 

@@ -19,6 +19,7 @@ Foerstner and Wrobel (2016), sec. 4.6.4.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -36,6 +37,17 @@ MIN_DETERMINED_SHARE = 1e-5
 ROUNDING = float(np.sqrt(np.finfo(float).eps))  # share of the squares of a single column left by rounding
 SMALLEST_LOG = -600.0  # ln of the smallest probability that `f_sf` is used for
 MAX_TERMS = 10_000  # most terms of the series for smaller probabilities
+
+
+class _Eliminated(NamedTuple):
+    """Whitened columns (k, 2, q) of which the unknowns are eliminated."""
+
+    H: FloatArray  # normal equations, (q, q)
+    g: FloatArray  # right-hand side, (q,)
+    squares: FloatArray  # of the columns before the elimination, (q,)
+    left: FloatArray  # columns after it, (k, 2, q)
+    by_cameras: FloatArray  # shifts of photographs and cameras by the columns, (a, q)
+    by_points: FloatArray  # shifts of object points by the columns, (n, 3, q)
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,8 @@ class Reduced:
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
-        return self._eliminated(D)[:3]
+        found = self._eliminated(D)
+        return found.H, found.g, found.squares
 
     def design_effect(self, D: FloatArray) -> float:
         """Return the factor by which correlated errors of neighbours multiply a gain by chance, at least 1.
@@ -118,10 +131,10 @@ class Reduced:
         """
         if self.correlation is None:
             return 1.0
-        H, _, squares, left, _ = self._eliminated(D)
+        found = self._eliminated(D)
         relative = self.sigma0_px * self.F
-        variance = H + correlated_sum(self.image, self.xy, relative, left, self.correlation)
-        effects = determined_inverse(H, squares) @ variance
+        variance = found.H + correlated_sum(self.image, self.xy, relative, found.left, self.correlation)
+        effects = determined_inverse(found.H, found.squares) @ variance
         first = float(np.trace(effects))
         return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
 
@@ -133,7 +146,7 @@ class Reduced:
         Args:
             D: whitened columns, (k, 2, q).
         """
-        return self._eliminated(D)[4]
+        return self._eliminated(D).by_points
 
     def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
         """Return the contribution of each photograph to the slope along a direction, after a step, (m,).
@@ -142,12 +155,26 @@ class Reduced:
             direction: whitened effect of the direction on the image points, (k, 2).
             step: whitened effect of the step on the image points, (k, 2).
         """
-        left = self._eliminated(np.stack([direction, step], axis=2))[3]
+        left = self._eliminated(np.stack([direction, step], axis=2)).left
         slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
         return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
 
-    def _eliminated(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return H, g, squares, remainder after elimination and shifts of points, for whitened columns."""
+    def contributions(self) -> tuple[FloatArray, FloatArray]:
+        """Return what the residuals of each photograph contribute to points and free interior parameters.
+
+        Returns:
+            Shifts of object points, (n, 3, m), and of the interior parameters over their standard deviations,
+            (i, m). They sum to zero over the photographs.
+        """
+        m = self.photographs
+        D = np.zeros((len(self.used), 2, m))
+        D[np.arange(len(self.used)), :, self.image] = self.v
+        found = self._eliminated(D)
+        sigma = np.sqrt(np.diagonal(self.Sinv)[6 * m :])
+        return found.by_points, found.by_cameras[6 * m :] / sigma[:, None]
+
+    def _eliminated(self, D: FloatArray) -> _Eliminated:
+        """Return whitened columns with the unknowns eliminated."""
         n, q = len(self.L), D.shape[2]
         C = sum_rows(self.point, np.swapaxes(self.B, 1, 2) @ D, n)
         flat_C = (self.L @ C).reshape(3 * n, q)
@@ -162,7 +189,7 @@ class Reduced:
         left = D - self.B @ by_points[self.point]
         left -= self.A[:, :, :6] @ by_cameras[: 6 * m].reshape(m, 6, q)[self.image]
         left -= self.A[:, :, 6:] @ by_cameras[6 * m :]
-        return H, g, squares, left, by_points
+        return _Eliminated(H, g, squares, left, by_cameras, by_points)
 
     def _by_cameras(self, D: FloatArray) -> FloatArray:
         """Return A'D, (a, q)."""

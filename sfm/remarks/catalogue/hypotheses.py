@@ -178,8 +178,9 @@ ROWS = (
     Kind(
         "camera_varies",
         SHIFT,
-        "The camera changes from photograph to photograph[[, c by up to {change}]][[, the principal "
-        f"point by up to {{away}}]]. {SHIFTED}{INSTEAD}",
+        "The camera changes between photographs[[, c by up to {change}]][[, principal point by up to "
+        "{away}]][[, distortion at the edge by up to {distortion}]]. Standard deviations are too small, by a "
+        f"factor of {{factor}} or more. {SHIFTED}{INSTEAD}",
         "autofocus, a stabiliser, a rolling shutter or a loose lens",
         "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
         short="a camera that changes from photograph to photograph",
