@@ -244,13 +244,14 @@ class ObjectFamily(OfPhotographs):
         return largest * without_motions(points, (self._field(points)[0] @ beta)[:, :, None])[:, :, 0]
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return the largest displacement of a point over the size of the object."""
+        """Return the largest displacement of a point; over the size of the object if it changes."""
         field_, size = self._field(a.estimate.points)
+        if one.pattern == "all":
+            return _parts_of_shape(field_ @ beta, unit)
         away = np.linalg.norm(field_ @ beta, axis=1) / size
-        change = 1.0 if one.pattern == "all" else float(np.ptp(one.factor))
         return {
             "photographs": tuple(a.network.images[i] for i in one.photographs),
-            "deformation": (1000 * change * float(np.nanmax(away)), "‰ of the object"),
+            "deformation": (1000 * float(np.ptp(one.factor)) * float(np.nanmax(away)), "‰ of the object"),
         }
 
     def _field(self, points: FloatArray) -> tuple[FloatArray, float]:
@@ -379,6 +380,37 @@ class FormatFamily(Family):
         return {"largest": (float(np.linalg.norm(beta.reshape(-1, 2), axis=1).max()), "px")}
 
 
+@dataclass(frozen=True)
+class GivenShapeFamily(Family):
+    """Given points at other places relative to one another; the parameters are their displacements."""
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark for an alternative of this family."""
+        return "shape_of_control"
+
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
+        seen, place = a.network.image_points, np.full(len(a.network.points), -1)
+        place[one.points] = np.arange(len(one.points))
+        rows = np.flatnonzero(place[seen.point] >= 0)
+        D = np.zeros((len(seen), 2, len(one.points), 3))
+        D[rows, :, place[seen.point[rows]]] = columns.point[rows]
+        return D.reshape(len(seen), 2, -1)
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return the largest displacement, and the standard deviation of coordinates that covers them all."""
+        return _parts_of_shape(beta.reshape(-1, 3), unit)
+
+
+def _parts_of_shape(away: FloatArray, unit: str) -> Parts:
+    """Return the largest displacement of given points (n, 3), and their root mean square."""
+    away = away[np.isfinite(away).all(axis=1)]
+    return {
+        "distance": Quantity(float(np.linalg.norm(away, axis=1).max()), unit),
+        "sigma": Quantity(float(np.sqrt((away**2).mean())), unit),
+    }
+
+
 def format_columns(a: Adjustment) -> FloatArray:
     """Return the columns of a displacement of each cell of the format, (k, 2, 2 cells).
 
@@ -411,6 +443,6 @@ OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     ObjectFamily("bending", BENDING_PLACES),
 )
 HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)
-FORMAT = FormatFamily("format")
+FORMAT, GIVEN_SHAPE = FormatFamily("format"), GivenShapeFamily("given shape")
 MOVED, SHIFTED = PointFamily("moved"), ShiftedFamily("shifted")
 BODY = BodyFamily("body", "plate_moved")

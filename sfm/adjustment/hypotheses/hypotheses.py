@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -26,16 +27,19 @@ from sfm.adjustment.hypotheses.alternatives import (
     is_significant,
 )
 from sfm.adjustment.hypotheses.columns import columns_of
-from sfm.adjustment.hypotheses.families import HELD, Alternative, InteriorFamily
-from sfm.adjustment.hypotheses.moved import MIN_GROUP
+from sfm.adjustment.hypotheses.families import GIVEN_SHAPE, HELD, Alternative, InteriorFamily
+from sfm.adjustment.hypotheses.moved import MIN_GROUP, price_of
 from sfm.adjustment.hypotheses.refit import (
     Refit,
+    log_likelihood,
     precision_factor,
     refit,
     shifts_of,
     unchecked_assumptions,
 )
 from sfm.adjustment.hypotheses.score import (
+    NONE,
+    Gain,
     Reduced,
     log_likelihood_gain,
     reduce_adjustment,
@@ -52,6 +56,7 @@ from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import reported
+from sfm.similarity import fit_similarity
 
 MAX_CAUSES = 2  # number of causes, sought one after another
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those with most evidence in the score test
@@ -60,6 +65,7 @@ MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points 
 # alternatives share them, and only the best is adjusted to the end: 46 of 186 photographs, half a minute.
 MAX_WORK = 3e8
 MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
+MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 MIN_OF_BODY = 3  # points that determine the six motions of a body
 OF_FREE_POINTS = (  # remarks that do not apply to given points
     *("assumptions_untested", "photographs_untested"),
@@ -172,8 +178,7 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
     """Return the cause that given points reveal: another camera in some photographs, or strained control.
 
     Image points alone reveal little about the cameras of a few photographs, or of many photographs of a
-    plane. Bent control is not reported as a cause, because it also absorbs errors common to the targets of a
-    plate. It only takes up what no camera explains.
+    plane.
 
     Args:
         final: finished adjustment in which most points are given.
@@ -182,7 +187,9 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
         numpy.linalg.LinAlgError: the network is not determined.
     """
     cause = _best(final, ())
-    if cause is None or cause.alternative.family.name == "bending" or cause.refit.shift < MIN_NAMED_SIGMAS:
+    if cause is None or (
+        cause.refit.shift < MIN_NAMED_SIGMAS and cause.alternative.kind != "shape_of_control"
+    ):
         return None
     return cause
 
@@ -272,6 +279,8 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
         (one, refit(plain, one, current, before, most=int(MAX_WORK / work)))
         for one in reported("alternatives adjusted", to_try, len(to_try))
     ]
+    if plain.datum == "control":
+        tried += _with_free_shape(plain)
     holding = [
         (
             min(
@@ -302,6 +311,46 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
         )
     )
     return Cause(best, adjusted, near)
+
+
+def _with_free_shape(held: Adjustment) -> list[tuple[Alternative, Refit]]:
+    """Return the alternative that given points have another shape; none if they do not determine one.
+
+    The image points alone state the shape. All its coordinates are parameters.
+
+    held: adjustment with control.
+    """
+    free = adjust_image_points(held.network, held.estimate, held.rejected, held.image_sigma_factor)
+    if free is not None and len(free.rejected) < len(held.rejected):
+        start, factor = held.estimate, held.image_sigma_factor
+        sample = adjust_image_points(held.network, start, held.rejected, factor, datum="control")
+        free, held = (None, held) if sample is None else (free, sample)
+    given = held.network.control.complete
+    if free is None or len(given) < MIN_SHAPE:
+        return []
+    number = {name: j for j, name in enumerate(free.network.points)}
+    X = free.estimate.points[[number[held.network.points[j]] for j in given.point]]
+    try:
+        away = fit_similarity(X, given.xyz).apply(X) - given.xyz
+    except GeometryError:
+        return []
+    beta, q = away.ravel(), away.size - 7
+    gain = log_likelihood(free, q) - log_likelihood(held)
+    seen = np.isin(held.network.image_points.point, given.point)
+    price = price_of(q, int(seen.sum()) // len(given), 0.0)  # each moves its image points only
+    one = Alternative(
+        GIVEN_SHAPE,
+        "all",
+        factor=np.ones(len(held.network.images)),
+        gain=Gain(squares_gained(gain, held.redundancy), q, beta),
+        spread=NONE,
+        log_p=0.0,
+        price=price,
+        search=0.0,
+        evidence=gain - price,
+        points=given.point,
+    )
+    return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
 
 
 def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
@@ -381,7 +430,12 @@ def free_network(final: Adjustment) -> Adjustment | None:
 
 
 def adjust_image_points(
-    network: Network, estimate: Estimate, rejected: BoolArray, factor: FloatArray
+    network: Network,
+    estimate: Estimate,
+    rejected: BoolArray,
+    factor: FloatArray,
+    *,
+    datum: Literal["free", "control"] = "free",
 ) -> Adjustment | None:
     """Adjust the image points of a network alone, or a sample of many; None if they determine no solution.
 
@@ -390,13 +444,17 @@ def adjust_image_points(
         estimate: start values.
         rejected: image points left out at the start, (k,).
         factor: factor on the standard deviations of image points, (k,).
+        datum: "control" to adjust them with the given points.
     """
-    part, start, rows = _sample(without_given(network), estimate)
+    alone = without_given(network)
+    if datum == "control":
+        alone = replace(alone, control=network.control)
+    part, start, rows = _sample(alone, estimate)
     try:
         free = adjust(
             part,
             start,
-            datum=Datum("free"),
+            datum=Datum(datum),
             image_sigma_factor=factor[rows],
             reject="tau",
             alpha=level_of_single(FALSE_ALARM, 2 * int(rows.sum())),

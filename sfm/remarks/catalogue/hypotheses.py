@@ -241,11 +241,12 @@ ROWS = (
     ),
     Kind(
         "shape_of_control",
-        SHIFT,
-        "The shape of the control points differs from the stated one, by up to {deformation}. "
-        f"{SHIFTED}{INSTEAD}",
+        "warning",  # it is known how precise the given points are, and the remedy adjusts with it
+        "The control points, or those of the plate, are not as given: the image points place them up to "
+        f"{{distance}} away, {{sigma}} RMS. {SHIFTED}{INSTEAD}",
         "coordinates of a print or a scan, a plate that is bent, or axes with different scales",
-        "Measure the control points, or state standard deviations that cover the difference.",
+        "Measure the points, or state {sigma} as standard deviation of their coordinates (plate_sigma of a "
+        "plate).",
         short="control points of a different shape",
     ),
     Kind(
