@@ -18,6 +18,7 @@ LAYERS = (
             "sfm.conventions",
             "sfm.errors",
             "sfm.distributions",
+            "sfm.likelihood",
             "sfm.camera",
             "sfm.distortion",
             "sfm.network",

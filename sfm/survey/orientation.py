@@ -23,6 +23,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
+from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
@@ -229,7 +230,10 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
         n_points=len(network.points),
         tolerance_px=float(found.tolerance_px.max()),
     )
-    return replace(found, estimate=replace(found.estimate, points=rays.points), point_failures=())
+    estimate = replace(found.estimate, points=rays.points)
+    limit = found.tolerance_px[network.camera[network.image_points.image]]
+    fits = residual_lengths(network, estimate) <= limit  # the RMS is that of the strongest points
+    return replace(found, estimate=estimate, fits=fits, point_failures=())
 
 
 def _strongest(network: Network) -> BoolArray:
@@ -297,9 +301,9 @@ def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, 
         if found is None:
             raise failure or GeometryError("orientation: none") from None
         return survey, measured, found
-    search = len(wide) * (math.log(2 * len(measured.network.image_points)) / 2 + math.log(1 / ALPHA))
+    price = price_of(len(wide), len(measured.network.image_points), math.log(1 / ALPHA))
     likelihood_of_other, fitting_other = _likelihood(other_measured, other)
-    if found is not None and likelihood_of_other <= likelihood + search:
+    if found is not None and likelihood_of_other <= likelihood + price:
         return survey, measured, found
     taken = tuple(
         remark(
@@ -327,13 +331,10 @@ def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
 
 
 def _likelihood(measured: Measurements, found: Orientation) -> tuple[float, int]:
-    """Return the log-likelihood of all image points, and how many of them fit.
-
-    Points that do not fit have a uniform distribution over the format.
-    """
-    length = residual_lengths(measured.network, found.estimate)
+    """Return the log-likelihood of all image points, and how many of them fit."""
+    network = measured.network
+    length = residual_lengths(network, found.estimate)
     fits = length <= FINAL_TOLERANCE_PX
-    count, fitting = len(length), int(fits.sum())
-    outlier = -math.log(float(np.prod(found.estimate.cameras[0].size_px)))
-    variance = max(float((length[fits] ** 2).sum()) / (2 * max(fitting, 1)), np.finfo(float).tiny)
-    return fitting * (-math.log(2 * math.pi * variance) - 1) + (count - fitting) * outlier, fitting
+    squares = float((length[fits] ** 2).sum())
+    areas = areas_of_photographs(network, found.estimate.cameras)
+    return log_likelihood(squares, fits, areas), int(fits.sum())

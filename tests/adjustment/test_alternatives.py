@@ -195,10 +195,10 @@ def test_without_redundancy_only_rejected_image_points_have_a_likelihood() -> No
     network, truth = make_network(seed_of("no redundancy"), images=2, points=5, free=())
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     assert a.redundancy == 0
-    assert refit.log_likelihood(a) == refit.log_likelihood(a, freed=3) == 0
+    assert refit.log_likelihood_of(a) == refit.log_likelihood_of(a, freed=3) == 0
     rejected = np.arange(len(network.image_points)) < 2
     width, height = truth.cameras[0].size_px
-    found = refit.log_likelihood(replace(a, rejected=rejected))
+    found = refit.log_likelihood_of(replace(a, rejected=rejected))
     assert found == pytest.approx(-2 * np.log(width * height))
 
 

@@ -22,7 +22,7 @@ from sfm.adjustment.hypotheses.hypotheses import (
     judge_alternatives,
     remark_of,
 )
-from sfm.adjustment.hypotheses.refit import Refit, log_likelihood, shifts_of
+from sfm.adjustment.hypotheses.refit import Refit, log_likelihood_of, shifts_of
 from sfm.adjustment.hypotheses.score import NONE, Gain, Spread, log_likelihood_gain
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -193,10 +193,10 @@ def test_the_remark_on_a_deformation(a: Adjustment, family: str, size: int) -> N
 
 def test_the_likelihood_spreads_rejected_points_over_their_photograph(a: Adjustment) -> None:
     plain = -a.redundancy / 2 * (np.log(2 * np.pi * a.sigma0_px**2) + 1)
-    assert log_likelihood(a) == pytest.approx(plain)
+    assert log_likelihood_of(a) == pytest.approx(plain)
     out = np.zeros(len(a.rejected), dtype=bool)
     out[[1, 4, 5]] = True
-    assert log_likelihood(replace(a, rejected=out)) == pytest.approx(plain - 3 * np.log(2000 * 1500))
+    assert log_likelihood_of(replace(a, rejected=out)) == pytest.approx(plain - 3 * np.log(2000 * 1500))
 
 
 def moved_points(a: Adjustment, points: FloatArray) -> Adjustment:

@@ -176,6 +176,29 @@ def test_another_c_is_likelier_for_all_image_points(times: float, better: bool) 
     assert bool(remarks) == better
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize(("lost", "better"), [(0, True), (1, False)])
+def test_misfits_lie_anywhere_in_the_photograph_they_are_in(
+    lost: int, better: bool, order: tuple[int, int]
+) -> None:
+    """Residuals of 30 px are better than misfits in a photograph of 6000 x 4500 px, not of 600 x 450 px.
+
+    The order of the cameras makes no difference.
+    """
+    network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
+    sizes = ((6000, 4500), (600, 450))
+    cameras = [
+        camera_from_values(name, "brown", size, (0.004, 0.004), c_mm=20.0, free=("c",))
+        for name, size in zip("AB", sizes, strict=True)
+    ]
+    of_photograph = np.where(np.arange(IMAGES) < 3, 1 - lost, lost)
+    network = replace(network, camera=np.array(order)[of_photograph])
+    truth = replace(truth, cameras=tuple(cameras[k] for k in order))
+    few = orientation(network, partly(truth, np.arange(IMAGES) < 3))
+    more = replace(orientation(network, truth), rms_px=30.0)
+    assert bool(try_other_principal_distances(network, truth, few, lambda _: more)[1]) == better
+
+
 def test_no_other_c_is_tried_for_mirrored_pictures() -> None:
     network, truth = make_network(seed_of("lost by c"), images=IMAGES, points=POINTS)
     few = orientation(network, partly(truth, np.arange(IMAGES) < 5))

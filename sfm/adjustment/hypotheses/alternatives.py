@@ -43,7 +43,6 @@ from sfm.adjustment.hypotheses.moved import (
     moved_bodies,
     moved_points,
     patterns_of,
-    price_of,
     runs_of,
     score_alternative,
     too_many_cameras,
@@ -65,6 +64,7 @@ from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf, chi2_sf
+from sfm.likelihood import price_of
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 

@@ -53,6 +53,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_sf
 from sfm.kernels.threads import own_threads
+from sfm.likelihood import price_of
 from sfm.network import sum_rows
 from sfm.remarks.remark import Remark, remark
 
@@ -392,19 +393,6 @@ def score_alternative(
         parameters=parameters,
         among=pattern.among,
     )
-
-
-def price_of(rank: int, touched: int, search: float) -> float:
-    """Return the gain of ln likelihood that parameters must reach.
-
-    Args:
-        rank: number of parameters.
-        touched: number of image points that they move.
-        search: ln of the number of patterns from which the alternative was chosen.
-
-    Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90, on the n of the Bayesian information criterion.
-    """
-    return float(rank / 2 * np.log(2 * max(touched, 2)) + search)
 
 
 def patterns_of(m: int) -> Iterator[tuple[str, FloatArray, float]]:

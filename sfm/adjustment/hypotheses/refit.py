@@ -53,6 +53,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.distributions import POWER
 from sfm.errors import GeometryError
+from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity, without_motions
@@ -117,7 +118,7 @@ def refit(
             break
         step = gain.beta
         beta = beta + step
-    gained = log_likelihood(current) - log_likelihood(start)
+    gained = log_likelihood_of(current) - log_likelihood_of(start)
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
     shift, rms = shifts_of(plain, start, current, one, parts[-1])
     return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
@@ -145,7 +146,7 @@ def _stepped(
             found = None
         if found is not None and found.converged:
             found = replace(found, error_correlation=plain.error_correlation)  # the best known one
-            if log_likelihood(found) > log_likelihood(start) - LAST_GAIN:
+            if log_likelihood_of(found) > log_likelihood_of(start) - LAST_GAIN:
                 return found, beta + step, taken
             best = best or (found, beta + step)
         step = step / 2
@@ -157,24 +158,19 @@ def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns)
     return np.concatenate([one.columns(a, columns) for one in every], axis=2)
 
 
-def log_likelihood(a: Adjustment, freed: int = 0) -> float:
-    """Return ln of the likelihood; rejected image points have a uniform distribution over their photograph.
-
-    Without redundancy every network fits, and only the rejected image points count.
+def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:
+    """Return ln of the likelihood of an adjustment; its rejected image points are misfits.
 
     Args:
         a: adjustment.
         freed: number of unknowns that adjustments it is compared with lack; their price is counted elsewhere.
-
-    Source: Rissanen (1978), Automatica 14; Foerstner and Wrobel (2016), sec. 4.7 (mixture of good and bad).
     """
-    sizes = np.array([float(np.prod(camera.size_px)) for camera in a.estimate.cameras])
-    area = sizes[a.network.camera[a.network.image_points.image[a.rejected]]]
-    if a.redundancy <= 0:
-        return float(-np.log(area).sum())
-    redundancy = a.redundancy + freed
-    variance = a.sigma0_px**2 * a.redundancy / redundancy
-    return float(-redundancy / 2 * (np.log(2 * np.pi * variance) + 1) - np.log(area).sum())
+    return log_likelihood(
+        a.sigma0_px**2 * a.redundancy,
+        ~a.rejected,
+        areas_of_photographs(a.network, a.estimate.cameras),
+        redundancy=a.redundancy + freed if a.redundancy > 0 else 0,
+    )
 
 
 def shifts_of(

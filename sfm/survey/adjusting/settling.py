@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.other_solutions import scale_estimate
 from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
@@ -366,7 +365,8 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
     found = [
         one
         for one in (
-            _adjust_with_cameras_held(network, one, datum) for one in _start_candidates(start, ended, datum)
+            _adjust_with_cameras_held(network, one, datum)
+            for one in _start_candidates(network, start, ended, datum)
         )
         if one
     ]
@@ -389,10 +389,18 @@ def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> t
     )
 
 
-def _start_candidates(start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
-    """Yield the ended adjustment scaled to c of the start, and the start; each also reversed in depth."""
-    factor = start.cameras[0].c_px / ended.cameras[0].c_px
-    back = replace(scale_estimate(ended, factor), cameras=start.cameras) if factor > 0 else start
+def _start_candidates(network: Network, start: Estimate, ended: Estimate, datum: Datum) -> Iterator[Estimate]:
+    """Yield the ended adjustment scaled to c of the start, and the start; each also reversed in depth.
+
+    The distance of each photograph is scaled as c of its camera.
+    """
+    pairs = zip(start.cameras, ended.cameras, strict=True)
+    factor = np.array([before.c_px / after.c_px for before, after in pairs])[network.camera]
+    back = start
+    if (factor > 0).all():
+        centre = ended.points.mean(axis=0)
+        position = centre + factor[:, None] * (ended.position - centre)
+        back = replace(ended, cameras=start.cameras, position=position)
     for one in (back, start):
         yield one
         if datum.kind != "control":

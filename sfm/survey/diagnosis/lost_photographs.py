@@ -41,6 +41,7 @@ from sfm.camera import Camera
 from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
@@ -197,15 +198,15 @@ def _find_likelier(
 
     It must orient at least `least` photographs. The search ends once all are oriented with normal residuals.
     """
-    search = math.log(2 * len(network.image_points)) / 2 + math.log(len(C_FACTORS) / ALPHA)
-    likeliest = _log_likelihood(network, estimate, found) + search
+    price = price_of(1, len(network.image_points), math.log(len(C_FACTORS) / ALPHA))
+    likeliest = _likelihood(network, estimate.cameras, found) + price
     best = None
     for start in starts:
         try:
             other = orient(start)
         except GeometryError:
             continue
-        likelihood = _log_likelihood(network, estimate, other)
+        likelihood = _likelihood(network, estimate.cameras, other)
         if _count_oriented(other) >= least and likelihood > likeliest:
             best, likeliest = other, likelihood
             if (
@@ -236,15 +237,12 @@ def _count_unexplained(network: Network, found: Orientation) -> int:
     return sum(network.images[i] not in mirrored for i in lost)
 
 
-def _log_likelihood(network: Network, estimate: Estimate, found: Orientation | None) -> float:
-    """Return the log-likelihood of all image points; misfits have a uniform distribution over the format."""
-    camera = estimate.cameras[0]
-    count, fitting = len(network.image_points), 0 if found is None else int(found.fits.sum())
-    outlier = -math.log(float(np.prod(camera.size_px)))
-    if found is None:
-        return count * outlier
-    sigma = max(found.rms_px, float(np.spacing(float(max(camera.size_px)))))  # no smaller than rounding
-    return fitting * (-math.log(2 * math.pi * sigma**2) - 1) + (count - fitting) * outlier
+def _likelihood(network: Network, cameras: tuple[Camera, ...], found: Orientation | None) -> float:
+    """Return the log-likelihood of all image points; without an orientation all are misfits."""
+    areas = areas_of_photographs(network, cameras)
+    fits = np.zeros(len(areas), dtype=bool) if found is None else found.fits
+    squares = 0.0 if found is None else found.rms_px**2 * 2 * float(fits.sum())
+    return log_likelihood(squares, fits, areas)
 
 
 def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:

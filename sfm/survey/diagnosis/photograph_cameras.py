@@ -25,8 +25,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.hypotheses.hypotheses import adjust_image_points, best_explanation
-from sfm.adjustment.hypotheses.moved import price_of
-from sfm.adjustment.hypotheses.refit import log_likelihood
+from sfm.adjustment.hypotheses.refit import log_likelihood_of
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -34,6 +33,7 @@ from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
+from sfm.likelihood import log_likelihood, price_of
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
@@ -184,7 +184,7 @@ def _explained_otherwise(
         q = sum(not group for group in own_estimate.cameras[index].shared)
         freed += q
         price += price_of(q, int((camera_of_row == index).sum()), search)
-    gained = log_likelihood(separate, freed) - log_likelihood(plain) - price
+    gained = log_likelihood_of(separate, freed) - log_likelihood_of(plain) - price
     return other.evidence > gained
 
 
@@ -209,7 +209,7 @@ def _photograph_camera(
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
     shared = _adjust_alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
-    search = np.log(len(SCALES)) + np.log(len(FREED_ROLES) * len(network.images) / ALPHA)
+    search = float(np.log(len(SCALES) * len(FREED_ROLES) * len(network.images) / ALPHA))
     best, most = None, 0.0
     for roles in FREED_ROLES:
         freed = camera.plays(*roles)
@@ -220,9 +220,8 @@ def _photograph_camera(
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             continue  # not a picture of these points: their names may be wrong
         sigma = max(sigma_px, found.sigma0_px)
-        gain = _log_likelihood(found, camera, n, sigma) - _log_likelihood(shared, camera, n, sigma)
-        q = int(freed.sum())
-        evidence = gain - q / 2 * np.log(2 * n) - search
+        gain = _likelihood(found, camera, n, sigma) - _likelihood(shared, camera, n, sigma)
+        evidence = gain - price_of(int(freed.sum()), n, search)
         if evidence > most:
             best, most = (found, freed), evidence
     if best is None:
@@ -256,14 +255,14 @@ def _adjust_alone(
     return found if found.converged and found.redundancy > 0 else None
 
 
-def _log_likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
-    """Return the log-likelihood of a photograph; misfits have a uniform distribution over its format."""
-    outlier = -np.log(float(np.prod(camera.size_px)))
-    if found is None:
-        return float(count * outlier)
-    squares = np.nan_to_num((found.residuals**2).sum(axis=1), nan=np.inf)
-    normal = -squares / (2 * sigma_px**2) - np.log(2 * np.pi * sigma_px**2)
-    return float(np.maximum(normal, outlier).sum())
+def _likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
+    """Return the log-likelihood of a photograph, with misfits where that is likelier."""
+    areas = np.full(count, float(np.prod(camera.size_px)))
+    squares = np.full(count, np.inf)
+    if found is not None:
+        squares = np.nan_to_num((found.residuals**2).sum(axis=1), nan=np.inf)
+    fits = squares < 2 * sigma_px**2 * np.log(areas / (2 * np.pi * sigma_px**2))
+    return log_likelihood(float(squares[fits].sum()), fits, areas, sigma_px=sigma_px)
 
 
 def _scaled_resection(
