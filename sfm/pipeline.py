@@ -15,15 +15,13 @@ from pathlib import Path
 
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
-from sfm.orientation.incremental.sequence import Orientation
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
-from sfm.survey.adjusting.solution import SolvedSurvey, solve_survey
+from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
 from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.clock_offsets import agree_on_clocks
 from sfm.survey.correspondences import Correspondences, find_correspondences
-from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
 from sfm.survey.inputs.measurements import Measurements, find_photographs, refuse_incomplete_cameras
 from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
@@ -31,7 +29,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
-from sfm.survey.orientation import orient_with_models
+from sfm.survey.orientation import Oriented, orient_with_models
 from sfm.survey.target_network import measure_targets
 from sfm.survey.unfinished import UnfinishedSurveyError, unfinished_survey
 
@@ -60,50 +58,28 @@ def run_survey(
             came.
         KolinearError: the survey cannot be run; the message states the remedy.
     """
-    clock = StageClock(progress)
-    so_far = _SoFar(survey)
-    with _stating_how_far(so_far, clock), own_threads(jobs):
-        so_far.survey, so_far.measured = _measure(survey, images_dir, jobs, store, clock)
-        solution = _solve(so_far, jobs, clock)
-        copies = find_copies(solution.adjustment)
-        if copies:
-            so_far.measured = without_copies(so_far.measured, copies)
-            solution = _solve(so_far, jobs, clock)
-        compared = compare_solution(solution, others, clock, files=so_far.measured.files)
-        survey, measured, start, matched = so_far.stages
-        return assemble_result(survey, measured, start, matched, solution, compared, clock)
+    clock, reached = StageClock(progress), _Reached(survey)
+    with _stating_how_far(reached, clock), own_threads(jobs):
+        reached.survey, reached.measured = survey, measured = _measure(survey, images_dir, jobs, store, clock)
+        with clock.stage("orientation"):
+            oriented = agree_on_turns(agree_on_clocks(orient_with_models(survey, measured)))
+        reached.oriented = oriented
+        with clock.stage("matching"):
+            reached.matched = matched = find_correspondences(oriented, jobs=jobs)
+        with clock.stage("adjustment"):
+            solution = solve_survey(oriented.survey, matched)
+        compared = compare_solution(solution, others, clock, files=measured.files)
+        return assemble_result(oriented, matched, solution, compared, clock)
 
 
 @dataclass
-class _SoFar:
-    """What the stages of a survey returned so far."""
+class _Reached:
+    """What the stages of a survey returned so far, for a survey that stops."""
 
     survey: Survey
     measured: Measurements | None = None
-    start: Orientation | None = None
+    oriented: Oriented | None = None
     matched: Correspondences | None = None
-
-    @property
-    def stages(self) -> tuple[Survey, Measurements, Orientation, Correspondences]:
-        """What every stage before the adjustment returned."""
-        assert self.measured is not None and self.start is not None and self.matched is not None
-        return self.survey, self.measured, self.start, self.matched
-
-
-def _solve(so_far: _SoFar, jobs: int, clock: StageClock) -> SolvedSurvey:
-    """Orient, match and adjust the image points; orientation may change the survey and the image points."""
-    survey, measured = so_far.survey, so_far.measured
-    assert measured is not None
-    so_far.start = so_far.matched = None
-    with clock.stage("orientation"):
-        survey, measured, start = orient_with_models(survey, measured)
-        survey, measured, start = agree_on_clocks(survey, measured, start)
-        measured, start = agree_on_turns(survey, measured, start)
-    so_far.survey, so_far.measured, so_far.start = survey, measured, start
-    with clock.stage("matching"):
-        so_far.matched = find_correspondences(survey, measured, start, jobs=jobs)
-    with clock.stage("adjustment"):
-        return solve_survey(survey, so_far.matched)
 
 
 def _measure(
@@ -135,18 +111,17 @@ def _measure(
 
 
 @contextmanager
-def _stating_how_far(so_far: _SoFar, clock: StageClock) -> Iterator[None]:
+def _stating_how_far(reached: _Reached, clock: StageClock) -> Iterator[None]:
     """Add to every GeometryError the name of the survey and, once it is measured, how far it came."""
     try:
         yield
     except GeometryError as error:
-        name = f"survey {so_far.survey.name}"
-        if so_far.measured is None:
+        name = f"survey {reached.survey.name}"
+        if reached.measured is None:
             raise GeometryError(f"{name}: {error}") from error
-        reached = unfinished_survey(
-            so_far.survey, so_far.measured, so_far.start, so_far.matched, clock, error
-        )
-        before = f"; reached before: {'; '.join(reached.steps)}" if reached.oriented is not None else ""
+        measured = reached.oriented or reached.measured
+        state = unfinished_survey(reached.survey, measured, reached.matched, clock, error)
+        before = f"; reached before: {'; '.join(state.steps)}" if state.oriented is not None else ""
         unfinished = UnfinishedSurveyError(f"{name}: {error}{before}")
-        unfinished.reached = reached
+        unfinished.reached = state
         raise unfinished from error

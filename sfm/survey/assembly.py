@@ -19,16 +19,16 @@ from sfm.conventions import IntArray
 from sfm.errors import KolinearError, MissingLibraryError
 from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
-from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import Remark, remark
 from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
-from sfm.survey.inputs.measurements import Measurements, PhotographList
+from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.orientation import Oriented
 from sfm.targets.codes.plates import points_of_plates
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
@@ -36,15 +36,14 @@ Adjuster = Callable[[Network, Estimate], BackendAdjustment]
 
 
 def assemble_result(
-    survey: Survey,
-    measured: Measurements,
-    start: Orientation,
+    oriented: Oriented,
     matched: Correspondences,
     solution: SolvedSurvey,
     compared: SurveyComparison,
     clock: StageClock,
 ) -> SurveyResult:
     """Return the judged result of a survey; each argument is what the stage of that name returned."""
+    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     adjustment, naming = solution.adjustment, matched.naming
     points = adjustment.network.points
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
@@ -52,14 +51,14 @@ def assemble_result(
     for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
         if name not in is_in:
             reasons.setdefault(name, reason)
-    failed = tuple(FailedImage(*one) for one in reasons.items())
+    failed = (*measured.failed, *(FailedImage(*one) for one in reasons.items()))
     correlations = exterior_correlations(adjustment)
     code = np.full(len(points), -1) if naming is None else naming.codes(adjustment.network)
     result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
-        images_total=len(measured.images) - sum(one.is_copy for one in measured.failed),
-        failed=measured.failed + failed,
+        images_total=len(measured.images) - sum(one.is_copy for one in failed),
+        failed=failed,
         adjustment=adjustment,
         code=code,
         comparison=compared.adjusters,

@@ -21,12 +21,10 @@ from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate, rows_of
-from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.survey import Survey
-from sfm.survey.orientation import orient_survey
+from sfm.survey.orientation import Oriented, orient_survey
 from sfm.survey.target_network import build_network, name_coded
 from sfm.targets.codes.plates import PlateFamily
 
@@ -64,20 +62,17 @@ class _Rig:
         return -int(self.agrees.sum()), self.squares(self.agrees)
 
 
-def agree_on_turns(
-    survey: Survey, measured: Measurements, start: Orientation
-) -> tuple[Measurements, Orientation]:
+def agree_on_turns(oriented: Oriented) -> Oriented:
     """Rename the points of a plate that looks alike turned, so that mounted cameras see the same turn.
 
     Args:
-        survey: states the plate.
-        measured: points of the plate in each photograph, in any turn.
-        start: orientation from these points.
+        oriented: orientation from the points of the plate in each photograph, in any turn.
 
     Returns:
-        The image points, renamed where the turn differed from that of the first camera, and the orientation
-        from them. A remark lists the photographs of pairs whose turn remains uncertain.
+        The orientation from the image points renamed where the turn differed from that of the first camera.
+        A remark lists the photographs of pairs whose turn remains uncertain.
     """
+    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     plate, photographs = survey.family, measured.photographs
     cameras = np.unique(measured.network.camera)
     if (
@@ -86,7 +81,7 @@ def agree_on_turns(
         or photographs is None
         or len(cameras) < 2
     ):
-        return measured, start
+        return oriented
     codes = [found.code for found in photographs.targets]
     uncertain: set[int] = set()
     for camera in cameras[1:].tolist():
@@ -112,11 +107,11 @@ def agree_on_turns(
         start = orient_survey(survey, measured)
     uncertain &= set(np.flatnonzero(start.estimate.oriented).tolist())
     if not uncertain:
-        return measured, start
+        return Oriented(survey, measured, start)
     names = [photographs.names[i] for i in sorted(uncertain)]
     involved = sorted({measured.cameras[measured.network.camera[i]].name for i in uncertain})
     alike = remark("plate_looks_alike_turned", cameras=involved, photographs=names)
-    return measured, replace(start, remarks=(*start.remarks, alike))
+    return Oriented(survey, measured, replace(start, remarks=(*start.remarks, alike)))
 
 
 def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair]]:

@@ -14,48 +14,40 @@ import numpy as np
 from sfm.conventions import IntArray
 from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate
-from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
-from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.survey import Survey
-from sfm.survey.orientation import orient_with_models
+from sfm.survey.orientation import Oriented, orient_with_models
 from sfm.survey.rigs import middle_rotation, with_moments
 
 MIN_MOMENTS = 3  # of two cameras, whose relative rotations are compared
 
 
-def agree_on_clocks(
-    survey: Survey, measured: Measurements, start: Orientation
-) -> tuple[Survey, Measurements, Orientation]:
+def agree_on_clocks(oriented: Oriented) -> Oriented:
     """Take the second offset of clocks that fit at two, if the cameras then agree better on their mounts.
 
     Args:
-        survey: may have the moments by a second offset.
-        measured: image points, with the moment of each photograph.
-        start: orientation with these moments.
+        oriented: its survey may have the moments by a second offset.
 
     Returns:
-        Survey, image points and orientation with the moments that agree, and a remark on the offset if these
-        are the other ones.
+        The orientation with the moments that agree, and a remark on the offset if these are the other ones.
     """
+    survey, measured, estimate = oriented.survey, oriented.measured, oriented.orientation.estimate
     if not survey.other_moments or measured.network.moment is None:
-        return survey, measured, start
+        return oriented
     other = replace(survey, moments=survey.other_moments, other_moments={})
     network = with_moments(other, replace(measured.network, moment=None))
     assert network.moment is not None
-    now, count = rotation_spread(measured.network.camera, measured.network.moment, start.estimate)
-    then, of_other = rotation_spread(network.camera, network.moment, start.estimate)
+    now, count = rotation_spread(measured.network.camera, measured.network.moment, estimate)
+    then, of_other = rotation_spread(network.camera, network.moment, estimate)
     dof = 3 * (min(count, of_other) - 1)
     if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(LEVEL, dof, dof):
-        return survey, measured, start
+        return oriented
     said = tuple(
         remark("clock_differs", **one.subjects, ahead=one.numbers["ahead"])
         if one.kind == "clocks_unsure"
         else one
         for one in measured.remarks
     )
-    measured = replace(measured, network=network, remarks=said)
-    return orient_with_models(other, measured)
+    return orient_with_models(other, replace(measured, network=network, remarks=said))
 
 
 def rotation_spread(camera: IntArray, moment: IntArray, estimate: Estimate) -> tuple[float, int]:

@@ -32,10 +32,11 @@ from sfm.survey.diagnosis.contradicting_codes import (
     remarks_on_contested,
 )
 from sfm.survey.diagnosis.photograph_cameras import find_photograph_cameras
-from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.surface_points import cover_photographs
 from sfm.survey.measuring.tie_points import needed_rays
+from sfm.survey.orientation import Oriented
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # of matching: with the given orientation, with the adjusted one, and once more to confirm
@@ -62,22 +63,19 @@ class Correspondences:
     overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
 
 
-def find_correspondences(
-    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
-) -> Correspondences:
+def find_correspondences(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
     """Return the network with uncoded targets, or with the texture that covers the photographs.
 
     Given image points do not change.
 
     Args:
-        survey: settings of the survey.
-        measured: the named image points, and all targets.
-        start: orientation from the named image points, with its final tolerance.
+        oriented: the named image points and all targets, and the orientation with its final tolerance.
         jobs: number of photographs of texture processed in parallel.
 
     Raises:
         GeometryError: fewer than two photographs keep enough points.
     """
+    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     photographs, naming = measured.photographs, measured.naming
     if photographs is None or naming is None:
         surface = cover_photographs(survey, measured, start, jobs=jobs)

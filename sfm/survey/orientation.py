@@ -11,8 +11,10 @@ field, and with one the object is bent. The image points decide between the two 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -23,6 +25,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
+from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
@@ -261,61 +264,95 @@ def refine(network: Network, estimate: Estimate) -> Estimate:
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
-def orient_with_models(survey: Survey, measured: Measurements) -> tuple[Survey, Measurements, Orientation]:
+@dataclass(frozen=True)
+class Oriented:
+    """An oriented survey, with what its orientation decided."""
+
+    survey: Survey  # with the lens models of its cameras, and the moments of its photographs
+    measured: Measurements  # with start values of these cameras, and the names of the points
+    orientation: Orientation
+
+
+def orient_with_models(survey: Survey, measured: Measurements) -> Oriented:
     """Orient a survey; cameras without a stated model get the fisheye model if it is likelier.
 
     Args:
         survey: may state the models of its cameras.
         measured: all named image points.
 
-    Returns:
-        The survey with the chosen models, the measurements with start values of these cameras, and the
-        orientation.
-
     Raises:
         GeometryError: as in `orient_survey`.
     """
-    found, failure = None, None
-    unsaid = [a for a, one in enumerate(survey.cameras) if not one.states_model]
+    unstated = [a for a, camera in enumerate(survey.cameras) if not camera.states_model]
+
+    def fisheyes(found: Oriented | None) -> Iterator[tuple[Survey, Measurements]]:
+        wide = unstated
+        if found is not None and _likelihood(found)[1] >= MIN_FITTING_FRACTION * len(
+            measured.network.image_points
+        ):
+            wide = [a for a in unstated if _is_wide(found.orientation.estimate.cameras[a])]
+        if wide:
+            known = measured.cameras if found is None else found.orientation.estimate.cameras
+            yield _with_fisheyes(survey, measured, known, wide)
+
+    def orient_model(model: tuple[Survey, Measurements]) -> Oriented:
+        return Oriented(*model, orient_survey(*model))
+
+    failure, found = None, None
     try:
-        found = orient_survey(survey, measured)
+        found = orient_model((survey, measured))
     except GeometryError as error:
         failure = error
-    likelihood, fitting = (-math.inf, 0) if found is None else _likelihood(measured, found)
-    few = fitting < MIN_FITTING_FRACTION * len(measured.network.image_points)
-    wide = [a for a in unsaid if found is None or few or _is_wide(found.estimate.cameras[a])]
-    if not wide:
-        if found is None:
-            raise failure or GeometryError("orientation: none")
-        return survey, measured, found
+    choice = Choice(fisheyes, partial(_evidence_of_fisheyes, survey), partial(_report_fisheyes, survey))
+    found = choose(found, (choice,), orient_model)
+    if found is None:
+        raise failure or GeometryError("orientation: none")
+    return found
+
+
+def _with_fisheyes(
+    survey: Survey, measured: Measurements, known: tuple[Camera, ...], wide: Sequence[int]
+) -> tuple[Survey, Measurements]:
+    """Return the survey and start values in which the wide cameras have the fisheye model with a known c."""
     cameras, starts = list(survey.cameras), list(measured.cameras)
     for a in wide:
         cameras[a] = cameras[a].model_copy(update={"model": FISHEYE})
-        known = starts[a] if found is None else found.estimate.cameras[a]
-        starts[a] = _as_fisheye(known, cameras[a].may_be_free)
-    other_survey = replace(survey, cameras=tuple(cameras))
-    other_measured = replace(measured, cameras=tuple(starts))
-    try:
-        other = orient_survey(other_survey, other_measured)
-    except GeometryError:
-        if found is None:
-            raise failure or GeometryError("orientation: none") from None
-        return survey, measured, found
-    price = price_of(len(wide), len(measured.network.image_points), math.log(1 / ALPHA))
-    likelihood_of_other, fitting_other = _likelihood(other_measured, other)
-    if found is not None and likelihood_of_other <= likelihood + price:
-        return survey, measured, found
+        starts[a] = _as_fisheye(known[a], cameras[a].may_be_free)
+    return replace(survey, cameras=tuple(cameras)), replace(measured, cameras=tuple(starts))
+
+
+def _evidence_of_fisheyes(survey: Survey, before: Oriented | None, after: Oriented | None) -> float:
+    """Return the gain of ln likelihood of all image points minus the price of a parameter per fisheye."""
+    if before is None or after is None:
+        return math.inf
+    count = len(_fisheyes_of(survey, after))
+    price = price_of(count, len(after.measured.network.image_points), math.log(1 / ALPHA))
+    return _likelihood(after)[0] - _likelihood(before)[0] - price
+
+
+def _report_fisheyes(survey: Survey, before: Oriented | None, after: Oriented | None) -> Oriented | None:
+    """Return the orientation with a remark on each camera that has the fisheye model now."""
+    if after is None:
+        return None
     taken = tuple(
         remark(
             "fisheye_taken",
-            camera=cameras[a].name,
-            fitting=fitting_other,
-            total=len(measured.network.image_points),
-            before=fitting,
+            camera=name,
+            fitting=_likelihood(after)[1],
+            total=len(after.measured.network.image_points),
+            before=0 if before is None else _likelihood(before)[1],
         )
-        for a in wide
+        for name in _fisheyes_of(survey, after)
     )
-    return other_survey, other_measured, replace(other, remarks=(*other.remarks, *taken))
+    return replace(
+        after, orientation=replace(after.orientation, remarks=(*after.orientation.remarks, *taken))
+    )
+
+
+def _fisheyes_of(survey: Survey, after: Oriented) -> list[str]:
+    """Return the names of the cameras that have another model than in the survey."""
+    pairs = zip(survey.cameras, after.survey.cameras, strict=True)
+    return [camera.name for usual, camera in pairs if camera.model != usual.model]
 
 
 def _is_wide(camera: Camera) -> bool:
@@ -330,11 +367,10 @@ def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
     return camera_from_values(camera.name, FISHEYE, camera.size_px, pixel, c_mm=c_mm, free=free)
 
 
-def _likelihood(measured: Measurements, found: Orientation) -> tuple[float, int]:
+def _likelihood(found: Oriented) -> tuple[float, int]:
     """Return the log-likelihood of all image points, and how many of them fit."""
-    network = measured.network
-    length = residual_lengths(network, found.estimate)
+    network, estimate = found.measured.network, found.orientation.estimate
+    length = residual_lengths(network, estimate)
     fits = length <= FINAL_TOLERANCE_PX
-    squares = float((length[fits] ** 2).sum())
-    areas = areas_of_photographs(network, found.estimate.cameras)
-    return log_likelihood(squares, fits, areas), int(fits.sum())
+    areas = areas_of_photographs(network, estimate.cameras)
+    return log_likelihood(float((length[fits] ** 2).sum()), fits, areas), int(fits.sum())

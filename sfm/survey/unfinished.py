@@ -11,7 +11,7 @@ from sfm.conventions import BoolArray
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Network
-from sfm.orientation.incremental.sequence import NotOrientedError, Orientation
+from sfm.orientation.incremental.sequence import NotOrientedError
 from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, PhotographTargets, StageTime
 from sfm.runtime.progress import StageClock
@@ -19,6 +19,7 @@ from sfm.survey.assembly import settings_by_table
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.orientation import Oriented
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,7 @@ class UnfinishedSurveyError(GeometryError):
 
 def unfinished_survey(
     survey: Survey,
-    measured: Measurements,
-    start: Orientation | None,
+    reached: Measurements | Oriented,
     matched: Correspondences | None,
     clock: StageClock,
     error: GeometryError,
@@ -76,12 +76,15 @@ def unfinished_survey(
 
     Args:
         survey: settings and given data.
-        measured: the measured image points.
-        start: their orientation; None if that stage was not reached.
+        reached: the measured image points, or their orientation if that stage was reached.
         matched: all image points; None if that stage was not reached.
         clock: times of the stages.
         error: why the last stage cannot go on.
     """
+    if isinstance(reached, Oriented):
+        survey, measured, start = reached.survey, reached.measured, reached.orientation
+    else:
+        measured, start = reached, None
     network, estimate = measured.network, None if start is None else start.estimate
     overlays = measured.overlays
     if matched is not None:

@@ -21,7 +21,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.network import Estimate, Network, rows_of
 from sfm.report.phrases import describe_neighbours, significant
-from sfm.survey.adjusting.solution import solve_survey
+from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.surveys import survey_of

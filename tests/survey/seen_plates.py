@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sfm.camera import camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.pipeline import _SoFar, _solve
+from sfm.pipeline import run_survey
 from sfm.result import SurveyResult
-from sfm.runtime.progress import SILENT, StageClock
-from sfm.survey.assembly import ALONE, assemble_result, compare_solution
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded
@@ -140,8 +139,6 @@ def run_plates(
         build_network(survey, photographs, naming), (start,), names, min_rays(naming),
         files=PhotographList(names, paths, of_camera, Path(".")), photographs=photographs, naming=naming,
     )  # fmt: skip
-    clock = StageClock(SILENT)
-    so_far = _SoFar(survey, measured)
-    solution = _solve(so_far, 1, clock)
-    compared = compare_solution(solution, ALONE, clock, files=None)
-    return assemble_result(*so_far.stages, solution, compared, clock)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm.pipeline._measure", lambda *_: (survey, measured))
+        return run_survey(survey)

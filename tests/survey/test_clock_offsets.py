@@ -49,7 +49,8 @@ def test_the_offset_at_which_cameras_keep_their_mounts_is_taken(wrong: bool, tmp
     measured = replace(
         measured, network=with_moments(survey, replace(measured.network, moment=None)), remarks=(unsure,)
     )
-    found, agreed, start = agree_on_clocks(survey, measured, orient_with_models(survey, measured)[2])
+    oriented = agree_on_clocks(orient_with_models(survey, measured))
+    found, agreed, start = oriented.survey, oriented.measured, oriented.orientation
     assert found.moments == right
     assert kinds_of(agreed.remarks) == (("clock_differs",) if wrong else ("clocks_unsure",))
     assert agreed.network.moment is not None and start.estimate.mounts is not None

@@ -23,7 +23,6 @@ from sfm.survey.inputs.checks.copies import (
     without_copies,
 )
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.targets import OtherSizes, separate_sizes
 from sfm.targets.codes.tags import tag_family, tag_modules
@@ -238,8 +237,6 @@ def test_photographs_whose_errors_correlate(rho: float) -> None:
 def test_photographs_of_one_place_are_named_as_such() -> None:
     """A fixed camera and a fixed board: what is seen differs by far less than residuals."""
     network, truth = make_network(seed_of("still"), images=3, points=60, noise_px=0.1)
-    measured = measurements_from_observations(survey_of(network, truth))
-    copies = {"image 2": ("image 1", 0.99), "image 3": ("image 1", 0.98)}
-    assert len(without_copies(measured, {"image 2": copies["image 2"]}).network.images) == 2
+    assert without_copies(network, truth, ["image 2"])[1].oriented.tolist() == [True, False, True]
     with pytest.raises(GeometryError, match="2 of 3 photographs show"):
-        without_copies(measured, copies)
+        without_copies(network, truth, ["image 2", "image 3"])

@@ -208,7 +208,8 @@ def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Mea
     names = tuple(f"{i}.png" for i in range(6))
     network = Network(names, np.zeros(6, dtype=np.int64), tuple(map(str, range(150))), seen)
     cameras = start_cameras(survey.cameras, "room")
-    return orient_with_models(survey, Measurements(network, cameras, names, np.full(150, 3)))
+    found = orient_with_models(survey, Measurements(network, cameras, names, np.full(150, 3)))
+    return found.survey, found.measured, found.orientation
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.orientation import orient_survey
+from sfm.survey.orientation import Oriented, orient_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded, plate_bars
 from sfm.targets.codes import boards
 from sfm.targets.codes.plates import PlateFamily, group_plates
@@ -321,7 +321,8 @@ def measured_pairs(
         build_network(survey, photographs, naming), tuple(cameras), tuple(every), min_rays(naming),
         files=PhotographList(tuple(every), paths, camera, folder), photographs=photographs, naming=naming,
     )  # fmt: skip
-    found, start = agree_on_turns(survey, measured, orient_survey(survey, measured))
+    oriented = agree_on_turns(Oriented(survey, measured, orient_survey(survey, measured)))
+    found, start = oriented.measured, oriented.orientation
     return found, start, photographs
 
 

@@ -14,7 +14,8 @@ from sfm.network import Estimate, Network
 from sfm.remarks.remark import of_kind, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting import solution
-from sfm.survey.adjusting.solution import OF_CAMERAS, SolvedSurvey, solve_survey
+from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
+from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey

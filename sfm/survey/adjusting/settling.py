@@ -31,6 +31,7 @@ from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM, chi2_isf
 from sfm.errors import GeometryError
+from sfm.judgement.choices import Choice, choose
 from sfm.network import Estimate, Network
 from sfm.observations.kind import is_observed
 from sfm.orientation.image_rays import ray_angles
@@ -152,7 +153,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
             adjustment, held = _readjust_until_converged(task, part, start, adjustment)
             iterations += adjustment.iterations
         estimate = merge_estimate(adjustment.estimate, images, points)
-        accepted = _accepted_image_points(network, adjustment, images, points)
+        accepted = accepted_image_points(network, adjustment, images, points)
         if wrong is None:  # once only: errors of windows are not quite normal, each round would find more
             wrong = np.zeros(len(points), dtype=bool)
             if task.survey.tie_points is not None and task.survey.reject != "none":
@@ -179,24 +180,30 @@ def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
     settled = settle(task, estimate)
     if task.survey.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
         return settled
-    per_photograph = find_photograph_cameras(
-        task.network,
-        settled.whole,
-        settled.accepted,
-        oriented=estimate.oriented,
-        suspected=task.suspected,
-    )
-    if per_photograph is None:
-        return settled
-    one, again = per_photograph.estimate, ~per_photograph.estimate.oriented & ~per_photograph.without
-    start = replace(
-        one,
-        position=np.where(again[:, None], estimate.position, one.position),
-        rotation=np.where(again[:, None, None], estimate.rotation, one.rotation),
-        points=np.where(one.determined[:, None], one.points, estimate.points),
-    )
-    found = settle(replace(task, network=per_photograph.network), start)
-    return replace(found, per_photograph=per_photograph, iterations=settled.iterations + found.iterations)
+
+    def settle_changed(changed: PhotographCameras) -> StableAdjustment:
+        values, again = changed.estimate, ~changed.estimate.oriented & ~changed.without
+        start = replace(
+            values,
+            position=np.where(again[:, None], estimate.position, values.position),
+            rotation=np.where(again[:, None, None], estimate.rotation, values.rotation),
+            points=np.where(values.determined[:, None], values.points, estimate.points),
+        )
+        found = settle(replace(task, network=changed.network), start)
+        return replace(found, per_photograph=changed, iterations=settled.iterations + found.iterations)
+
+    def changed_cameras(settled: StableAdjustment) -> Iterator[PhotographCameras]:
+        changed = find_photograph_cameras(
+            task.network,
+            settled.whole,
+            settled.accepted,
+            oriented=estimate.oriented,
+            suspected=task.suspected,
+        )
+        if changed is not None:
+            yield changed
+
+    return choose(settled, (Choice(changed_cameras),), settle_changed)
 
 
 def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: BoolArray) -> Adjustment:
@@ -235,17 +242,26 @@ def _readjust_until_converged(
     nearer = nearer_start(part, start, ended.estimate, datum)
     if nearer is None:
         return ended, ()
-    for held in HELD_ONE_AFTER_ANOTHER[: None if not len(part.interior) else 1]:
-        cameras = tuple(replace(one, free=one.free & ~one.plays(*held)) for one in nearer.cameras)
-        found = _adjust_with_snooping(
-            *(task, part, replace(nearer, cameras=cameras)),
+    held = HELD_ONE_AFTER_ANOTHER[: None if not len(part.interior) else 1]
+
+    def adjust_holding(roles: tuple[Role, ...]) -> Adjustment:
+        cameras = tuple(
+            replace(camera, free=camera.free & ~camera.plays(*roles)) for camera in nearer.cameras
+        )
+        return _adjust_with_snooping(
+            task,
+            part,
+            replace(nearer, cameras=cameras),
             covariance=False,
             method="gauss-newton",
             max_iterations=MANY_ITERATIONS,
         )
-        if found.converged:
-            return found, held_to_converge(nearer.cameras, cameras)
-    return ended, ()
+
+    first_converged = Choice[tuple[Role, ...], Adjustment](
+        lambda _: held, lambda _, found: float(found.converged), suffices=lambda _: True
+    )
+    found = choose(ended, (first_converged,), adjust_holding)
+    return found, () if found is ended else held_to_converge(nearer.cameras, found.estimate.cameras)
 
 
 def _adjust_with_snooping(
@@ -339,10 +355,17 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     return np.asarray(large)
 
 
-def _accepted_image_points(
+def accepted_image_points(
     network: Network, adjustment: Adjustment, images: BoolArray, points: BoolArray
 ) -> BoolArray:
-    """Return which image points of the whole network the adjustment of its part accepted, (k,)."""
+    """Return which image points of the whole network the adjustment of its part accepted, (k,).
+
+    Args:
+        network: the whole network.
+        adjustment: of its part.
+        images: photographs of the part, (m,).
+        points: points of the part, (n,).
+    """
     seen = network.image_points
     part = images[seen.image] & points[seen.point]
     accepted = part.copy()

@@ -22,10 +22,11 @@ from sfm.adjustment.quality.other_solutions import OtherSolution, other_solution
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import base_name
-from sfm.conventions import IntArray
+from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
+from sfm.judgement.choices import Choice, choose
+from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
@@ -37,6 +38,7 @@ from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.settling import (
     StableAdjustment,
     Task,
+    accepted_image_points,
     adjust_finally,
     on_points,
     settle,
@@ -77,20 +79,27 @@ from sfm.survey.placing import (
 from sfm.survey.rigs import hold_mounts, split_blocks
 from sfm.targets.codes.plates import points_of_plates
 
-OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
-# Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
-# reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
-# halves of a video whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
-MAX_FOCUS_CHANGE = 1.03
 PAIR_TOLERANCE = 10.0  # standard deviations within which image points fit another orientation of a pair
 GIVEN_IMAGE_POINTS = 3  # of a photograph with given orientation, which selects one of the four solutions
+
+
+@dataclass(frozen=True)
+class SurveyModel:
+    """What is adjusted."""
+
+    survey: Survey
+    matched: Correspondences
+    varying: frozenset[str] = frozenset()  # names of the cameras with c per photograph, if c is adjusted
+    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs left out of the matched ones, with the reason
 
 
 @dataclass(frozen=True)
 class SolvedSurvey:
     """The final adjustment of a survey, with its tests and everything that was left out."""
 
+    model: SurveyModel
     adjustment: Adjustment
+    accepted: BoolArray  # image points of the matched network that the adjustment accepted, (k,)
     control_check: ControlCheck | None  # None without control, or if the datum is control
     dropped_images: tuple[tuple[str, Remark], ...]  # photographs that lost their points, with the reason
     remarks: tuple[Remark, ...]
@@ -100,55 +109,21 @@ class SolvedSurvey:
     others: tuple[OtherSolution, ...]  # other solutions that the image points allow
 
 
-def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
-    """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
-
-    Points with too few accepted rays and photographs with too few accepted points are removed, and the rest
-    is adjusted again. A free network is placed on the scale bars and the control, if there are any, without a
-    change of shape. If the survey does not state the free parameters, and texture shows that photographs were
-    zoomed, c is adjusted per photograph.
-
-    Args:
-        survey: states the datum, the a priori sigma and observed exterior orientation.
-        matched: all image points, and approximate values of all unknowns.
+def solve_model(model: SurveyModel) -> SolvedSurvey:
+    """Return the solution of a model of a survey.
 
     Raises:
         GeometryError: too little is left to adjust, or the datum is control but no control is seen.
     """
-    found = _solve(survey, matched)
-    varying = _cameras_with_varying_c(survey, found)
-    if varying:
-        report_step("adjusting c of each photograph")
-        with suppress(GeometryError):
-            zoomed = _solve(survey, matched, varying)
-            a, focal = (
-                zoomed.adjustment,
-                [c for _, c, _ in _c_per_photograph(varying, zoomed.adjustment.estimate)],
-            )
-            differs = any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal)  # more than by focusing
-            if a.converged and not a.undetermined and differs:
-                return zoomed
-    return found
-
-
-def _cameras_with_varying_c(survey: Survey, found: SolvedSurvey) -> frozenset[str]:
-    """Return the cameras whose c, as texture shows, differs among their photographs."""
-    differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
-    if survey.tie_points is None or survey.rigs or not differs:
-        return frozenset()
-    return frozenset(one.name for one in survey.cameras if not one.states_free)
-
-
-def _solve(survey: Survey, matched: Correspondences, varying: frozenset[str] = frozenset()) -> SolvedSurvey:
-    """Return the solution of a survey; the cameras `varying` have c per photograph."""
-    start = _prepare(survey, matched, varying)
+    survey, matched = model.survey, model.matched
+    start = _prepare(survey, matched, model.varying)
     free = _free_network(start)
     mounts, of_mounts = _confirmed_mounts(start, free)
     plates = _points_of_plates(survey, matched.naming, matched.network)
     task, given = _with_confirmed_values(start, free, plates, checks_scale=bool(len(mounts)))
     settled, gross = _settle_with_given(start, free, task, given, mounts)
     report_step("adjusting all observations")
-    found, better = _finish_from_best_start(start, settled)
+    found = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
     if survey.tie_points is not None:
         report_step("estimating the errors that neighbours have in common")
@@ -168,21 +143,19 @@ def _solve(survey: Survey, matched: Correspondences, varying: frozenset[str] = f
     plates = _points_of_plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)
     return SolvedSurvey(
+        model,
         final,
+        accepted_image_points(whole, final, settled.images, settled.points),
         found.check,
-        _dropped_photographs(start, settled),
+        (*model.left_out, *_dropped_photographs(start, settled)),
         (
             *start.remarks,
             *(() if settled.per_photograph is None else settled.per_photograph.remarks),
             *of_mounts,
             *given.remarks,
             *gross,
-            *better,
+            *found.remarks,
             *settled.held,
-            *(
-                remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit))
-                for name, c, unit in _c_per_photograph(varying, final.estimate)
-            ),
             *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
             *posed_by_rigs(final, start.of_its_own[settled.images]),
             *remarks_on_uncalibrated(survey, final.estimate),
@@ -228,6 +201,15 @@ class _Final:
     check: ControlCheck | None
     c_held: tuple[str, ...]  # cameras whose c should be free but had to be held
     others: tuple[OtherSolution, ...]
+    remarks: tuple[Remark, ...] = ()  # on its start values
+
+    @property
+    def log_likelihood(self) -> float:
+        """Ln of the likelihood of all image points, of which those outside the adjustment are misfits."""
+        a, network = self.adjustment, self.settled.task.network
+        areas = areas_of_photographs(network, self.settled.whole.cameras)
+        fits = accepted_image_points(network, a, self.settled.images, self.settled.points)
+        return log_likelihood(a.sigma0_px**2 * a.redundancy, fits, areas, redundancy=a.redundancy)
 
 
 def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
@@ -432,17 +414,36 @@ def _with_mounts(
     return replace(task, network=network), estimate, said
 
 
-def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> tuple[_Final, tuple[Remark, ...]]:
-    """Return the final adjustment, and a remark if it starts from another solution of smaller v'Pv."""
-    found = _finish(start, settled)
-    if not found.others or not found.others[0].converges:
-        return found, ()
-    other = found.others[0]
-    estimate = merge_estimate(other.estimate, settled.images, settled.points)
-    again = _finish(start, settle(settled.task, estimate).after(settled), before=found.adjustment)
-    if not again.adjustment.converged:  # the better start leads to no solution
-        return found, ()
-    return again, (_remark_on_better_start(found.adjustment, other),)
+def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Final:
+    """Return the final adjustment, from another solution if that is likelier."""
+
+    def settle_again(before: _Final) -> _Final:
+        estimate = merge_estimate(before.others[0].estimate, settled.images, settled.points)
+        again = settle(settled.task, estimate).after(settled)
+        return _finish(start, again, before=before.adjustment)
+
+    return choose(_finish(start, settled), (BETTER_START,), settle_again)
+
+
+def _with_better_start(final: _Final) -> Iterator[_Final]:
+    """Yield the final adjustment if it has another solution to start from."""
+    if final.others and final.others[0].converges:
+        yield final
+
+
+def _evidence_of_start(before: _Final, again: _Final) -> float:
+    """Return the gain of ln likelihood of all image points; both have the same parameters."""
+    if not again.adjustment.converged:
+        return -np.inf
+    return again.log_likelihood - before.log_likelihood
+
+
+def _report_start(before: _Final, again: _Final) -> _Final:
+    """Return the final adjustment with the remark on its start."""
+    return replace(again, remarks=(_remark_on_better_start(before.adjustment, before.others[0]),))
+
+
+BETTER_START = Choice(_with_better_start, _evidence_of_start, _report_start)
 
 
 def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:
@@ -556,13 +557,3 @@ def _remark_on_better_start(final: Adjustment, other: OtherSolution) -> Remark:
         better=(other.c, other.unit),
         vPv=other.vPv,
     )
-
-
-def _c_per_photograph(varying: frozenset[str], estimate: Estimate) -> Iterator[tuple[str, list[float], str]]:
-    """Yield the name of each camera with c per photograph, the values of c, and their unit."""
-    for name in sorted(varying):
-        cameras = [
-            one for one in estimate.cameras if one.name != name and base_name(one.name, [name]) == name
-        ]
-        if cameras:
-            yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]

@@ -41,6 +41,7 @@ from sfm.camera import Camera
 from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of
@@ -155,21 +156,41 @@ def try_other_principal_distances(
         The better orientation if the survey adjusts c, else the given one. There are no remarks if no other
         principal distance orients more photographs.
     """
-    m = len(network.images)
+    m, seen = len(network.images), network.image_points
+    if not len(seen):
+        return found, ()
     lost = m if found is None else _count_unexplained(network, found)
-    if not len(network.image_points):
-        return found, ()
     free = all(camera.free[0] for camera in estimate.cameras)
-    if lost < 2:  # a single lost photograph has another cause
-        misfit = found is not None and free and found.rms_px > MISFIT * network.image_points.median_sigma_px
-        held = [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
-        best = _find_likelier(network, estimate, found, held, orient, least=_count_oriented(found))
-        return (found if best is None else _with_original_freedom(best, estimate)), ()
-    others = [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
-    least = _count_oriented(found) + int(MAJORITY_FRACTION * lost) + 1
-    best = _find_likelier(network, estimate, found, others, orient, least=least)
-    if best is None:
+    single = lost < 2  # a single lost photograph has another cause
+    least = _count_oriented(found) + (0 if single else int(MAJORITY_FRACTION * lost) + 1)
+    price = price_of(1, len(seen), math.log(len(C_FACTORS) / ALPHA))
+    limit = MISFIT * seen.median_sigma_px
+
+    def starts(before: Orientation | None) -> list[Estimate]:
+        if not single:
+            return [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
+        misfit = before is not None and free and before.rms_px > limit
+        return [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
+
+    def evidence(before: Orientation | None, after: Orientation | None) -> float:
+        if _count_oriented(after) < least:
+            return -math.inf
+        gain = _likelihood(network, estimate.cameras, after) - _likelihood(network, estimate.cameras, before)
+        return gain - price
+
+    def all_fits(after: Orientation | None) -> bool:
+        return (
+            after is not None
+            and _count_oriented(after) == m
+            and after.rms_px <= MISFIT * seen.median_sigma_px
+        )
+
+    best = choose(found, (Choice(starts, evidence, suffices=all_fits),), orient)
+    if best is None or best is found:
         return found, ()
+    taken = _with_original_freedom(best, estimate) if free else found
+    if single:
+        return taken, ()
     remarks = tuple(
         remark(
             "c_looks_wrong",
@@ -182,39 +203,7 @@ def try_other_principal_distances(
         )
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
-    return (_with_original_freedom(best, estimate) if free else found), remarks
-
-
-def _find_likelier(
-    network: Network,
-    estimate: Estimate,
-    found: Orientation | None,
-    starts: list[Estimate],
-    orient: Callable[[Estimate], Orientation],
-    *,
-    least: int,
-) -> Orientation | None:
-    """Return the likeliest orientation from other start values; None if `found` is likelier.
-
-    It must orient at least `least` photographs. The search ends once all are oriented with normal residuals.
-    """
-    price = price_of(1, len(network.image_points), math.log(len(C_FACTORS) / ALPHA))
-    likeliest = _likelihood(network, estimate.cameras, found) + price
-    best = None
-    for start in starts:
-        try:
-            other = orient(start)
-        except GeometryError:
-            continue
-        likelihood = _likelihood(network, estimate.cameras, other)
-        if _count_oriented(other) >= least and likelihood > likeliest:
-            best, likeliest = other, likelihood
-            if (
-                _count_oriented(best) == len(network.images)
-                and best.rms_px <= MISFIT * network.image_points.median_sigma_px
-            ):
-                break
-    return best
+    return taken, remarks
 
 
 def _count_oriented(found: Orientation | None) -> int:

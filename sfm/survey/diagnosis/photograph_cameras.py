@@ -18,6 +18,7 @@ and Bolles (1981), sec. II (triples of points).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
+from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import log_likelihood, price_of
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
@@ -210,23 +212,32 @@ def _photograph_camera(
     nothing = np.zeros(len(camera.names), dtype=bool)
     shared = _adjust_alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
     search = float(np.log(len(SCALES) * len(FREED_ROLES) * len(network.images) / ALPHA))
-    best, most = None, 0.0
-    for roles in FREED_ROLES:
-        freed = camera.plays(*roles)
-        freed[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = False  # one photograph determines the first
-        found = _adjust_alone(alone, start, points, freed)
+
+    def freed_parameters(_: _Fit) -> Iterator[BoolArray]:
+        for roles in FREED_ROLES:
+            freed = camera.plays(*roles)
+            freed[np.flatnonzero(camera.plays(Role.RADIAL))[1:]] = (
+                False  # one photograph determines the first
+            )
+            yield freed
+
+    def adjust_freed(freed: BoolArray) -> _Fit:
+        return _Fit(_adjust_alone(alone, start, points, freed), freed)
+
+    def evidence(before: _Fit, after: _Fit) -> float:
+        found = after.adjustment
         if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
-            continue
+            return -np.inf
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
-            continue  # not a picture of these points: their names may be wrong
+            return -np.inf  # not a picture of these points: their names may be wrong
         sigma = max(sigma_px, found.sigma0_px)
-        gain = _likelihood(found, camera, n, sigma) - _likelihood(shared, camera, n, sigma)
-        evidence = gain - price_of(int(freed.sum()), n, search)
-        if evidence > most:
-            best, most = (found, freed), evidence
-    if best is None:
+        gain = _likelihood(found, camera, n, sigma) - _likelihood(before.adjustment, camera, n, sigma)
+        return gain - price_of(int(after.freed.sum()), n, search)
+
+    best = choose(_Fit(shared, nothing), (Choice(freed_parameters, evidence),), adjust_freed)
+    if best.adjustment is None or not best.freed.any():
         return None
-    found, freed = best
+    found, freed = best.adjustment, best.freed
     variant = replace(
         camera,
         name=f"{camera.name} {network.images[image]}",
@@ -238,6 +249,14 @@ def _photograph_camera(
         ),
     )
     return variant, found
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """One photograph on known points."""
+
+    adjustment: Adjustment | None  # None without a solution
+    freed: BoolArray  # parameters of its camera that are free
 
 
 def _adjust_alone(

@@ -53,7 +53,7 @@ def with_lens_models(
     files = PhotographList(tuple(names), tuple(folder / name for name in names), np.array(owner), folder)
     try:
         measured = measure_targets(survey, files, store=store, progress=progress)
-        _, _, found = orient_with_models(survey, measured)
+        found = orient_with_models(survey, measured).orientation
     except (GeometryError, PhotographError):  # the survey states the reason
         return cameras
     taken = {

@@ -17,6 +17,7 @@ Source: Koch (1999), Parameter Estimation and Hypothesis Testing in Linear Model
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -27,11 +28,7 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
 from sfm.distributions import LEVEL, f_sf
 from sfm.errors import GeometryError
-from sfm.network import Estimate, rows_of
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import remark
-from sfm.result import FailedImage
-from sfm.survey.inputs.measurements import Measurements
+from sfm.network import Estimate, Network, rows_of
 
 MIN_CORRELATION = 0.7  # of the errors; it is 0.99 for real photographs saved as JPEG of quality 40
 SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are not copies
@@ -80,52 +77,29 @@ def _correlation(adjustment: Adjustment, rows_i: IntArray, rows_j: IntArray) -> 
     return 1 - ratio, float(1 - f_sf(ratio, 2 * len(a), 2 * len(a)))
 
 
-def without_copies(measured: Measurements, copies: dict[str, tuple[str, float]]) -> Measurements:
-    """Return measurements without the copies, which are listed among the failed photographs.
+def without_copies(network: Network, estimate: Estimate, copies: Collection[str]) -> tuple[Network, Estimate]:
+    """Return the network without the image points of copies, and the estimate without their orientation.
 
     Args:
-        measured: measurements of all photographs.
-        copies: result of `find_copies`.
+        network: all image points.
+        estimate: approximate values.
+        copies: names of the copies.
 
     Raises:
-        GeometryError: fewer than two photographs are left.
+        GeometryError: fewer than two oriented photographs are left.
     """
-    network = measured.network
-    keep = np.array([name not in copies for name in network.images], dtype=bool)
-    if keep.sum() < 2:
+    copied = np.isin(network.images, list(copies))
+    count = int(estimate.oriented.sum())
+    if (estimate.oriented & ~copied).sum() < 2:
         raise GeometryError(
-            f"{len(copies)} of {counted(len(keep), 'photograph')} {agreeing(len(copies), 'shows|show')} "
+            f"{len(copies)} of {counted(count, 'photograph')} {agreeing(len(copies), 'shows|show')} "
             f"the object as another one does, down to the errors ({listed(copies)}): copies, or nothing "
             "moved between the exposures; photograph from other directions, or move the plate"
         )
-    every = np.ones(len(network.image_points), dtype=bool)
-    points = np.ones(len(network.points), dtype=bool)
-    empty = np.full((len(keep), 3), np.nan), np.full((len(keep), 3, 3), np.nan)
-    start = Estimate(measured.cameras, *empty, np.full((len(points), 3), np.nan))
-    network, _ = reduce_network(network, start, keep, points, every)
-    photographs, naming = measured.photographs, measured.naming
-    kept = [k for k, kept_one in enumerate(keep) if kept_one]
-    if photographs is not None:
-        photographs = replace(
-            photographs,
-            names=tuple(photographs.names[k] for k in kept),
-            paths=tuple(photographs.paths[k] for k in kept),
-            camera=photographs.camera[kept],
-            targets=tuple(photographs.targets[k] for k in kept),
-            stored=tuple(photographs.stored[k] for k in kept) if photographs.stored else (),
-        )
-    if naming is not None:
-        naming = replace(naming, point=tuple(naming.point[k] for k in kept))
-    failed = tuple(
-        FailedImage(name, remark("copy_of_errors", original=first)) for name, (first, _) in copies.items()
-    )
-    return replace(
-        measured,
-        network=network,
-        photographs=photographs,
-        naming=naming,
-        failed=(*measured.failed, *failed),
-    )
+    position = np.where(copied[:, None], np.nan, estimate.position)
+    rotation = np.where(copied[:, None, None], np.nan, estimate.rotation)
+    points = network.image_points.select(~copied[network.image_points.image])
+    return replace(network, image_points=points), replace(estimate, position=position, rotation=rotation)
 
 
 def same_photographs(image: IntArray, point: IntArray, xy: FloatArray, camera: IntArray) -> dict[int, int]:

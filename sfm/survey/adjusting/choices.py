@@ -1,0 +1,115 @@
+"""Solves a survey, also with other models that its solution suggests, and takes the likeliest.
+
+Copies of photographs are left out, as they are no second observation. If texture shows that photographs were
+zoomed, c is adjusted per photograph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sfm.camera import base_name
+from sfm.judgement.choices import Choice, choose
+from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
+from sfm.remarks.remark import remark
+from sfm.runtime.progress import report_step
+from sfm.survey.adjusting.solution import SolvedSurvey, SurveyModel, solve_model
+from sfm.survey.correspondences import Correspondences
+from sfm.survey.inputs.checks.copies import find_copies, without_copies
+from sfm.survey.inputs.survey import Survey
+
+OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
+# Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
+# reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
+# halves of a video whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
+MAX_FOCUS_CHANGE = 1.03
+
+
+def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
+    """Adjust the network in the datum of the survey, with rejection of outliers and full covariance.
+
+    Points with too few accepted rays and photographs with too few accepted points are removed, and the rest
+    is adjusted again. A free network is placed on the scale bars and the control, if there are any, without a
+    change of shape.
+
+    Args:
+        survey: states the datum, the a priori sigma and observed exterior orientation.
+        matched: all image points, and approximate values of all unknowns.
+
+    Raises:
+        GeometryError: too little is left to adjust, or the datum is control but no control is seen.
+    """
+    return choose(solve_model(SurveyModel(survey, matched)), CHOICES, solve_model)
+
+
+def _models_without_copies(found: SolvedSurvey) -> Iterator[SurveyModel]:
+    """Yield the model without the photographs whose errors are those of another one."""
+    copies = find_copies(found.adjustment)
+    if copies:
+        matched = found.model.matched
+        network, estimate = without_copies(matched.network, matched.estimate, copies)
+        left_out = tuple(
+            (name, remark("copy_of_errors", original=first)) for name, (first, _) in copies.items()
+        )
+        yield replace(
+            found.model,
+            matched=replace(matched, network=network, estimate=estimate),
+            left_out=found.model.left_out + left_out,
+        )
+
+
+def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
+    """Yield the model in which c, as texture shows, differs among the photographs of a camera."""
+    survey = found.model.survey
+    differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
+    varying = frozenset(one.name for one in survey.cameras if not one.states_free)
+    if differs and varying and survey.tie_points is not None and not survey.rigs:
+        report_step("adjusting c of each photograph")
+        yield replace(found.model, varying=varying)
+
+
+def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
+    """Return the gain of ln likelihood minus the price, if c differs by more than focusing changes it."""
+    a = zoomed.adjustment
+    focal = [c for _, c, _ in _c_per_photograph(zoomed)]
+    if not a.converged or a.undetermined or not any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal):
+        return -float("inf")
+    freed = a.unknown_counts[1] - before.adjustment.unknown_counts[1]
+    price = price_of(freed, len(a.rejected) // len(a.network.images))
+    return _log_likelihood(zoomed, freed) - _log_likelihood(before) - price
+
+
+def _log_likelihood(solved: SolvedSurvey, freed: int = 0) -> float:
+    """Return ln of the likelihood of all image points of a survey, see `log_likelihood_of`."""
+    a, matched = solved.adjustment, solved.model.matched
+    areas = areas_of_photographs(matched.network, matched.estimate.cameras)
+    squares = a.sigma0_px**2 * a.redundancy
+    return log_likelihood(squares, solved.accepted, areas, redundancy=a.redundancy + freed)
+
+
+def _report_varying_c(_: SolvedSurvey, zoomed: SolvedSurvey) -> SolvedSurvey:
+    """Return the solution with a remark on each camera with c per photograph."""
+    said = (
+        remark("c_per_photograph", camera=name, least=(min(c), unit), most=(max(c), unit))
+        for name, c, unit in _c_per_photograph(zoomed)
+    )
+    return replace(zoomed, remarks=(*zoomed.remarks, *said))
+
+
+def _c_per_photograph(solved: SolvedSurvey) -> Iterator[tuple[str, list[float], str]]:
+    """Yield the name of each camera with c per photograph, the values of c, and their unit."""
+    for name in sorted(solved.model.varying):
+        cameras = [
+            one
+            for one in solved.adjustment.estimate.cameras
+            if one.name != name and base_name(one.name, [name]) == name
+        ]
+        if cameras:
+            yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]
+
+
+CHOICES = (
+    Choice(_models_without_copies),
+    Choice(_models_with_varying_c, _evidence_of_varying_c, _report_varying_c),
+)
