@@ -53,7 +53,8 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             ("columns", ("columns", "alternatives", "hypotheses")),
             ("families", ("families", "alternatives", "hypotheses")),
             ("hypotheses", ("families", "hypotheses", "alternatives")),
-            ("moved", ("alternatives", "rig_bumps", "rejections", "unchecked_assumptions", "hypotheses")),
+            ("bumps", ("rig_bumps",)),
+            ("moved", ("alternatives", "rejections", "unchecked_assumptions", "hypotheses")),
             ("refit", ("families", "unchecked_assumptions", "alternatives", "hypotheses")),
             ("score", ("alternatives", "hypotheses")),
         )

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.moved import _gain, _scores, bump_remarks, find_bumps
+from sfm.adjustment.hypotheses.bumps import _gain, _scores, bump_remarks, find_bumps
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.network import Estimate, Network

@@ -1,14 +1,8 @@
-"""Alternatives of moved points, bodies and rig cameras, and the patterns of photographs that they affect.
+"""Alternatives of moved points and bodies, and the patterns of photographs that they affect.
 
 Points move between two photographs of the sequence. Sets of points with different vectors are built in the
 order of their single gains. Sets that shift by one vector are found by two-means clustering. Bodies are
 given.
-
-`find_bumps` tests whether the cameras of a rig kept their mounts, by a separate pose of each photograph. E
-are the derivatives of its image points by a separate pose, v the whitened residuals, and R = I - A Q A'. The
-shift is estimated as (E'R E)^-1 E'v, and v'E (E'R E)^-1 E'v / sigma0^2 is chi-square with six degrees of
-freedom. The photographs of all rigs are tested together. The largest shift comes first, and each further one
-is tested jointly with those found before.
 
 A `Pattern` gives each photograph, or run of photographs, a factor on the columns of a family. `Part` computes
 the gain of a pattern, and `score_alternative` the test.
@@ -25,9 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.adjustment.covariance import marginal_of
-from sfm.adjustment.engine.collinearity import residuals
-from sfm.adjustment.engine.correlated import linearise
 from sfm.adjustment.hypotheses.columns import Columns
 from sfm.adjustment.hypotheses.families import (
     BODY,
@@ -48,21 +39,15 @@ from sfm.adjustment.hypotheses.score import (
     log_probability,
     points_by_cameras,
 )
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import chi2_sf
-from sfm.kernels.threads import own_threads
 from sfm.likelihood import price_of
 from sfm.network import sum_rows
-from sfm.remarks.remark import Remark, remark
 
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
 ROUNDS = 20  # iterations of two-means clustering
 STARTS = 8  # photographs or points from which a group is grown
-FALSE_ALARM = 0.01  # probability that a bump is reported for a rig without one
-MIN_REDUNDANCY = 1e-9  # redundancy of a separate pose below which nothing checks it
 MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds
 MAX_SPLITS = 12  # positions in the sequence at which a movement is tested
 MAX_MOVED = 60  # points that are tested together
@@ -218,129 +203,6 @@ def _shifted(
             best = one
     if best is not None:
         yield best
-
-
-@dataclass(frozen=True)
-class Bump:
-    """A photograph whose camera was displaced on the rig."""
-
-    photograph: str
-    camera: str
-    shift: float  # shift of the projection centre, object unit
-    turn: float  # rotation, rad
-    sigmas: float  # square root of chi-square
-    probability: float  # probability of such a shift by chance, in one test
-
-
-def find_bumps(a: Adjustment) -> tuple[Bump, ...]:
-    """Return the photographs whose cameras were displaced on a rig, largest shift first.
-
-    With two photographs at a moment, nothing shows which camera was displaced; the one that is not the
-    reference camera is named.
-
-    Args:
-        a: adjustment with rigs and independent errors.
-    """
-    moment, mounts = a.network.moment, a.estimate.mounts
-    if moment is None or mounts is None or a.error_correlation is not None:
-        return ()
-    together = np.bincount(moment)[moment]
-    mounted = np.isin(np.arange(len(mounts.rig)), np.flatnonzero(mounts.position.any(axis=1)))
-    tested = np.flatnonzero((together > 1) & (mounted[a.network.camera] | (together > 2)))
-    if not len(tested):
-        return ()
-    with own_threads():
-        s, G = _scores(a, tested)
-    critical = level_of_single(FALSE_ALARM, len(tested))
-    found: list[Bump] = []
-    taken: list[int] = []
-    while len(taken) < len(tested):
-        best, chi2, step = -1, 0.0, np.zeros(6)
-        for k in range(len(tested)):
-            if k in taken or _same_moment(moment, tested, k, taken):
-                continue
-            value, d = _gain(s, G, k, taken)
-            if value > chi2:
-                best, chi2, step = k, value, d
-        probability = float(chi2_sf(chi2 / a.sigma0**2, 6))
-        if best < 0 or probability >= critical:
-            break
-        i = int(tested[best])
-        found.append(
-            Bump(
-                a.network.images[i],
-                a.estimate.cameras[a.network.camera[i]].name,
-                float(np.linalg.norm(step[:3])),
-                float(np.linalg.norm(step[3:])),
-                float(np.sqrt(chi2) / a.sigma0),
-                probability,
-            )
-        )
-        taken.append(best)
-    return tuple(found)
-
-
-def bump_remarks(a: Adjustment, unit: str) -> tuple[Remark, ...]:
-    """Return the remark on cameras that were displaced on a rig; empty if there are none.
-
-    Args:
-        a: adjustment.
-        unit: unit of its coordinates.
-    """
-    found = find_bumps(a)
-    if not found:
-        return ()
-    cameras = {one.camera for one in found}
-    theirs = [k for k, camera in enumerate(a.estimate.cameras) if camera.name in cameras]
-    most = 2 * len(found) >= int(np.isin(a.network.camera, theirs).sum())
-    return (
-        remark(
-            "rig_contradicted" if most else "rig_bumped",
-            photographs=[one.photograph for one in found],
-            cameras=list(dict.fromkeys(one.camera for one in found)),
-            distance=(max(one.shift for one in found), unit),
-            angle=(float(np.degrees(max(one.turn for one in found))), "deg"),
-            shift=max(one.sigmas for one in found),
-        ),
-    )
-
-
-def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:
-    """Return whether all other photographs of the same moment already have a separate pose."""
-    taken_with = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
-    return taken_with + 2 > int((moment == moment[tested[k]]).sum())
-
-
-def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return E'v (t, 6) and E'R E (t, 6, t, 6) of the tested photographs."""
-    m = marginal_of(a, cross=False)
-    o, weight = m.layout.observations, np.ascontiguousarray(a.weights[m.layout.order])
-    linear = linearise(m.optimum, m.layout, weight)
-    v = np.einsum("kab,kb->ka", linear.whitening, residuals(o, m.optimum.state)).ravel()
-    v = np.where(np.repeat(weight > 0, 2), np.nan_to_num(v), 0.0)
-    E = np.zeros((len(v), len(tested), 6))
-    for t, i in enumerate(tested):
-        rows = (2 * np.flatnonzero(o.image == i)[:, None] + np.arange(2)).ravel()
-        columns = 6 * o.pose_of[i] + np.arange(6)
-        E[rows, t] = linear.A[rows][:, columns].toarray()
-    flat = E.reshape(len(v), -1)
-    G = flat.T @ linear.residuals(flat)
-    return (flat.T @ v).reshape(-1, 6), G.reshape(len(tested), 6, len(tested), 6)
-
-
-def _gain(s: FloatArray, G: FloatArray, k: int, taken: list[int]) -> tuple[float, FloatArray]:
-    """Return chi-square and shift (6,) of a separate pose of a photograph, jointly with those taken."""
-    t, M = s[k], G[k][:, k]
-    if taken:
-        across = G[k][:, taken].reshape(6, -1)
-        others = G[taken][:, :, taken].reshape(6 * len(taken), -1)
-        solved = np.linalg.lstsq(others, np.column_stack([across.T, s[taken].ravel()]), rcond=None)[0]
-        M, t = M - across @ solved[:, :6], t - across @ solved[:, 6]
-    scale = np.sqrt(np.maximum(np.diagonal(G[k][:, k]), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-    on = values > MIN_REDUNDANCY
-    part = vectors[:, on].T @ (t / scale)
-    return float((part**2 / values[on]).sum()), -(vectors[:, on] @ (part / values[on])) / scale
 
 
 @dataclass(frozen=True)

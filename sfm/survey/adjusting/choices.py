@@ -1,6 +1,7 @@
 """Solves a survey, also with other models that its solution suggests, and takes the likeliest.
 
-Copies of photographs are left out, as they are no second observation. If texture shows that photographs were
+Copies of photographs are left out, as they are no second observation. Photographs of a rig that lose their
+points, while others of their moment fit, are adjusted free of the rig. If texture shows that photographs were
 zoomed, c is adjusted per photograph.
 """
 
@@ -9,6 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
+from sfm.adjustment.hypotheses.alternatives import ALPHA
+from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.camera import base_name
 from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
@@ -19,6 +24,7 @@ from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
 
+POSE = 6  # parameters of the pose of a photograph
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
 # reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
@@ -69,6 +75,53 @@ def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
         yield replace(found.model, varying=varying)
 
 
+def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
+    """Yield the model in which photographs that lost their points, unlike others of their moment, are free.
+
+    Where all photographs of a moment lost points, the one that lost the smallest share stays.
+    """
+    matched, network = found.model.matched, found.model.matched.network
+    if network.moment is None or matched.estimate.mounts is None:
+        return
+    seen, m = network.image_points, len(network.images)
+    known = np.isin(network.points, found.adjustment.network.points)[seen.point]
+    count = np.bincount(seen.image[known], minlength=m)
+    against = np.bincount(seen.image[known & ~found.accepted], minlength=m)
+    share = against / np.maximum(count, 1)
+    share[~matched.estimate.oriented] = np.inf  # none stays for its sake
+    least = np.full(int(network.moment.max()) + 1, np.inf)
+    np.minimum.at(least, network.moment, share)
+    free = more_than_chance(against, count, ALPHA) & (share > least[network.moment]) & np.isfinite(share)
+    if not free.any():
+        return
+    moment = network.moment.copy()
+    moment[free] = len(least) + np.arange(int(free.sum()))
+    mounts = matched.estimate.mounts
+    paired = np.isin(np.arange(len(mounts.rig)), network.camera[np.bincount(moment)[moment] > 1])
+    mounts = replace(mounts, free=mounts.free & paired[:, None])  # nothing determines the others
+    report_step("adjusting photographs free of their rig")
+    yield replace(
+        found.model,
+        matched=replace(
+            matched,
+            network=replace(network, moment=moment),
+            estimate=replace(matched.estimate, mounts=mounts),
+        ),
+        stated_moment=network.moment,
+    )
+
+
+def _evidence_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
+    """Return the gain of ln likelihood minus the price of a pose for each photograph."""
+    stated, matched = after.model.stated_moment, after.model.matched
+    if stated is None or not after.adjustment.converged or after.adjustment.undetermined:
+        return -float("inf")
+    seen, free = matched.network.image_points, stated != matched.network.moment
+    count = np.bincount(seen.image, minlength=len(free))[free]
+    price = sum(price_of(POSE, int(points)) for points in count)
+    return _log_likelihood(after, POSE * int(free.sum())) - _log_likelihood(before) - price
+
+
 def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
     """Return the gain of ln likelihood minus the price, if c differs by more than focusing changes it."""
     a = zoomed.adjustment
@@ -111,5 +164,6 @@ def _c_per_photograph(solved: SolvedSurvey) -> Iterator[tuple[str, list[float], 
 
 CHOICES = (
     Choice(_models_without_copies),
+    Choice(_models_free_of_rigs, _evidence_of_free_photographs),
     Choice(_models_with_varying_c, _evidence_of_varying_c, _report_varying_c),
 )

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.hypotheses.alternatives import explain_rejections
+from sfm.adjustment.hypotheses.bumps import bump_remarks
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
-from sfm.adjustment.hypotheses.moved import bump_remarks
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
@@ -91,6 +91,9 @@ class SurveyModel:
     matched: Correspondences
     varying: frozenset[str] = frozenset()  # names of the cameras with c per photograph, if c is adjusted
     left_out: tuple[tuple[str, Remark], ...] = ()  # photographs left out of the matched ones, with the reason
+    # moments that the survey states, (m,); photographs with others in the network are free of their rig; None
+    # if none is free
+    stated_moment: IntArray | None = None
 
 
 @dataclass(frozen=True)
@@ -139,6 +142,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     # Natural texture has very many points; only those that had approximate values are worth a line.
     listed = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
+    stated = None if model.stated_moment is None else model.stated_moment[settled.images]
     report_step("testing the assumptions")
     plates = _points_of_plates(survey, matched.naming, final.network)
     judged = judge_alternatives(final, unit=unit, bodies=plates)
@@ -162,7 +166,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
             *handedness_unchecked(survey, checked=given.checks_handedness),
             *windows_elsewhere(survey, judged.causes),
             *judged.unchecked,
-            *bump_remarks(final, unit),
+            *bump_remarks(final, unit, stated),
             *windows_elsewhere(survey, explain_rejections(final, unit=unit, bodies=plates)),
             *remarks_on_held_c(found.c_held, judged.causes),
         ),
