@@ -13,22 +13,24 @@ import pytest
 
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
+from sfm.camera import project
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.network import Estimate, Mounts, Network
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
-from sfm.remarks.remark import kinds_of
+from sfm.remarks.remark import Remark, kinds_of, of_kind
 from sfm.report.figures.plots import epipolar_figure
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
+from sfm.result import SurveyResult
 from sfm.survey import rigs
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs, planned_mounts
 from tests.findings import findings_of
 from tests.rigs import make_rig
-from tests.synthetic import seed_of
+from tests.synthetic import SIZE_PX, seed_of
 
 RIG = '[[rig]]\nname = "stereo"\ncameras = ["camera 1", "camera 2"]\nmoment = "moment ([0-9]+)"\n'
 
@@ -337,6 +339,89 @@ def test_a_rig_has_other_mounts_in_another_block_of_time(tmp_path: Path) -> None
     write_result(found, tmp_path / "out")
     again = read_result(tmp_path / "out")
     assert again.estimate.mounts is not None and again.estimate.mounts.rig[:2] == (first.name,) * 2
+
+
+REJECTING = '\n[adjust]\nreject = "tau"\n'
+
+
+def bumped(network: Network, truth: Estimate, photographs: list[int], turn: float) -> Network:
+    """Return the network with photographs taken by cameras turned by an angle, deg, and shifted by 1 mm."""
+    seen, rng = network.image_points, seed_of("bump")
+    axis, shift = rng.standard_normal(3), rng.normal(0, 1e-3, 3)
+    R, xy = rotation_from_vector(np.radians(turn) * axis / np.linalg.norm(axis)), seen.xy.copy()
+    for i in photographs:
+        rows, camera = seen.image == i, truth.cameras[network.camera[i]]
+        X, X0, of_camera = truth.points[seen.point[rows]], truth.position[i], truth.rotation[i]
+        moved = project(camera, X0 + of_camera @ shift, of_camera @ R, X)
+        xy[rows] += moved - project(camera, X0, of_camera, X)
+    inside = (np.isfinite(xy) & (xy > 0) & (xy < np.array(SIZE_PX) - 1)).all(axis=1)
+    return replace(network, image_points=replace(seen, xy=xy).select(inside))
+
+
+def judged(folder: Path, network: Network, truth: Estimate) -> SurveyResult:
+    """Return the result of a survey that rejects image points."""
+    names = ", ".join(f'"{camera.name}"' for camera in truth.cameras)
+    rig = re.sub("cameras = .*", f"cameras = [{names}]", RIG) + REJECTING
+    return run_survey(read_survey(written(folder, network, truth, rig)))
+
+
+def of_rigs(result: SurveyResult) -> tuple[Remark, ...]:
+    return of_kind(result.remarks, "rig_bumped", "rig_contradicted")
+
+
+@pytest.mark.parametrize(
+    ("cameras", "turn", "which"),
+    [
+        (2, 0.02, [11, 13, 15]),
+        (2, 0.1, [11, 13, 15]),
+        pytest.param(2, 2.0, [11, 13, 15], marks=pytest.mark.slow),
+        (3, 0.1, [12]),  # the reference camera
+        pytest.param(3, 1.0, [12], marks=pytest.mark.slow),
+        pytest.param(3, 0.1, [17, 20, 23], marks=pytest.mark.slow),
+    ],
+)
+def test_photographs_of_a_bumped_camera_are_free_of_the_rig_and_named(
+    cameras: int, turn: float, which: list[int], tmp_path: Path
+) -> None:
+    """From 0.1 degrees on they lost their image points to the rig, and nothing named them."""
+    network, truth = make_rig(seed_of(f"bumped {cameras}"), cameras=cameras, moments=8, points=35)
+    result = judged(tmp_path, bumped(network, truth, which, turn), truth)
+    (said,) = of_rigs(result)
+    assert said.kind == "rig_bumped"
+    assert sorted(said.names("photographs")) == [network.images[i] for i in which]
+    assert said.number("angle") == pytest.approx(turn, abs=max(0.02, 0.05 * turn))
+    assert result.failed == () and result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
+    assert result.verdict.level == "fair"
+
+
+@pytest.mark.parametrize(
+    ("moments", "kind"), [([2, 5], "rig_bumped"), ([1, 2, 3, 4, 5, 6, 7, 0], "rig_contradicted")]
+)
+def test_photographs_of_other_moments_are_named(moments: list[int], kind: str, tmp_path: Path) -> None:
+    """Two photographs with exchanged names, and a camera whose first photograph is missing."""
+    network, truth = make_rig(seed_of("wrong moments"), moments=8, points=35)
+    names = list(network.images)
+    rows = [2 * k + 1 for k in moments]
+    for row, other in zip(rows, rows[1:] + rows[:1], strict=True):
+        names[row] = network.images[other]
+    result = judged(tmp_path, replace(network, images=tuple(names)), truth)
+    (said,) = of_rigs(result)
+    assert said.kind == kind and len(result.network.images) == 16
+    assert set(said.names("photographs")) <= {network.images[row] for row in rows}
+    assert len(said.names("photographs")) >= len(rows) - 1
+    assert result.verdict.level == ("fair" if kind == "rig_bumped" else "bad")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_photograph_that_kept_its_mount_stays_on_its_rig(share: float, tmp_path: Path) -> None:
+    """Also one of which half of the points are wrong."""
+    network, truth = make_rig(seed_of("kept mounts"), moments=8, points=35)
+    seen, rng = network.image_points, seed_of("gross errors of one photograph")
+    wrong = (seen.image == 5) & (rng.random(len(seen)) < share)
+    xy = seen.xy + np.where(wrong[:, None], rng.normal(0, 30.0, seen.xy.shape), 0.0)
+    result = judged(tmp_path, replace(network, image_points=replace(seen, xy=xy)), truth)
+    assert of_rigs(result) == () and network.moment is not None
+    assert result.network.moment is not None and (result.network.moment == network.moment).all()
 
 
 @pytest.mark.parametrize(

@@ -255,8 +255,9 @@ ROWS = (
         "{photographs:photograph} of {cameras} {photographs:contradicts|contradict} the rig, by up to "
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
         "the camera was moved on its rig, or photographed at another moment while rig or object moved",
-        "Leave {photographs:this photograph|these photographs} out; if the camera stayed at its new place, "
-        "list the photographs before and after it as blocks of the rig.",
+        "If the camera stayed at its new place, list the photographs before and after it as blocks of the "
+        "rig; otherwise correct the {photographs:moment|moments}, or leave {photographs:the photograph|the "
+        "photographs} out.",
         short="a camera that moved on its rig",
     ),
     Kind(

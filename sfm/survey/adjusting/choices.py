@@ -15,9 +15,11 @@ import numpy as np
 from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.camera import base_name
+from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
-from sfm.remarks.remark import remark
+from sfm.network import Mounts
+from sfm.remarks.remark import of_kind, remark
 from sfm.runtime.progress import report_step
 from sfm.survey.adjusting.solution import SolvedSurvey, SurveyModel, solve_model
 from sfm.survey.correspondences import Correspondences
@@ -25,6 +27,7 @@ from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
 
 POSE = 6  # parameters of the pose of a photograph
+OF_RIGS = ("rig_bumped", "rig_contradicted")
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
 # reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
@@ -76,50 +79,72 @@ def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
 
 
 def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
-    """Yield the model in which photographs that lost their points, unlike others of their moment, are free.
+    """Yield models in which photographs that contradict their rig, or lost their points to it, are free.
 
-    Where all photographs of a moment lost points, the one that lost the smallest share stays.
+    Where all photographs of a moment lost points, the one that lost the smallest share stays. The free
+    photographs of a moment keep the mounts among themselves, or each is free. The larger part of a moment
+    counts as that of the rig, and of two photographs that of the reference camera.
     """
-    matched, network = found.model.matched, found.model.matched.network
-    if network.moment is None or matched.estimate.mounts is None:
+    network, estimate = found.model.matched.network, found.model.matched.estimate
+    stated, oriented = network.moment, estimate.oriented
+    if stated is None or estimate.mounts is None:
         return
     seen, m = network.image_points, len(network.images)
     known = np.isin(network.points, found.adjustment.network.points)[seen.point]
     count = np.bincount(seen.image[known], minlength=m)
     against = np.bincount(seen.image[known & ~found.accepted], minlength=m)
-    share = against / np.maximum(count, 1)
-    share[~matched.estimate.oriented] = np.inf  # none stays for its sake
-    least = np.full(int(network.moment.max()) + 1, np.inf)
-    np.minimum.at(least, network.moment, share)
-    free = more_than_chance(against, count, ALPHA) & (share > least[network.moment]) & np.isfinite(share)
+    share = np.where(oriented, against / np.maximum(count, 1), np.inf)
+    least = np.full(int(stated.max()) + 1, np.inf)
+    np.minimum.at(least, stated, share)
+    named = [name for one in of_kind(found.remarks, *OF_RIGS) for name in one.names("photographs")]
+    free = more_than_chance(against, count, ALPHA) & (share > least[stated])
+    free = oriented & (free | np.isin(network.images, named))
     if not free.any():
         return
-    moment = network.moment.copy()
-    moment[free] = len(least) + np.arange(int(free.sum()))
-    mounts = matched.estimate.mounts
-    paired = np.isin(np.arange(len(mounts.rig)), network.camera[np.bincount(moment)[moment] > 1])
-    mounts = replace(mounts, free=mounts.free & paired[:, None])  # nothing determines the others
     report_step("adjusting photographs free of their rig")
-    yield replace(
-        found.model,
-        matched=replace(
-            matched,
-            network=replace(network, moment=moment),
-            estimate=replace(matched.estimate, mounts=mounts),
-        ),
-        stated_moment=network.moment,
+    together = np.where(free, stated + len(least), stated)
+    of_reference = estimate.mounts.at_reference[network.camera]
+    # photographs of each moment, and half of one more with the reference camera
+    size = np.bincount(together, oriented * (1 + of_reference / 2), minlength=2 * len(least))
+    smaller = size[: -len(least)] < size[len(least) :]
+    together = np.where(smaller[stated], (together + len(least)) % (2 * len(least)), together)
+    yield _with_moments(found.model, together)
+    if (np.bincount(together[oriented], minlength=2 * len(least))[len(least) :] > 1).any():
+        yield _with_moments(found.model, np.where(free, len(least) + np.arange(m), stated))
+
+
+def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
+    """Return the model with other moments; cameras without others at any moment are on no rig."""
+    matched = model.matched
+    network, mounts = replace(matched.network, moment=moment), matched.estimate.mounts
+    if mounts is not None:
+        together = np.bincount(moment[matched.estimate.oriented])
+        paired = np.isin(np.arange(len(mounts.rig)), network.camera[together[moment] > 1])
+        mounts = Mounts(
+            np.where(paired[:, None], mounts.position, 0.0),
+            np.where(paired[:, None, None], mounts.rotation, np.eye(3)),
+            mounts.free & paired[:, None],
+            tuple(rig if on else "" for rig, on in zip(mounts.rig, paired, strict=True)),
+        )
+    estimate = replace(matched.estimate, mounts=mounts)
+    return replace(
+        model,
+        matched=replace(matched, network=network, estimate=estimate),
+        stated_moment=matched.network.moment,
     )
 
 
 def _evidence_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
-    """Return the gain of ln likelihood minus the price of a pose for each photograph."""
+    """Return the gain of ln likelihood minus the price of each further pose."""
     stated, matched = after.model.stated_moment, after.model.matched
     if stated is None or not after.adjustment.converged or after.adjustment.undetermined:
         return -float("inf")
-    seen, free = matched.network.image_points, stated != matched.network.moment
-    count = np.bincount(seen.image, minlength=len(free))[free]
-    price = sum(price_of(POSE, int(points)) for points in count)
-    return _log_likelihood(after, POSE * int(free.sum())) - _log_likelihood(before) - price
+    moment, seen = matched.network.moment, matched.network.image_points
+    assert moment is not None
+    count = np.bincount(moment[seen.image], minlength=int(moment.max()) + 1)  # image points
+    further = np.setdiff1d(moment, stated)
+    price = sum(price_of(POSE, int(count[k])) for k in further)
+    return _log_likelihood(after, POSE * len(further)) - _log_likelihood(before) - price
 
 
 def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
