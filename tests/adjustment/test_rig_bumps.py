@@ -56,6 +56,16 @@ def test_two_bumps_are_both_named() -> None:
     assert [one.photograph for one in found] == [network.images[11], network.images[3]]
 
 
+def test_a_rig_that_most_photographs_contradict_while_they_share_its_pose_is_an_error() -> None:
+    """The third camera was at another place at each of eight moments; nothing was freed."""
+    network, truth = scene(4, 3)
+    rng = seed_of("places of a camera")
+    for moment in range(8):
+        network = bumped(network, truth, 3 * moment + 2, rng.normal(0, 0.02, 3))
+    (said,) = bump_remarks(adjust(network, truth, reject="none"), "m")
+    assert said.kind == "rig_contradicted" and said.severity == "error"
+
+
 def test_rigs_that_kept_their_places_are_left_alone() -> None:
     """30 of them at a level of 1 %: two alarms have a chance of 4 %, three of 0.3 %."""
     alarms = sum(bool(find_bumps(adjust(*scene(k, 2), reject="none"))) for k in range(10, 40))

@@ -153,6 +153,7 @@ LIMITS: dict[
     "second_motion": ("share", 0.01, 0.05),
     "key_points_not_measured": ("missing", 0.5, None),
     "targets_blurred": ("blur", 2.5, None),
+    "rig_contradicted": ("bound", 0.0, 1.0),
 }
 
 

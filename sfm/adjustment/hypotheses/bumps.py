@@ -47,6 +47,7 @@ class Bump:
     turn: float  # rotation, rad
     sigmas: float  # square root of chi-square
     probability: float  # probability of such a shift by chance, in one test
+    free: bool  # whether it was adjusted free of the rig
 
 
 def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...]:
@@ -98,11 +99,12 @@ def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tu
             distance=(max(bump.shift for bump in found), unit),
             angle=(float(np.degrees(max(bump.turn for bump in found))), "deg"),
             shift=max(bump.sigmas for bump in found),
+            bound=sum(not bump.free for bump in found),
         ),
     )
 
 
-def _bump(a: Adjustment, i: int, step: FloatArray, chi2: float) -> Bump:
+def _bump(a: Adjustment, i: int, step: FloatArray, chi2: float, *, free: bool) -> Bump:
     """Return the bump of a photograph by a shift and a rotation, (6,), with its chi-square."""
     return Bump(
         a.network.images[i],
@@ -111,6 +113,7 @@ def _bump(a: Adjustment, i: int, step: FloatArray, chi2: float) -> Bump:
         float(np.linalg.norm(step[3:])),
         float(np.sqrt(chi2)),
         float(chi2_sf(chi2, 6)),
+        free,
     )
 
 
@@ -138,7 +141,7 @@ def _of_mounted(a: Adjustment, tested: IntArray, critical: float) -> Iterator[Bu
             value, d = _gain(s, G, k, taken)
             if value > chi2:
                 best, chi2, step = k, value, d
-        bump = _bump(a, int(tested[best]), step, chi2 / a.sigma0**2)
+        bump = _bump(a, int(tested[best]), step, chi2 / a.sigma0**2, free=False)
         if best < 0 or bump.probability >= critical:
             break
         yield bump
@@ -167,7 +170,7 @@ def _of_freed(a: Adjustment, freed: IntArray, stated: IntArray) -> Iterator[Bump
         images = np.array([i, mate, *other])
         d, J = _difference(a, images)
         Q = J @ joint(np.zeros(0, dtype=np.int64), images) @ J.T
-        yield _bump(a, i, d, float(d @ np.linalg.lstsq(Q, d, rcond=None)[0]))
+        yield _bump(a, i, d, float(d @ np.linalg.lstsq(Q, d, rcond=None)[0]), free=True)
 
 
 def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -262,7 +262,7 @@ ROWS = (
     ),
     Kind(
         "rig_contradicted",
-        "error",
+        Grade("bound", error=1),  # photographs that still share the pose of their rig, which bends it
         "Most photographs of {cameras} contradict the rig, by up to {distance} and {angle}, {shift} standard "
         "deviations: {photographs}.",
         "a wrong mount was given, the camera moved to another place during the survey, or the cameras were "
