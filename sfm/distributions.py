@@ -19,6 +19,8 @@ from scipy import special
 FALSE_ALARM = 0.05  # that the tests of one kind, together, report anything in a result without errors
 LEVEL = 0.001  # that one question is answered wrongly although nothing is wrong; Baarda (1968)
 POWER = 0.8  # that an error of the size that is called detectable is found; Baarda (1968)
+MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
+MIN_LEAD = np.log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 
 
 def chi2_sf(x: Any, r: Any) -> Any:

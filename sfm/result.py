@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.quality.correlations import ExteriorCorrelations, OrientationCorrelation
-from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera
@@ -48,6 +47,16 @@ class LeftOutPoint:
     point: str  # name of the point
     image_points: int  # number of its image points
     reason: Remark  # what was found and what was needed
+
+
+@dataclass(frozen=True)
+class GivenTest:
+    """Test of one kind of given values against the free network."""
+
+    what: str  # scale, control points or projection centres
+    statistic: float  # chi-square
+    dof: int
+    probability: float  # of such differences by chance
 
 
 @dataclass(frozen=True)

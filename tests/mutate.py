@@ -68,11 +68,11 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/adjustment/test_minimal_bias.py",
     ),
     **{
-        f"sfm/adjustment/quality/{module}.py": (
-            "tests/adjustment/test_given_model.py",
-            "tests/adjustment/test_given_values.py",
+        f"sfm/judgement/given/{module}.py": (
+            "tests/judgement/test_given_model.py",
+            "tests/judgement/test_given_values.py",
         )
-        for module in ("given_values", "given_points", "given_names")
+        for module in ("values", "points", "names")
     },
     "sfm/adjustment/quality/consistency.py": (
         "tests/report/test_findings.py",
@@ -84,15 +84,15 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     ),
     "sfm/comparison/causes.py": ("tests/comparison/test_causes.py",),
     "sfm/remarks/catalogue": ("tests/remarks",),
-    "sfm/survey/hypotheses/given_scales.py": (
-        "tests/survey/test_given_thresholds.py",
+    "sfm/judgement/given/scales.py": (
+        "tests/judgement/test_given_thresholds.py",
         "tests/survey/test_wrong_scale.py",
         "tests/survey/test_plates.py",
         "tests/survey/test_unchecked.py",
         "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
     ),
-    "sfm/survey/hypotheses/given.py": (
-        "tests/survey/test_given_thresholds.py",
+    "sfm/judgement/given/judge.py": (
+        "tests/judgement/test_given_thresholds.py",
         "tests/survey/test_unchecked.py",
         "tests/survey/test_wrong_scale.py",
         "tests/survey/test_rigs.py",

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from sfm import distributions
-from sfm.adjustment.quality.given_values import NONCENTRALITY
+from sfm.judgement.given.values import NONCENTRALITY
 from tests.places import ROOT
 
 LEVELS = (

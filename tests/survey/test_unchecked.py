@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import GivenPoints
-from sfm.adjustment.quality.given_values import GivenModel
 from sfm.adjustment.solve import adjust
+from sfm.judgement.given.judge import judge_given
+from sfm.judgement.given.points import GivenPoints
+from sfm.judgement.given.scales import remarks_on_unchecked
+from sfm.judgement.given.values import GivenModel
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.similarity import Similarity
-from sfm.survey.hypotheses.given import judge_given
-from sfm.survey.hypotheses.given_scales import remarks_on_unchecked
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar

@@ -45,12 +45,11 @@ from sfm.adjustment.hypotheses.score import (
     reduce_adjustment,
     squares_gained,
 )
-from sfm.adjustment.quality.given_values import MIN_LEAD
 from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM
+from sfm.distributions import FALSE_ALARM, MIN_LEAD
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network

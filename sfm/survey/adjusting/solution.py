@@ -17,7 +17,6 @@ from sfm.adjustment.hypotheses.alternatives import explain_rejections
 from sfm.adjustment.hypotheses.bumps import bump_remarks
 from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
-from sfm.adjustment.quality.given_values import GivenTest
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
@@ -26,13 +25,14 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
+from sfm.judgement.given.judge import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
-from sfm.result import ControlCheck, LeftOutPoint
+from sfm.result import ControlCheck, GivenTest, LeftOutPoint
 from sfm.runtime.progress import report_step
 from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.settling import (
@@ -56,7 +56,6 @@ from sfm.survey.adjusting.solution_remarks import (
 )
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.free_parameters import choose_free_parameters
-from sfm.survey.hypotheses.given import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.measurements import Naming

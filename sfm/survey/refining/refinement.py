@@ -24,6 +24,7 @@ from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
+from sfm.judgement.given.judge import judge_given
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
@@ -31,7 +32,6 @@ from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
 from sfm.survey.correspondences import TOLERANCE_FACTOR
-from sfm.survey.hypotheses.given import judge_given
 from sfm.survey.refining.oriented_windows import (
     ModelTargets,
     OrientedKeyPoints,

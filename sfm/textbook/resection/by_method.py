@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.given_values import MARGIN
 from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.distributions import MARGIN
 from sfm.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import (

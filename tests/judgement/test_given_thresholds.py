@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.adjustment.quality.given_points import GivenPoints
-from sfm.adjustment.quality.given_values import GivenModel, Judgement
 from sfm.conventions import SWELLING
+from sfm.judgement.given import judge as given
+from sfm.judgement.given import scales as given_scales
+from sfm.judgement.given.points import GivenPoints
+from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
-from sfm.survey.hypotheses import given, given_scales
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.findings import findings_of
 from tests.survey import mistyped

@@ -24,11 +24,9 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import non_centrality
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, f_sf
+from sfm.distributions import MARGIN, MIN_LEAD, f_sf
 
-MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
 NONCENTRALITY = non_centrality()  # of an error that a test at LEVEL finds with POWER: 4.13, Baarda (1968)
-MIN_LEAD = log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 # An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
 # not explain are errors of the values. The best-fitting factor may be larger by chance.
 MAX_FACTOR = 10.0
@@ -182,6 +180,7 @@ class GivenModel:
     redundancy: int  # redundancy of the variance factor of the free network
     estimated: bool = False  # whether the standard deviations are unknown and follow from the differences
     extent: float = 0.0  # extent of the given values, for standard deviations that are not stated
+    confirmed: int = 0  # further values that are right, and count among those who agree
 
     @cached_property
     def items(self) -> int:
@@ -277,6 +276,39 @@ class GivenModel:
             item=self.item[kept],
         )
 
+    def beside(self, right: BoolArray) -> GivenModel:
+        """Return the model of the other differences, predicted by the network and by values that are right.
+
+        Args:
+            right: which differences belong to values that are right, (m,).
+
+        Source: Foerstner and Wrobel (2016), sec. 4.2.7 (sequential estimation).
+        """
+        if not right.any():
+            return self
+        c, t = np.flatnonzero(right), np.flatnonzero(~right)
+        S, size = self.network + self.stated, float(np.trace(self.A[c] @ self.A[c].T))
+        unit = float(np.trace(S[np.ix_(c, c)])) / len(c)
+        # covariance along the parameters changes nothing, and makes the covariance of fixed values regular
+        S = S + (unit * len(c) / size if size else 0.0) * self.A @ self.A.T
+        W = np.linalg.inv(S[np.ix_(c, c)] + RANK**1.5 * unit * np.eye(len(c)))
+        d, U = np.linalg.eigh(self.A[c].T @ W @ self.A[c])
+        on = d > RANK * d.max(initial=0.0)  # parameters that the right values determine
+        Q, G = U[:, on] / d[on] @ U[:, on].T, S[np.ix_(t, c)] @ W
+        B = self.A[t] - G @ self.A[c]
+        covariance = S[np.ix_(t, t)] - G @ S[np.ix_(c, t)] + B @ Q @ B.T
+        stated = self.stated[np.ix_(t, t)]
+        _, item = np.unique(self.item[t], return_inverse=True)
+        return replace(
+            self,
+            v=self.v[t] - G @ self.v[c] - B @ Q @ self.A[c].T @ W @ self.v[c],
+            network=(covariance + covariance.T) / 2 - stated,
+            stated=stated,
+            A=B @ U[:, ~on],
+            item=item,
+            confirmed=len(np.unique(self.item[c])),
+        )
+
     def external(self, some: tuple[int, ...] = ()) -> FloatArray:
         """Return the external reliability of each given value, infinite if nothing checks it, (items,).
 
@@ -367,16 +399,6 @@ class Judgement:
     def misfit(self) -> float:
         """Chi-square after accounting for the errors found, plus their cost."""
         return self.statistic + self.score
-
-
-@dataclass(frozen=True)
-class GivenTest:
-    """Test of one kind of given values against the free network."""
-
-    what: str  # scale, control points or projection centres
-    statistic: float  # chi-square
-    dof: int
-    probability: float  # of such differences by chance
 
 
 def judge_values(model: GivenModel, level: float) -> Judgement:
@@ -514,7 +536,7 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
     at_worst = model.at_worst.kept() if model.estimated else None
     out: tuple[int, ...] = ()
     while out == () or not _fits(kept, at_worst, level):
-        if 2 * (len(out) + 1) >= model.items:
+        if 2 * (len(out) + 1) >= model.items + model.confirmed:
             return None
         fall, rank = kept.decreases()
         gain = fall - cost * rank

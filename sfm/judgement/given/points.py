@@ -16,8 +16,10 @@ from math import comb, log
 
 import numpy as np
 
-from sfm.adjustment.quality.given_names import assignments, cost_of_choice, find_renamed
-from sfm.adjustment.quality.given_values import (
+from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
+from sfm.errors import GeometryError
+from sfm.judgement.given.names import assignments, cost_of_choice, find_renamed
+from sfm.judgement.given.values import (
     MARGIN,
     RANK,
     GivenModel,
@@ -26,8 +28,6 @@ from sfm.adjustment.quality.given_values import (
     judge_values,
     misfit_of,
 )
-from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
-from sfm.errors import GeometryError
 from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity, similarity_motions
 
 MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct

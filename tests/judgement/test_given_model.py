@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sfm.adjustment.quality import given_names, given_points, given_values
-from sfm.adjustment.quality.given_points import GivenPoints, judge_points
-from sfm.adjustment.quality.given_values import GivenModel, Judgement, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.judgement.given import names as given_names
+from sfm.judgement.given import points as given_points
+from sfm.judgement.given import values as given_values
+from sfm.judgement.given.points import GivenPoints, judge_points
+from sfm.judgement.given.scales import GivenScale, scale_model, scale_of_length
+from sfm.judgement.given.values import GivenModel, Judgement, judge_values
 from sfm.similarity import Similarity, fit_similarity
-from sfm.survey.hypotheses.given_scales import GivenScale, scale_model, scale_of_length
 from tests.synthetic import seed_of
 
 FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))

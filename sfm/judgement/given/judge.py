@@ -21,17 +21,12 @@ from scipy.linalg import block_diag
 
 from sfm.adjustment.covariance import determines_cameras, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import GivenPoints, judge_points, parameters_of
-from sfm.adjustment.quality.given_values import NONCENTRALITY, GivenModel, GivenTest
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.distributions import LEVEL
 from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, Network
-from sfm.observations.pose import MountObservations, exterior_jacobian
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import Similarity
-from sfm.survey.hypotheses.given_scales import (
+from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
+from sfm.judgement.given.scales import (
     Group,
     Places,
     Task,
@@ -41,6 +36,12 @@ from sfm.survey.hypotheses.given_scales import (
     numbers_of_scale,
     remarks_on_unchecked,
 )
+from sfm.judgement.given.values import NONCENTRALITY, GivenModel
+from sfm.network import ExteriorObservations, Network
+from sfm.observations.pose import MountObservations, exterior_jacobian
+from sfm.remarks.remark import Remark, remark
+from sfm.result import GivenTest
+from sfm.similarity import Similarity
 
 TINY = float(np.finfo(float).tiny)
 MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.quality import given_points, given_values
-from sfm.adjustment.quality.given_points import GivenPoints, judge_points
-from sfm.adjustment.quality.given_values import GivenModel, judge_values
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.distributions import LEVEL
+from sfm.judgement.given import points as given_points
+from sfm.judgement.given import values as given_values
+from sfm.judgement.given.points import GivenPoints, judge_points
+from sfm.judgement.given.scales import scale_model, scale_of_length, scale_of_points
+from sfm.judgement.given.values import GivenModel, judge_values
 from sfm.similarity import Similarity
-from sfm.survey.hypotheses.given_scales import scale_model, scale_of_length, scale_of_points
 from tests.survey.mistyped import BOX, PYRAMID
 from tests.synthetic import seed_of
 

@@ -13,25 +13,25 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.given_points import (
+from sfm.conventions import BoolArray, FloatArray, IntArray, find_unit
+from sfm.distributions import LEVEL, chi2_isf, chi2_sf
+from sfm.judgement.given.points import (
     GivenPoints,
     PlacedPoints,
     centre_and_size,
     excludes_mirror,
     parameters_of,
 )
-from sfm.adjustment.quality.given_values import (
+from sfm.judgement.given.values import (
     UNSTATED_FRACTION,
     GivenModel,
-    GivenTest,
     Judgement,
     judge_values,
 )
-from sfm.conventions import BoolArray, FloatArray, IntArray, find_unit
-from sfm.distributions import LEVEL, chi2_isf, chi2_sf
 from sfm.network import Network, ScaleBars
 from sfm.remarks.kind import WRONG_SIGMAS, significant
 from sfm.remarks.remark import Remark, remark
+from sfm.result import GivenTest
 from sfm.similarity import extended_axes
 
 MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
