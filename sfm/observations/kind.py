@@ -232,11 +232,7 @@ class TableKind(Kind):
         """Return the observations with other standard deviations, of the shape of `sigma`."""
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the observations in other units; some kinds add further mistakes.
-
-        Another unit explains nothing if it changes no value by more than its standard deviation, such as
-        offsets of 0 from a plane; the larger standard deviation alone would then make them agree.
-        """
+        """Return the observations in other units; some kinds add further mistakes."""
         turned = np.array([name in self.angles for name in self.components])
         units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048} if not turned.all() else {}
         found: dict[str, Self] = {}
@@ -244,8 +240,7 @@ class TableKind(Kind):
             by = np.where(turned == (name == "gon"), factor, 1.0)
             values = self.values * np.resize(by, self.values.shape)
             sigma = self.sigma * np.resize(by, self.sigma.shape)
-            if (np.abs(values - self.values).ravel() > sigma.ravel()).any():
-                found[name] = self.with_values(values).with_sigma(sigma)
+            found[name] = self.with_values(values).with_sigma(sigma)
         return found
 
     @classmethod

@@ -1,13 +1,12 @@
 """Survey observations beside photographs: distances, levelling, angles and antenna positions from tables.
 
-Tables are read into observations of a network. Before the main adjustment, observations that contradict all
-others are found and removed, and known mistakes are tried as their explanation.
+Tables are read into observations of a network. `sfm.judgement.given.tables` judges them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,14 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from sfm.adjustment.result import Adjustment, ObservedResiduals
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import listed
-from sfm.distributions import LEVEL, normal_ppf
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
-from sfm.network import Estimate, Network
-from sfm.observations.kind import PHOTOGRAPH, POINT, Group, Kind, RowKind, TableKind
+from sfm.network import Network
+from sfm.observations.kind import PHOTOGRAPH, POINT, Group, RowKind, TableKind
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.tables import TABLES
 from sfm.remarks.remark import Remark, remark
@@ -34,8 +31,6 @@ if TYPE_CHECKING:
 
 
 DISTANCE = "distance"
-MAX_WRONG = 1 / 3  # share of wrong observations of a kind beyond which none of this kind is trusted
-MIN_REDUNDANCY = 0.01  # redundancy number below which others hardly check an observation
 
 
 @dataclass(frozen=True)
@@ -249,10 +244,9 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
             names = tuple(column[row] for column in one.table.texts)
             if (labels.get(names[0]), *names[1:]) not in hidden:
                 unused.append(one.name(int(row)))
+    usable = with_tables(survey.tables, replace(network, observations=())).observations
     for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
-        there = {
-            kind.group for kind in network.observations if isinstance(kind, Group) and type(kind) is one.of
-        }
+        there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is one.of}
         unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
     return (
@@ -272,155 +266,3 @@ def _known(one: ObservationTable, network: Network) -> BoolArray:
     names = set(_names(one, network))
     known: BoolArray = np.array([[name in names for name in column] for column in one.named], dtype=bool)
     return np.asarray(known.all(axis=0))
-
-
-@dataclass(frozen=True)
-class Gross:
-    """Observations of one kind from tables that contradict others."""
-
-    kind: str  # name of the kind
-    names: tuple[str, ...]  # as in `Kind.parts`
-    whole: bool  # if more than MAX_WRONG contradict, nothing shows which are right: all are removed
-    mistake: str | None = None  # correcting this mistake makes them agree, see `Kind.mistakes`
-
-
-def find_gross(network: Network, adjust_with: Callable[[Network], Adjustment]) -> tuple[Gross, ...]:
-    """Return the observations of tables that contradict all others, by kind.
-
-    Image points are not tested here: they are weaker, and one wrong observation would make correct ones be
-    rejected. If one common mistake of a kind explains all contradictions, the whole kind is removed.
-    Otherwise the observation with the largest w is removed first, as long as others of its kind stay.
-
-    Args:
-        network: has the accepted image points and the observations.
-        adjust_with: adjusts a network without rejecting anything.
-    """
-    given, wrong, whole = network.observations, dict[str, list[str]](), set[str]()
-    total, estimate, mistakes = Counter[str](), None, dict[str, str | None]()
-    while network.observations:
-        a = adjust_with(network)
-        first = len(network.kinds) - len(network.observations)
-        w, row, component, one = _worst(a, first)
-        if one is None or not w > _critical(a, first):
-            break
-        kind, explained = network.kinds[one.index], list[Gross]()
-        if estimate is None:
-            estimate = a.estimate
-            for other in given:
-                total[other.name] += len(other.parts(network, estimate))
-            explained = _explained(network, estimate, kind, adjust_with)
-        for gross in explained:
-            wrong[gross.kind], mistakes[gross.kind] = list(gross.names), gross.mistake
-            whole |= {gross.kind} if gross.whole else set()
-        if not explained:
-            if total[kind.name] < 3:
-                break  # of two, nothing shows which is wrong; the remark on residuals names the larger
-            part = kind.parts(network, estimate)[kind.part_of(int(one.rows[row]), component)]
-            wrong.setdefault(kind.name, []).append(part)
-            if len(wrong[kind.name]) > MAX_WRONG * total[kind.name]:
-                whole.add(kind.name)
-        network = without_observations(network, estimate, wrong, whole)
-    for name in wrong.keys() - mistakes.keys():
-        assert estimate is not None
-        of_kind = [kind for kind in given if kind.name == name]
-        mistakes[name] = _mistake(of_kind, wrong[name], network, estimate, adjust_with, whole=name in whole)
-    return tuple(Gross(name, tuple(names), name in whole, mistakes[name]) for name, names in wrong.items())
-
-
-def _explained(
-    network: Network, estimate: Estimate, worst: Kind, adjust_with: Callable[[Network], Adjustment]
-) -> list[Gross]:
-    """Return each kind whose common mistake explains all contradictions; several mean the cause is open."""
-    found: list[Gross] = []
-    kinds = dict.fromkeys(kind.name for kind in network.observations)
-    for name, single in [(name, False) for name in kinds] + [(worst.name, True)]:
-        of = [kind for kind in network.observations if (kind is worst if single else kind.name == name)]
-        others = tuple(kind for kind in network.observations if not any(kind is one for one in of))
-        for mistake in of[0].mistakes():
-            mended = tuple(kind.mistakes()[mistake] for kind in of)
-            a = adjust_with(replace(network, observations=(*others, *mended)))
-            first = len(network.kinds) - len(network.observations)
-            if _agrees(a, first) and name not in {one.kind for one in found}:
-                names = [part for kind in of for part in kind.parts(network, estimate)]
-                whole = not any(kind.name == name for kind in others)
-                found.append(Gross(name, tuple(names), whole, mistake))
-    return found
-
-
-def _mistake(
-    kinds: Sequence[Kind],
-    names: Sequence[str],
-    network: Network,
-    estimate: Estimate,
-    adjust_with: Callable[[Network], Adjustment],
-    *,
-    whole: bool,
-) -> str | None:
-    """Return the mistake whose correction makes removed observations agree with the others, or None."""
-    for mistake in dict.fromkeys(mistake for kind in kinds for mistake in kind.mistakes()):
-        mended: list[Kind] = []
-        for kind in kinds:
-            on = np.array([whole or name in names for name in kind.parts(network, estimate)], dtype=bool)
-            if on.any():
-                one = kind.mistakes()[mistake]
-                mended.append(one if isinstance(kind, Group) else one.select_parts(on))
-        others = [kind for kind in network.observations if not _same_group(kind, mended)]
-        a = adjust_with(replace(network, observations=(*others, *mended)))
-        first = len(network.kinds) - len(network.observations) + len(others)
-        if _agrees(a, first):
-            return mistake
-    return None
-
-
-def _same_group(kind: Kind, others: Sequence[Kind]) -> bool:
-    """Return whether observations belong to the same group as any of the others."""
-    return isinstance(kind, Group) and any(
-        type(kind) is type(other) and kind.group == other.group
-        for other in others
-        if isinstance(other, Group)
-    )
-
-
-def _worst(a: Adjustment, first: int) -> tuple[float, int, int, ObservedResiduals | None]:
-    """Return the largest |w| of the kinds from index `first` on, its row, component and residuals."""
-    tests = [(*test, one) for one in a.observed if one.index >= first for test in _largest(one)]
-    return max(tests, key=lambda test: test[0], default=(0.0, 0, 0, None))
-
-
-def _agrees(a: Adjustment, first: int) -> bool:
-    """Return whether the kinds from index `first` on are checked, and none contradicts."""
-    w, _, _, one = _worst(a, first)
-    return one is not None and w <= _critical(a, first)
-
-
-def _critical(a: Adjustment, first: int) -> float:
-    """Return the critical |w|: the chance that any correct observation of these kinds exceeds it is LEVEL."""
-    count = sum(one.count for one in a.observed if one.index >= first)
-    return -float(normal_ppf(LEVEL / (2 * max(count, 1))))
-
-
-def _largest(one: ObservedResiduals) -> list[tuple[float, int, int]]:
-    """Return the largest |w| of each checked observation, its row and its component."""
-    w = np.where(one.redundancy_numbers > MIN_REDUNDANCY, np.abs(one.standardised), -np.inf)
-    w = np.where(np.isnan(w), -np.inf, w)
-    at = w.argmax(axis=1)
-    return [
-        (float(of_row[k]), row, int(k))
-        for row, (of_row, k) in enumerate(zip(w, at, strict=True))
-        if of_row[k] >= 0
-    ]
-
-
-def without_observations(
-    network: Network, estimate: Estimate, wrong: Mapping[str, Collection[str]], whole: Collection[str]
-) -> Network:
-    """Return the network without the `wrong` observations of each kind, and without the `whole` kinds."""
-    kept = []
-    for kind in network.observations:
-        if kind.name in whole:
-            continue
-        if kind.name in wrong:
-            parts = kind.parts(network, estimate)
-            kind = kind.select_parts(np.array([name not in wrong[kind.name] for name in parts], dtype=bool))
-        kept.append(kind)
-    return replace(network, observations=tuple(kind for kind in kept if len(kind)))

@@ -36,8 +36,6 @@ Weighted = TableKind | ScaleBars  # with one standard deviation for each value
 
 ROUGH_ROUNDS, ROUNDS = 6, 20  # Gauss-Newton steps from each attitude, and from the best attitudes
 BEST = 3  # attitudes that are fitted to the end
-# Residual in standard deviations beyond which an observation is taken as wrong before anything is adjusted.
-MIN_FAR_SIGMAS = 100.0
 MIN_FRACTION = 1e-9  # of the derivatives, below which the effect of a motion is only rounding
 MAX_STEP = 0.5  # largest rotation of one step, rad, and largest change of ln(scale)
 MIN_POINTS = 3  # that fix position, attitude and scale
@@ -67,25 +65,6 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
     best = sorted(tried, key=lambda one: one[1])[:BEST]
     return min((_fitted(kinds, one, ROUNDS, scaled=scaled) for one, _ in best), key=lambda one: one[1])[0]
-
-
-def loosen_far(network: Network, estimate: Estimate) -> Network:
-    """Return the network with larger standard deviations of observations that are far from an estimate.
-
-    In least squares an observation that is off by 1e5 standard deviations would bend the whole network. The
-    square root of this ratio limits its effect, and it still has the largest residual.
-
-    Args:
-        network: has observations of points and photographs.
-        estimate: placed on the observations, see `place_on_observations`.
-    """
-    kinds: list[Kind] = []
-    for kind in network.observations:
-        if isinstance(kind, TableKind) and len(kind) == len(_usable(kind, estimate)):
-            over = _over_sigma(kind, kind, estimate)
-            kind = kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over / MIN_FAR_SIGMAS, 1.0)))
-        kinds.append(kind)
-    return replace(network, observations=tuple(kinds))
 
 
 def scale_sigma(network: Network, estimate: Estimate) -> float:

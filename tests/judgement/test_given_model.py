@@ -574,3 +574,23 @@ def test_a_value_is_suspected_where_its_update_would_let_the_others_fit() -> Non
     every = model.kept()
     fall, rank = every.decreases()
     assert [k for k in range(6) if every.may_fit(0.001, float(fall[k]), int(rank[k]))] == [3]
+
+
+@pytest.mark.parametrize("fixed", [False, True])
+def test_values_that_are_right_predict_the_others_as_they_would_together(fixed: bool) -> None:
+    """Chi-square of all values is that of the right ones, plus that of the others beside them."""
+    rng = np.random.default_rng(5)
+    C = rng.standard_normal((9, 9))
+    A = rng.standard_normal((9, 3))
+    A[:6, 2] = 0.0  # a parameter that only the other values have
+    stated = np.diag(np.where(np.arange(9) < 4, 0.0 if fixed else 0.1, 0.3))
+    model = GivenModel(rng.standard_normal(9), C @ C.T, stated, A, np.arange(9) // 2, 50)
+    right = np.arange(9) < 6
+    beside = model.beside(right)
+    assert beside.items == 2 and beside.confirmed == 3
+    both = model.part(right).kept().chi2 + beside.kept().chi2
+    assert both == pytest.approx(model.kept().chi2, rel=1e-8)
+    assert beside.kept().dof + model.part(right).kept().dof == model.kept().dof
+    without = beside.kept((0,)).chi2 + model.part(right).kept().chi2
+    assert without == pytest.approx(model.kept((3,)).chi2, rel=1e-8)
+    assert model.beside(np.zeros(9, dtype=bool)) is model

@@ -408,11 +408,16 @@ def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, a
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.2])
-def test_a_unit_is_a_mistake_of_offsets_only_where_they_are_not_zero(offset: float) -> None:
-    """A standard deviation a thousand times larger made planes agree whose points were simply not there."""
-    points, value = np.arange(6), np.full((6, 1), offset)
-    planes = planes_and_lines.Planes("wall", points, value, np.full((6, 1), 1e-3))
-    assert ("thousandth" in planes.mistakes()) == (offset > 0)
+def test_points_that_are_not_on_their_plane_are_in_no_other_unit(offset: float, tmp_path: Path) -> None:
+    """A standard deviation a thousand times larger would make any points agree with their plane."""
+    network, truth = network_of(f"off {offset}", ("distance",))
+    points, value = np.arange(14, 20), np.full((6, 1), offset)
+    plane = planes_and_lines.Planes("wall", points, value, np.full((6, 1), 1e-3))
+    given = {"plane": [plane], "distance": list(network.observations)}
+    remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
+    (found,) = [one for one in remarks if one.kind == "kind_wrong"]
+    assert found.names("of") == ("planes",) and not found.names("mistake")
+    assert "observations_unused" not in {one.kind for one in remarks}  # its points are in the result
 
 
 def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:

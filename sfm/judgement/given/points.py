@@ -17,10 +17,10 @@ from math import comb, log
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
+from sfm.distributions import MARGIN
 from sfm.errors import GeometryError
 from sfm.judgement.given.names import assignments, cost_of_choice, find_renamed
 from sfm.judgement.given.values import (
-    MARGIN,
     RANK,
     GivenModel,
     Judgement,

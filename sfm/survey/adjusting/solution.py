@@ -28,12 +28,18 @@ from sfm.judgement.choices import Choice, choose
 from sfm.judgement.given.judge import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
+from sfm.camera import base_name
+from sfm.conventions import IntArray
+from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.tables import as_judged, judge_tables
+from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.result import ControlCheck, GivenTest, LeftOutPoint
 from sfm.runtime.progress import report_step
+from sfm.similarity import Similarity, fit_similarity
 from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.settling import (
     StableAdjustment,
@@ -63,12 +69,10 @@ from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
-from sfm.survey.observation_tables import find_gross, without_observations
 from sfm.survey.placing import (
     MIN_CONTROL,
     hold_fixed,
     is_scaled,
-    loosen_far,
     place_on_control,
     place_on_exterior,
     place_on_frame,
@@ -472,24 +476,20 @@ def _without_gross_observations(
     task: Task, settled: StableAdjustment, estimate: Estimate
 ) -> tuple[Task, tuple[Remark, ...]]:
     """Return the task without tabulated observations that contradict all others in the settled network."""
-
-    def adjusted(part: Network) -> Adjustment:
-        free = task.datum.kind != "control"
-        placed = place_on_observations(part, start) if free else start  # wrong observations would turn it
-        datum = on_points(task, part, placed)
-        loose = loosen_far(part, placed)
-        return adjust(loose, placed, datum=datum, reject="none", image_sigma_factor=task.factor)
-
+    adjustment = settled.adjustment
     part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
-    gross = find_gross(part, adjusted)
-    wrong, whole = {one.kind: one.names for one in gross}, {one.kind for one in gross if one.whole}
-    remarks = tuple(
-        remark("kind_wrong", of=one.kind, mistake=one.mistake)
-        if one.whole
-        else remark("observations_wrong", observations=one.names, mistake=one.mistake)
-        for one in gross
-    )
-    return replace(task, network=without_observations(task.network, estimate, wrong, whole)), remarks
+    if task.datum.kind != "control":
+        part = replace(part, control=ObjectPoints(), exterior=ExteriorObservations())
+
+    def place(network: Network) -> Similarity:
+        placed = start if task.datum.kind == "control" else place_on_observations(network, start)
+        places = [np.concatenate([one.points, one.position]) for one in (adjustment.estimate, placed)]
+        return fit_similarity(places[0], places[1])
+
+    wrong = judge_tables(part, FreeNetwork(adjustment), place)
+    tables = as_judged(task.network, estimate, task.network.observations, wrong)
+    remarks = tuple(one.remark for one in wrong)
+    return replace(task, network=replace(task.network, observations=tables)), remarks
 
 
 def _free_network_in_frame(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
