@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, skew
+from sfm.conventions import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    angles_from_rotation,
+    rotation_from_angles,
+    skew,
+)
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, Block, Kind, Linear, RowKind, Values, no_index
 from sfm.observations.point_pairs import Pairs
 
@@ -166,6 +173,20 @@ class MountObservations(PoseObservations):
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return the projection centres, (c, 3), and the rotations from rig axes to image axes, (c, 3, 3)."""
         return values.mount_position[self.camera], values.camera_from_rig[self.camera]
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the inverse poses, the opposite bases and the inverse rotations."""
+        X, S = self.position, self.covariance
+        R = np.array([rotation_from_angles(*angles) for angles in self.angles]).reshape(-1, 3, 3)
+        inverse, turned = np.swapaxes(R, 1, 2), S.copy()
+        by_rotation = (X**2).sum(axis=1) * S[:, 3:, 3:].max(axis=(1, 2), initial=0.0)
+        turned[:, :3, :3] = inverse @ S[:, :3, :3] @ R + by_rotation[:, None, None] * np.eye(3)
+        angles, back = angles_from_rotation(inverse), -np.einsum("nab,nb->na", inverse, X)
+        return {
+            "inverse pose": replace(self, position=back, angles=angles, covariance=turned),
+            "opposite base": replace(self, position=-X),
+            "inverse rotation": replace(self, angles=angles),
+        }
 
     def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the cameras."""

@@ -294,23 +294,6 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
     np.testing.assert_allclose(found, np.where(np.isfinite(stated), factor**2 * stated, stated))
 
 
-def test_of_a_mount_the_length_of_its_base_is_left_open() -> None:
-    """Its scale is that of the given base; an opposite base has no scale that fits."""
-    X, P = np.array([0.3, -0.2, 0.1]), np.array([0.9, -0.5, 0.4])
-    found: Any = SimpleNamespace(
-        position=X[None], angles=np.zeros((1, 3)), covariance=np.diag([1e-6] * 3 + [1e-8] * 3), redundancy=50
-    )
-    for given_at, opened in ((P, 1.0), (-P, 0.0)):
-        one: Any = SimpleNamespace(
-            position=given_at[None], angles=np.array([[0.1, 0.0, 0.0]]), covariance=1e-6 * np.eye(6)[None]
-        )
-        model = given._shape(one, found, 0)
-        scale = np.linalg.norm(P) / np.linalg.norm(X)
-        np.testing.assert_allclose(model.v, [*(given_at - scale * X), 0.1, 0, 0], atol=1e-12)
-        np.testing.assert_allclose(model.A, opened * scale * np.array([[*X, 0, 0, 0]]).T, atol=1e-12)
-        np.testing.assert_allclose(np.diagonal(model.network), [scale**2 * 1e-6] * 3 + [1e-8] * 3)
-
-
 def test_four_points_that_are_not_in_a_plane_are_in_space() -> None:
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     assert given_scales.are_in_space(corner)

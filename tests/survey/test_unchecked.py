@@ -9,6 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.points import GivenPoints
 from sfm.judgement.given.scales import remarks_on_unchecked
@@ -209,7 +210,7 @@ def test_a_grid_of_a_plate_does_not_scatter() -> None:
     network = observed_anew(network, truth, 0.001, seed_of("little noise"))
     at = np.arange(8)
     control = ObjectPoints(at, np.round(truth.points[:8], 3), np.zeros((8, 3, 3)))
-    free = adjust(network, truth, datum=Datum("free"))
+    free = FreeNetwork(adjust(network, truth, datum=Datum("free")))
     for plates, kind in (((), "given_scatter"), ((network.points[:8],), "given_not_exact")):
         judged = judge_given(
             replace(network, control=control), free, Datum("control"), unit="m", plates=plates

@@ -1,6 +1,6 @@
 """Given values: judged against the free network of the image points before they are used.
 
-`judge` judges control, bars, projection centres and mounts, `tables` all other survey observations. `values`
-are the statistics of both, `free_network` the reference, `points`, `names` and `scales` what points and
-lengths may have wrong.
+`judge` judges control, bars and projection centres, `mounts` the mounts of rigs, `tables` all other survey
+observations. `free_network` is the reference of each, and `values` are the statistics of all. `points`,
+`names` and `scales` are what points and lengths may have wrong.
 """

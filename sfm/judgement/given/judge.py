@@ -1,12 +1,7 @@
-"""Tests of given values and mounts against the image points, before they are used.
+"""Tests of control, scale bars and projection centres against the image points, before they are used.
 
 If the other values identify a contradicting value, it is left out and reported. If they do not, no value that
 may be wrong is used. The rest takes part in the adjustment.
-
-Given mounts of the cameras of a rig are judged by the photographs. A network without given mounts estimates
-the mounts with their covariance. Rotation and direction of the base are compared with those from the image
-points alone, which do not determine the length of the base. The length is compared with those of the other
-mounts, and with everything else that gives a scale.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests).
 """
@@ -17,14 +12,12 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from sfm.adjustment.covariance import determines_cameras, marginal_of
+from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
-from sfm.distributions import LEVEL
+from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
+from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import (
     Group,
@@ -33,12 +26,10 @@ from sfm.judgement.given.scales import (
     are_in_space,
     contradiction_of,
     judge_scales,
-    numbers_of_scale,
     remarks_on_unchecked,
 )
 from sfm.judgement.given.values import NONCENTRALITY, GivenModel
 from sfm.network import ExteriorObservations, Network
-from sfm.observations.pose import MountObservations, exterior_jacobian
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import Similarity
@@ -62,7 +53,7 @@ class JudgedGiven:
 
 def judge_given(
     network: Network,
-    free: Adjustment | None,
+    free: FreeNetwork | None,
     datum: Datum,
     *,
     unit: str,
@@ -85,7 +76,7 @@ def judge_given(
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
-    places = None if free is None or free.redundancy < 1 else _places(network, free, datum)
+    places = None if free is None else _places(network, free, datum)
     if free is None or places is None:
         kinds = (("bars", network.scale_bars), ("control", network.control))
         of = [name for name, some in kinds if len(some)]
@@ -97,9 +88,10 @@ def judge_given(
     return _judged(task)
 
 
-def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
+def _places(network: Network, of_image_points: FreeNetwork, datum: Datum) -> Places | None:
     """Return the given points in the free network with their covariance; None if undetermined."""
-    if not free.converged or free.undetermined or free.defect != free.expected_defect:
+    free, marginal = of_image_points.adjustment, of_image_points.marginal
+    if marginal is None:
         return None
     bars, control = network.scale_bars, network.control
     number = {name: j for j, name in enumerate(free.network.points)}
@@ -116,7 +108,6 @@ def _places(network: Network, free: Adjustment, datum: Datum) -> Places | None:
     points = np.array([number[name] for name in names], dtype=np.int64)
     stations = np.array([photograph[name] for name in images], dtype=np.int64)
     try:
-        marginal = marginal_of(free)
         joint = marginal.joint((6 * stations[:, None] + np.arange(3)).ravel(), points)
     except (GeometryError, np.linalg.LinAlgError):
         return None
@@ -351,154 +342,3 @@ def shift_of_fixed(model: GivenModel, sigma: float) -> float:
     datum = model.A @ parameters_of(fixed, np.ones(len(model.v), dtype=bool))
     variance = np.diagonal(datum @ model.network @ datum.T) + np.diagonal(model.network)
     return float(sigma * np.sqrt(((datum**2).sum(axis=1) / variance).max()))
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Mounts of the same cameras, estimated in a network without the given mounts."""
-
-    position: FloatArray  # (c, 3)
-    angles: FloatArray  # rad, (c, 3)
-    covariance: FloatArray  # of X, Y, Z, omega, phi, kappa of all mounts, (6 c, 6 c)
-    motions: FloatArray  # derivatives by the motions that the network leaves open, (6 c, d)
-    redundancy: int
-
-
-def judge_mounts(given: MountObservations, free: Adjustment) -> tuple[MountObservations, tuple[Remark, ...]]:
-    """Return the mounts whose rotation and base direction the photographs confirm, and remarks on the others.
-
-    Args:
-        given: mounts, held fixed or observed.
-        free: adjustment of the image points alone.
-    """
-    found = _found(given, free)
-    if found is None:
-        return given, ()
-    level, kept, remarks = LEVEL / len(given), np.ones(len(given), dtype=bool), []
-    for k in range(len(given)):
-        one = given.select(np.array([k]))
-        model = _shape(one, found, k)
-        if model.fits(level):
-            continue
-        kept[k] = False
-        R, X = rotation_from_angles(*found.angles[k]), found.position[k]
-        turn = rotation_from_angles(*one.angles[0]).T @ R
-        named = (name for name, other in _mistaken(one) if _shape(other, found, k).fits(level))
-        remarks.append(
-            remark(
-                "mount_contradicted",
-                camera=free.estimate.cameras[given.camera[k]].name,
-                angle=(_degrees((np.trace(turn) - 1) / 2), "deg"),
-                direction=(_degrees(_cosine(one.position[0], X)), "deg"),
-                sigmas=float(np.sqrt(model.kept().chi2)),
-                mistake=next(named, None),
-            )
-        )
-    return given.select(kept), tuple(remarks)
-
-
-def judge_mount_scales(
-    given: MountObservations, without: Adjustment, others: Sequence[str]
-) -> tuple[MountObservations, tuple[Remark, ...]]:
-    """Return the mounts if their scales agree; otherwise no mounts, and the remark that they contradict.
-
-    Args:
-        given: mounts whose rotation and direction the photographs confirm.
-        without: adjustment of everything but the mounts.
-        others: kinds of given values in this adjustment that give a scale.
-    """
-    found = _found(given, without)
-    if found is None or not len(given) or not given.position.any(axis=1).all():  # a base of 0 has no scale
-        return given, ()
-    c = len(given)
-    length = np.linalg.norm(given.position, axis=1), np.linalg.norm(found.position, axis=1)
-    rows, stated = np.zeros((c, 6 * c)), np.zeros(c)
-    for k, along in enumerate(given.position / length[0][:, None]):
-        rows[k, 6 * k : 6 * k + 3] = found.position[k] / length[1][k] ** 2
-        stated[k] = along @ given.covariance[k, :3, :3] @ along / length[0][k] ** 2
-    model = GivenModel(
-        np.log(length[0] / length[1]),
-        rows @ found.covariance @ rows.T,
-        np.diag(stated),
-        rows @ found.motions,
-        np.arange(c),
-        found.redundancy,
-    )
-    if model.kept().probability() >= LEVEL:
-        return given, ()
-    is_open = bool(np.abs(model.A).max(initial=0.0) > 0)
-    S = model.network + model.stated
-    if is_open:  # the two that differ most
-        low, high = int(model.v.argmin()), int(model.v.argmax())
-        off, sigma = model.v[high] - model.v[low], np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high])
-        cameras, others = [high], [f"the mount of {without.estimate.cameras[given.camera[low]].name}"]
-    else:
-        k = int(np.argmax(np.abs(model.v) / np.sqrt(np.diagonal(S))))
-        off, sigma, cameras = model.v[k], np.sqrt(S[k, k]), list(range(c))
-    names = [without.estimate.cameras[a].name for a in given.camera[cameras]]
-    by = numbers_of_scale(float(off), float(sigma))
-    said = remark("mounts_scale_contradicted", cameras=names, others=others, **by)
-    return given.select(np.zeros(c, dtype=bool)), (said,)
-
-
-def _found(given: MountObservations, a: Adjustment) -> _Found | None:
-    """Return the mounts of an adjustment without given mounts; None if it does not determine them."""
-    mounts = a.estimate.mounts
-    if mounts is None or not a.converged or a.redundancy < 1:
-        return None
-    if a.undetermined or a.defect != a.expected_defect:
-        return None
-    try:
-        m = marginal_of(a, cross=False)
-        rigs = m.covariance().rigs
-    except (GeometryError, np.linalg.LinAlgError):
-        return None
-    k = given.camera
-    at = (len(rigs) - 6 * len(mounts.rig) + 6 * k[:, None] + np.arange(6)).ravel()
-    covariance, columns = rigs[np.ix_(at, at)], m.layout.mount_column[k]
-    if not np.isfinite(covariance).all() or (columns < 0).any():
-        return None
-    R = mounts.rotation[k]
-    J = block_diag(*exterior_jacobian(np.swapaxes(R, 1, 2)))
-    motions = J @ m.optimum.motions.reduced[columns.ravel()]
-    motions[np.abs(motions) < 1e-9 * np.abs(motions).max(initial=1.0)] = 0.0
-    return _Found(mounts.position[k], angles_from_rotation(R), covariance, motions, a.redundancy)
-
-
-def _shape(one: MountObservations, found: _Found, k: int) -> GivenModel:
-    """Return the differences of one mount from that of the photographs; the length of the base is free."""
-    X, P = found.position[k], one.position[0]
-    scale = float(np.linalg.norm(P)) / max(float(np.linalg.norm(X)), TINY) or 1.0
-    turned = one.angles[0] - found.angles[k]
-    open_scale = P @ X > 0  # no positive scale reverses a base
-    D, own = np.diag([scale] * 3 + [1.0] * 3), slice(6 * k, 6 * k + 6)
-    return GivenModel(
-        np.concatenate([P - scale * X, (turned + np.pi) % (2 * np.pi) - np.pi]),
-        D @ found.covariance[own, own] @ D,
-        one.covariance[0],
-        np.concatenate([open_scale * scale * X, np.zeros(3)])[:, None],
-        np.zeros(6, dtype=np.int64),
-        found.redundancy,
-    )
-
-
-def _mistaken(one: MountObservations) -> Iterator[tuple[str, MountObservations]]:
-    """Yield (name of a common mistake, mount without this mistake)."""
-    R, X, S = rotation_from_angles(*one.angles[0]), one.position[0], one.covariance[0]
-    turned = S.copy()
-    turned[:3, :3] = R.T @ S[:3, :3] @ R + float(X @ X) * S[3:, 3:].max() * np.eye(3)
-    angles = angles_from_rotation(R.T)
-    yield (
-        "inverse pose",
-        replace(one, position=-(R.T @ X)[None], angles=angles[None], covariance=turned[None]),
-    )
-    yield "opposite base", one.with_values(np.concatenate([-X, one.angles[0]])[None])
-    yield "inverse rotation", one.with_values(np.concatenate([X, angles])[None])
-
-
-def _cosine(a: FloatArray, b: FloatArray) -> float:
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), TINY))
-
-
-def _degrees(cosine: float) -> float:
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))

@@ -25,12 +25,12 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
-from sfm.judgement.given.judge import JudgedGiven, judge_given, judge_mount_scales, judge_mounts
+
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
-from sfm.camera import base_name
-from sfm.conventions import IntArray
 from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.judge import JudgedGiven, judge_given
+from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.tables import as_judged, judge_tables
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations
@@ -124,10 +124,11 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     survey, matched = model.survey, model.matched
     start = _prepare(survey, matched, model.varying)
     free = _free_network(start)
-    mounts, of_mounts = _confirmed_mounts(start, free)
+    reference = _reference(start, free)
+    mounts, of_mounts = _confirmed_mounts(start, reference)
     plates = _points_of_plates(survey, matched.naming, matched.network)
-    task, given = _with_confirmed_values(start, free, plates, checks_scale=bool(len(mounts)))
-    settled, gross = _settle_with_given(start, free, task, given, mounts)
+    task, given = _with_confirmed_values(start, free, reference, plates, checks_scale=bool(len(mounts)))
+    settled, gross = _settle_with_given(start, free, reference, task, given, mounts)
     report_step("adjusting all observations")
     found = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
@@ -301,20 +302,33 @@ def _has_no_identity(survey: Survey) -> bool:
     return plate is not None and plate.is_ambiguous
 
 
+def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork | None:
+    """Return the free network that judges given values; None without one that can."""
+    # a camera that had to be held at its start value gives the network a wrong shape
+    if free is None or free.held:
+        return None
+    adjustment, network = free.adjustment, start.task.network
+    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
+    if start.task.survey.tie_points is not None and (given_any or network.observations):
+        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
+    return FreeNetwork(adjustment)
+
+
 def _confirmed_mounts(
-    start: _Prepared, free: StableAdjustment | None
+    start: _Prepared, reference: FreeNetwork | None
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the given mounts that the image points confirm, and remarks on the others."""
     mounts = start.task.survey.given_mounts
-    if free is None or free.held or not len(mounts):
+    if reference is None or not len(mounts):
         return mounts, ()
     report_step("testing the given mounts")
-    return judge_mounts(mounts, free.adjustment)
+    return judge_mounts(mounts, reference)
 
 
 def _with_confirmed_values(
     start: _Prepared,
     free: StableAdjustment | None,
+    reference: FreeNetwork | None,
     plates: tuple[tuple[str, ...], ...],
     *,
     checks_scale: bool,
@@ -333,15 +347,10 @@ def _with_confirmed_values(
     if _has_no_identity(task.survey):
         return task, JudgedGiven(network, task.datum)
     report_step("testing the given values")
-    # a camera that had to be held at its start value gives the network a wrong shape
-    adjustment = None if free is None or free.held else free.adjustment
-    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
-    if adjustment is not None and task.survey.tie_points is not None and given_any:
-        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
     plate = plate_control(task.survey.targets)
     given = judge_given(
         network,
-        adjustment,
+        reference,
         task.datum,
         unit=task.survey.unit,
         rescale=task.survey.adjust.weights == "components",
@@ -359,6 +368,7 @@ def _with_confirmed_values(
 def _settle_with_given(
     start: _Prepared,
     free: StableAdjustment | None,
+    reference: FreeNetwork | None,
     task: Task,
     given: JudgedGiven,
     mounts: MountObservations,
@@ -375,22 +385,21 @@ def _settle_with_given(
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
         # neither the free network is a start, nor are its per-photograph cameras
-        free = None
+        free = reference = None
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate = start.estimate
     if free is not None:
         estimate = _free_network_in_frame(estimate, free.whole, task, given)
     estimate = scale_to_bars(task.network, estimate, task.datum)
     gross: tuple[Remark, ...] = ()
-    if task.network.observations and free is not None:
-        task, gross = _without_gross_observations(task, free, estimate)
+    if free is not None and reference is not None and (task.network.observations or len(mounts)):
+        task, mounts, gross = _with_confirmed_observations(task, free, reference, estimate, mounts)
         if gross and task.datum.kind != "control":
             estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
     if len(mounts):
-        task, estimate, of_mounts = _with_mounts(task, estimate, free, mounts)
-        gross += of_mounts
+        task, estimate = _with_mounts(task, estimate, mounts)
     if free is None:
         return settle_by_photograph(task, estimate), gross
     if task.datum.kind != "control" and not is_scaled(task.network, estimate):
@@ -399,26 +408,14 @@ def _settle_with_given(
     return replace(settled, held=settled.held or free.held), gross
 
 
-def _with_mounts(
-    task: Task, estimate: Estimate, free: StableAdjustment | None, mounts: MountObservations
-) -> tuple[Task, Estimate, tuple[Remark, ...]]:
-    """Return the task and start values with the given mounts, if their scale agrees with all other scales."""
-    kinds = (("bars", task.network.scale_bars), ("control", task.network.control))
-    others = [name for name, some in kinds if len(some) and name in ("bars", task.datum.kind)]
-    others += [one.name for one in task.network.observations]
-    said: tuple[Remark, ...] = ()
-    if free is not None and not free.held:
-        without = free.adjustment
-        if others:
-            with suppress(GeometryError):  # the other values may need a scale that nothing else gives
-                without = settle(task, estimate, free.accepted).adjustment
-        mounts, said = judge_mount_scales(mounts, without, others)
+def _with_mounts(task: Task, estimate: Estimate, mounts: MountObservations) -> tuple[Task, Estimate]:
+    """Return the task and start values with the given mounts."""
     scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
     estimate = hold_mounts(estimate, mounts, scaled=scaled)
     network = with_given_mounts(mounts, task.network)
     if task.network.observations and task.datum.kind != "control":
         estimate = place_on_observations(task.network, estimate)
-    return replace(task, network=network), estimate, said
+    return replace(task, network=network), estimate
 
 
 def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Final:
@@ -472,24 +469,25 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
-def _without_gross_observations(
-    task: Task, settled: StableAdjustment, estimate: Estimate
-) -> tuple[Task, tuple[Remark, ...]]:
-    """Return the task without tabulated observations that contradict all others in the settled network."""
-    adjustment = settled.adjustment
-    part, start = reduce_network(task.network, estimate, settled.images, settled.points, settled.accepted)
+def _with_confirmed_observations(
+    task: Task, free: StableAdjustment, reference: FreeNetwork, estimate: Estimate, mounts: MountObservations
+) -> tuple[Task, MountObservations, tuple[Remark, ...]]:
+    """Return the task and the mounts without what contradicts the image points and other given values."""
+    part, start = reduce_network(task.network, estimate, free.images, free.points, free.accepted)
     if task.datum.kind != "control":
         part = replace(part, control=ObjectPoints(), exterior=ExteriorObservations())
 
     def place(network: Network) -> Similarity:
         placed = start if task.datum.kind == "control" else place_on_observations(network, start)
-        places = [np.concatenate([one.points, one.position]) for one in (adjustment.estimate, placed)]
+        places = [np.concatenate([one.points, one.position]) for one in (free.estimate, placed)]
         return fit_similarity(places[0], places[1])
 
-    wrong = judge_tables(part, FreeNetwork(adjustment), place)
+    wrong = judge_tables(part, reference, place)
+    part = replace(part, observations=as_judged(part, start, part.observations, wrong))
     tables = as_judged(task.network, estimate, task.network.observations, wrong)
-    remarks = tuple(one.remark for one in wrong)
-    return replace(task, network=replace(task.network, observations=tables)), remarks
+    mounts, of_mounts = judge_mount_scales(mounts, part, reference, place)
+    task = replace(task, network=replace(task.network, observations=tables))
+    return task, mounts, (*(one.remark for one in wrong), *of_mounts)
 
 
 def _free_network_in_frame(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
