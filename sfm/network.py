@@ -222,6 +222,7 @@ class Network:
             np.append(bars.end, self.point_index(end)),
             np.append(bars.length, length),
             np.append(bars.sigma, sigma),
+            np.append(bars.table, 0) if len(bars.table) else bars.table,
         )
         return replace(self, scale_bars=added)
 

@@ -164,6 +164,8 @@ class ScaleBars(Kind):
     end: IntArray = field(default_factory=no_index)  # index of the second point, (b,)
     length: FloatArray = field(default_factory=no_value)  # object unit, (b,)
     sigma: FloatArray = field(default_factory=no_value)  # object unit, (b,)
+    # number of the table of distances of each, whose scale they share; 0 or empty: of none, (b,)
+    table: IntArray = field(default_factory=no_index)
 
     def __len__(self) -> int:
         return len(self.start)
@@ -213,6 +215,7 @@ class ScaleBars(Kind):
             end=self.end[rows],
             length=self.length[rows],
             sigma=self.sigma[rows],
+            table=self.table[rows] if len(self.table) else self.table,
         )
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:

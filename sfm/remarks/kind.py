@@ -193,8 +193,9 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
 
 
 def _nouns(names: tuple[str, ...], other: str) -> list[str]:
-    """Return the nouns of names; a name without a noun follows the noun `other`."""
-    return [NOUNS.get(name) or f"{other} {name}".lstrip() for name in names]
+    """Return the nouns of names; a name that is none, such as "the first table", follows `other`."""
+    others = {name: name if name.startswith("the ") else f"{other} {name}".lstrip() for name in names}
+    return [NOUNS.get(name, others[name]) for name in names]
 
 
 def _number(one: Quantity, spec: str, digits: int) -> str:

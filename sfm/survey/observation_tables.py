@@ -176,12 +176,12 @@ def _sizes(of: type[TableKind], value: FloatArray, d: int) -> FloatArray:
     return np.asarray(np.where(np.isin(of.components, of.angles), 0.0, value))
 
 
-def bars_of(table: ObservationTable) -> list[ScaleBar]:
-    """Return the distances of a table as scale bars; none if the table has another kind."""
+def bars_of(table: ObservationTable, number: int) -> list[ScaleBar]:
+    """Return the distances of a table as scale bars with its number; none if the table has another kind."""
     if table.kind != DISTANCE:
         return []
     return [
-        ScaleBar(start, end, float(length), float(sigma))
+        ScaleBar(start, end, float(length), float(sigma), number)
         for (start, end), (length,), (sigma,) in zip(
             zip(*table.table.texts, strict=True), table.value, table.sigma, strict=True
         )

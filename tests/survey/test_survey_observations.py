@@ -490,6 +490,8 @@ def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path)
     assert "additive constant" in (tmp_path / "out" / "report.html").read_text("utf-8")
     (kept,) = result.network.observations
     assert len(kept.value) == 6
+    (said,) = [one for one in result.remarks if one.kind == "scale_unchecked"]
+    assert said.names("given") == ("the distances with additive constant tape",)
     order = [network.points.index(name) for name in result.network.points]
     sizes = [np.linalg.norm(X - X.mean(axis=0)) for X in (result.estimate.points, truth.points[order])]
     assert sizes[0] / sizes[1] == pytest.approx(1.0, abs=2e-3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.observation_tables import ObservationTable
 from tests.findings import findings_of
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import make_network, seed_of
@@ -172,3 +175,53 @@ def test_right_bars_and_control_are_no_remark(reject: str) -> None:
     assert {one.severity for one in remarks_on_given(result)} <= {"note"}
     assert len(result.network.scale_bars) == 2
     assert findings_of(result).verdict.level == "good"
+
+
+def _table(truth: Estimate, rows: int, factor: float) -> ObservationTable:
+    """Return a table of distances that are all as much too long."""
+    pairs = [(k, k + 14) for k in range(rows)]
+    lengths = [factor * float(np.linalg.norm(truth.points[i] - truth.points[j])) for i, j in pairs]
+    names = [[str(i + 1) for i, _ in pairs], [str(j + 1) for _, j in pairs]]
+    return ObservationTable.from_arrays(
+        "distance",
+        list(zip(*names, strict=True)),
+        np.array(lengths)[:, None],
+        np.full((rows, 1), 2e-4 * factor),
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("factor", "unit"), [(3.2808, 3.28), (1.01, None), (1000.0, 1000.0), (1.0, None)])
+def test_a_table_of_one_scale_does_not_outvote_two_bars(factor: float, unit: float | None, seed: int) -> None:
+    network, truth = _scene(f"a table and two bars {seed}")
+    given = {"scale_bars": _bars(truth, [1.0, 1.0]), "tables": (_table(truth, 10, factor),)}
+    result = run_survey(survey_of(network, truth, **given))
+    said = [one for one in remarks_on_given(result) if one.severity != "note"]
+    assert len(result.network.scale_bars) == (12 if factor == 1.0 else 2)
+    assert [one.kind for one in said] == ([] if factor == 1.0 else ["scale_left_out"])
+    assert findings_of(result).verdict.level == ("good" if factor == 1.0 else "fair")
+    for one in said:
+        assert one.names("given") == ("the table of distances",)
+        assert _factor(one) == pytest.approx(factor, rel=1e-3)
+        assert ("unit_factor" in one.numbers) == (unit is not None)
+        assert unit is None or one.number("unit_factor") == pytest.approx(unit, rel=1e-2)
+
+
+def test_a_table_and_a_bar_of_other_scales_give_none() -> None:
+    network, truth = _scene("a table and a bar")
+    given = {"scale_bars": _bars(truth, [1.0]), "tables": (_table(truth, 10, 1.01),)}
+    result = run_survey(survey_of(network, truth, **given))
+    (said,) = [one for one in remarks_on_given(result) if one.severity != "note"]
+    assert said.kind == "scale_contradicted" and said.names("given") == ("1 - 11", "the table of distances")
+    assert findings_of(result).verdict.level == "bad" and not result.has_scale
+
+
+def test_a_wrong_row_leaves_its_table_which_alone_gives_the_scale() -> None:
+    network, truth = _scene("a wrong row")
+    table = _table(truth, 8, 1.0)
+    value = table.value.copy()
+    value[3] += 0.05
+    result = run_survey(survey_of(network, truth, tables=(replace(table, value=value),)))
+    said = {one.kind: one.names("given") for one in remarks_on_given(result)}
+    assert said == {"bar_left_out": ("4 - 18",), "scale_unchecked": ("the table of distances",)}
+    assert len(result.network.scale_bars) == 7

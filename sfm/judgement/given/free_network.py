@@ -22,7 +22,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.judgement.given.values import RANK, GivenModel
-from sfm.network import values_of
+from sfm.network import Network, values_of
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
 from sfm.similarity import Similarity
 
@@ -134,6 +134,11 @@ class Reference:
             terms = np.eye(6) * lengths * (columns >= 0)[:, None]
         # fixed unknowns have derivatives of 0 in any column
         return np.searchsorted(self.reduced, columns).clip(0, max(len(self.reduced) - 1, 0)), by @ terms
+
+
+def confirmed(network: Network) -> tuple[Kind, ...]:
+    """Return the given values that are judged before all other observations."""
+    return network.control, network.exterior, network.scale_bars
 
 
 def _columns(cofactor: FloatArray) -> FloatArray:

@@ -72,7 +72,7 @@ def judge_given(
         plates: names of the points of each plate, if control is the first plate. Fixed coordinates of a grid
             are not rounded to decimals. The scale is that of the plate, as the survey states. Bars between
             points of another plate are the size of that plate.
-        checks_scale: whether given mounts check the scale.
+        checks_scale: whether mounts or tables check the scale.
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)

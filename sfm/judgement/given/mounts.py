@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.distributions import LEVEL
-from sfm.judgement.given.free_network import FreeNetwork, Reference
+from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
 from sfm.judgement.given.scales import numbers_of_scale
 from sfm.judgement.given.values import RANK, GivenModel
 from sfm.network import Network
@@ -81,13 +81,11 @@ def judge_mount_scales(
         free: adjustment of the image points alone.
         place: gives the object frame from the frame of the free network, by all given values of a network.
     """
-    right = [kind for kind in (network.control, network.exterior, network.scale_bars) if len(kind)]
-    right += network.observations
+    right = [kind for kind in (*confirmed(network), *network.observations) if len(kind)]
     reference = free.reference_of([*right, given]) if len(given) else None
     mounts = free.adjustment.estimate.mounts
-    if (
-        reference is None or mounts is None or not given.position.any(axis=1).all()
-    ):  # a base of 0 has no scale
+    has_scale = given.position.any(axis=1).all()  # a base of 0 has none
+    if reference is None or mounts is None or not has_scale:
         return given, ()
     placing = place(network)
     model = _lengths(given, right, reference, placing)

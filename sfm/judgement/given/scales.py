@@ -35,6 +35,7 @@ from sfm.result import GivenTest
 from sfm.similarity import extended_axes
 
 MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
+TABLE = "the table of distances"
 MAX_PERCENT = 2.0  # a larger ratio of lengths is reported as a factor, a smaller one in per cent
 
 
@@ -49,26 +50,15 @@ class JudgedScales:
 
 
 def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
-    """Judge the scales of bars and of dependable groups of points against one another.
+    """Judge the scales of bars, tables and dependable groups of points against one another.
 
     Args:
         task: values to judge.
         groups: dependable groups of given points.
     """
-    bars, places = task.network.scale_bars, task.places
-    found: dict[str, list[tuple[_Length, GivenScale]]] = {}
-    for one in _lengths(bars):
-        b = one.bars[0]
-        ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
-        at = [places.of_point.get(name, -1) for name in ends]
-        if min(at) >= 0 and at[0] != at[1]:
-            scale = scale_of_length(one.length, one.sigma, places.xyz, at[0], at[1])
-            given = f" ({significant(one.length)} {task.unit})" if one.contradicted else ""
-            name = task.plate_at(ends) or f"{ends[0]} - {ends[1]}{given}"
-            found.setdefault(name, []).append((one, scale))
-    names, of = list(found), list[str]()
-    lengths = [tuple(b for one, _ in some for b in one.bars) for some in found.values()]
-    scales = [mean_scale([scale for _, scale in some]) for some in found.values()]
+    places, lengths = task.places, _sources(task)
+    names, of = list(lengths.of), list[str]()
+    scales = [mean_scale([scale for _, scale in some]) for some in lengths.of.values()]
     for group in groups:
         given_scale = _scale_of(task, group)
         if given_scale is not None:
@@ -76,30 +66,114 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
             of.append(group.of)
             names.append(plate_name(0) if task.of_plate and group.of == "control" else group.of)
     if not scales:
-        return JudgedScales(bars)
+        return JudgedScales(task.network.scale_bars)
     model = scale_model(tuple(scales), places.joint, places.redundancy)
     judgement = judge_values(model, task.level)
-    tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
+    test = GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability)
+    bars = lengths.without(())
     if len(scales) == 1:
         alone = () if task.of_plate or task.checks_scale else (remark("scale_unchecked", given=names[0]),)
-        return JudgedScales(bars, alone, tests)
+        return JudgedScales(bars, (*lengths.remarks, *alone), (lengths.test or test,))
     if judgement.fits:
-        return JudgedScales(bars, tuple(remarks_on_unchecked("lengths", names, model)), tests)
+        unchecked = remarks_on_unchecked("lengths", names, model)
+        return JudgedScales(bars, (*lengths.remarks, *unchecked), (test,))
     if judgement.factor != 1.0:
         used = judgement.factor if task.rescale else None
         said = remark("given_sigmas", of="bars", factor=judgement.factor, used=used)
-        return JudgedScales(replace(bars, sigma=(used or 1.0) * bars.sigma), (said,), tests)
+        bars = replace(bars, sigma=(used or 1.0) * bars.sigma)
+        return JudgedScales(bars, (*lengths.remarks, said), (test,))
     on_points = task.datum.kind == "control"
     plates = {plate_name(k) for k in range(len(task.plates))}.intersection(names)
+    sources = list(lengths.of)
     out, remarks = _contradicting_scales(
-        model, judgement, names, len(lengths), on_points=on_points, plates=plates
+        model, judgement, names, len(sources), on_points=on_points, plates=plates
     )
-    keep: BoolArray = np.ones(len(bars), dtype=bool)
-    keep[[b for k in out if k < len(lengths) for b in lengths[k]]] = False
-    kept = ScaleBars(bars.start[keep], bars.end[keep], bars.length[keep], bars.sigma[keep])
-    return JudgedScales(
-        kept, remarks, tests, frozenset(of[k - len(lengths)] for k in out if k >= len(lengths))
+    left_out = frozenset(of[k - len(sources)] for k in out if k >= len(sources))
+    bars = lengths.without([sources[k] for k in out if k < len(sources)])
+    return JudgedScales(bars, (*lengths.remarks, *remarks), (test,), left_out)
+
+
+@dataclass(frozen=True)
+class _Lengths:
+    """Given lengths by the source of their scale: a bar, a plate, or a table of distances."""
+
+    of: dict[str, list[tuple[_Length, GivenScale]]]
+    bars: ScaleBars  # with standard deviations that fit
+    wrong: tuple[int, ...] = ()  # bars of tables that contradict the others of their table
+    remarks: tuple[Remark, ...] = ()  # on rows of tables
+    test: GivenTest | None = None  # of the rows of a table
+
+    def without(self, sources: Collection[str]) -> ScaleBars:
+        """Return the bars of all other sources."""
+        of_sources = {b for name in sources for length, _ in self.of[name] for b in length.bars}
+        return self.bars.select(~np.isin(np.arange(len(self.bars)), [*self.wrong, *of_sources]))
+
+
+def _sources(task: Task) -> _Lengths:
+    """Return the given lengths by source.
+
+    The rows of a table share the errors of a tape or an instrument. Rows that contradict most of their table
+    are left out. If nothing shows which rows of a table are wrong, each of them is a source.
+    """
+    found = _Lengths({}, task.network.scale_bars)
+    tables: dict[str, dict[str, list[tuple[_Length, GivenScale]]]] = {}
+    for name, table, length, scale in _scales_of_lengths(task, found.bars):
+        of = tables.setdefault(table, {}) if table else found.of
+        of.setdefault(name, []).append((length, scale))
+    for table, rows in tables.items():
+        found = _with_table(task, found, table, rows)
+    return found
+
+
+def _with_table(
+    task: Task, lengths: _Lengths, table: str, rows: dict[str, list[tuple[_Length, GivenScale]]]
+) -> _Lengths:
+    """Return the lengths with the rows of a table, judged against one another."""
+    scales = tuple(mean_scale([scale for _, scale in row]) for row in rows.values())
+    model = scale_model(scales, task.places.joint, task.places.redundancy)
+    judgement, names = judge_values(model, task.level), list(rows)
+    alike = [k for k in range(len(names)) if k not in judgement.wrong]
+    for k in alike:
+        name = names[k] if judgement.doubtful or len(alike) == 1 else table
+        lengths.of.setdefault(name, []).extend(rows[names[k]])
+    if judgement.doubtful:
+        return lengths
+    remarks = [_left_out(model, judgement.wrong, names, k, len(names), ()) for k in judgement.wrong]
+    bars = lengths.bars
+    if judgement.factor != 1.0:
+        used = judgement.factor if task.rescale else None
+        remarks.append(remark("given_sigmas", of=table, factor=judgement.factor, used=used))
+        of_table = [b for row in rows.values() for length, _ in row for b in length.bars]
+        factor = np.where(np.isin(np.arange(len(bars)), of_table), used or 1.0, 1.0)
+        bars = replace(bars, sigma=factor * bars.sigma)
+    remarks += remarks_on_unchecked("lengths", names, model, judgement.wrong)
+    wrong = tuple(b for k in judgement.wrong for length, _ in rows[names[k]] for b in length.bars)
+    test = GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability)
+    return replace(
+        lengths,
+        bars=bars,
+        wrong=(*lengths.wrong, *wrong),
+        remarks=(*lengths.remarks, *remarks),
+        test=test,
     )
+
+
+def _scales_of_lengths(task: Task, bars: ScaleBars) -> Iterator[tuple[str, str, _Length, GivenScale]]:
+    """Yield the name, the table, or "" without one, the length and the scale of each given length."""
+    places = task.places
+    several = len(np.unique(bars.table[bars.table > 0])) > 1
+    for length in _lengths(bars):
+        b = length.bars[0]
+        ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
+        at = [places.of_point.get(name, -1) for name in ends]
+        if min(at) < 0 or at[0] == at[1]:
+            continue
+        scale = scale_of_length(length.length, length.sigma, places.xyz, at[0], at[1])
+        given = f" ({significant(length.length)} {task.unit})" if length.contradicted else ""
+        number = int(bars.table[b]) if len(bars.table) else 0
+        table = f"{TABLE} {number}" if several else TABLE
+        table = table if number else ""
+        yield task.plate_at(ends) or f"{ends[0]} - {ends[1]}{given}", table, length, scale
 
 
 def _scale_of(task: Task, group: Group) -> GivenScale | None:
@@ -166,7 +240,7 @@ def _left_out(
 ) -> Remark:
     """Return the remark that a bar, a plate or given points were left out because of their scale."""
     off, sigma = _difference(model, wrong, k)
-    kind = "bar_left_out" if k < bars else "scale_left_out"
+    kind = "bar_left_out" if k < bars and not names[k].startswith(TABLE) else "scale_left_out"
     kind = "plate_size_left_out" if names[k] in plates else kind
     return remark(kind, given=names[k], **numbers_of_scale(off, sigma))
 
@@ -189,9 +263,10 @@ class _Length:
 
 def _lengths(bars: ScaleBars) -> list[_Length]:
     """Return the lengths of scale bars; agreeing lengths between the same points are merged."""
-    same: dict[frozenset[int], list[list[int]]] = {}
+    same: dict[tuple[frozenset[int], int], list[list[int]]] = {}
     for b in np.argsort(bars.length, kind="stable").tolist():
-        alike = same.setdefault(frozenset((int(bars.start[b]), int(bars.end[b]))), [])
+        ends = frozenset((int(bars.start[b]), int(bars.end[b])))
+        alike = same.setdefault((ends, int(bars.table[b]) if len(bars.table) else 0), [])
         if alike and _agree(bars, alike[-1][0], b):
             alike[-1].append(b)
         else:
@@ -345,7 +420,7 @@ class Task:
     unit: str
     rescale: bool
     plates: tuple[frozenset[str], ...] = ()  # points of each plate; the first plate is control
-    checks_scale: bool = False  # whether given mounts check the scale of the others
+    checks_scale: bool = False  # whether mounts or tables check the scale of the others
 
     @property
     def of_plate(self) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.distributions import LEVEL
-from sfm.judgement.given.free_network import FreeNetwork, Reference
+from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
 from sfm.judgement.given.values import GivenModel, judge_values
 from sfm.network import Estimate, Network
 from sfm.observations.kind import Group, Kind, TableKind
@@ -52,7 +52,7 @@ def judge_tables(
         free: adjustment of the image points alone.
         place: gives the object frame from the frame of the free network, by all given values of a network.
     """
-    reference = free.reference_of([*_confirmed(network), *network.observations])
+    reference = free.reference_of([*confirmed(network), *network.observations])
     if reference is None or not network.observations:
         return ()
     judge = _Judge(network, reference, place)
@@ -107,7 +107,7 @@ class _Judge:
 
     def model(self, tables: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
         """Return the differences of observations from what the right values imply, and the kind of each."""
-        right = [kind for kind in _confirmed(self.network) if len(kind)]
+        right = [kind for kind in confirmed(self.network) if len(kind)]
         placing = self.place(replace(self.network, observations=tuple(tables)))
         model, kind = self.reference.differences([*right, *tables], placing)
         of_right = kind < len(right)
@@ -188,8 +188,3 @@ class _Judge:
 
     def _parts(self, kinds: Sequence[Kind]) -> tuple[str, ...]:
         return tuple(name for kind in kinds for name in kind.parts(self.network, self.estimate))
-
-
-def _confirmed(network: Network) -> tuple[Kind, ...]:
-    """Return the given values that were judged before."""
-    return network.control, network.exterior, network.scale_bars

@@ -161,8 +161,9 @@ ROWS = (
         "The scale of {given:@} [[differs by {off:+} from]][[is {times} times]] that of the other given "
         "values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} "
         "and {coarser}]]. They were left out.",
-        "coordinates in another unit or of another temperature, a print that shrank, or points that moved",
-        "Correct these coordinates or remove them.",
+        "coordinates or lengths in another unit or of another temperature, a tape that is too long, a print "
+        "that shrank, or points that moved",
+        "Correct these values or remove them.",
     ),
     Kind(
         "scale_contradicted",

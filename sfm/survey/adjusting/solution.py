@@ -77,6 +77,7 @@ from sfm.survey.placing import (
     place_on_exterior,
     place_on_frame,
     place_on_observations,
+    scale_sigma,
     scale_to_bars,
 )
 from sfm.survey.rigs import hold_mounts, split_blocks
@@ -127,7 +128,9 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     reference = _reference(start, free)
     mounts, of_mounts = _confirmed_mounts(start, reference)
     plates = _points_of_plates(survey, matched.naming, matched.network)
-    task, given = _with_confirmed_values(start, free, reference, plates, checks_scale=bool(len(mounts)))
+    others = replace(start.task.network, scale_bars=ScaleBars())
+    checks = len(mounts) > 0 or bool(np.isfinite(scale_sigma(others, start.estimate)))
+    task, given = _with_confirmed_values(start, free, reference, plates, checks_scale=checks)
     settled, gross = _settle_with_given(start, free, reference, task, given, mounts)
     report_step("adjusting all observations")
     found = _finish_from_best_start(start, settled)

@@ -16,6 +16,8 @@ from sfm.camera import Camera, base_name
 from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS
 from sfm.network import Estimate, Network
+from sfm.observations.kind import Group
+from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
 from sfm.result import LeftOutPoint
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
@@ -54,6 +56,7 @@ def remarks_on_solution(
         *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
         *weak_scale(adjustment),
+        *scale_alone(adjustment),
     )
 
 
@@ -117,6 +120,24 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
     sigma = scale_sigma(network, a.estimate)
     names = list(dict.fromkeys(one.name for one in network.observations))
     return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
+
+
+def scale_alone(a: Adjustment) -> tuple[Remark, ...]:
+    """Return the note on a scale that rests on one mount or one table; bars and control have theirs."""
+    network, mounts = a.network, a.estimate.mounts
+    if a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2:
+        return ()
+    sources = []
+    for kind in network.observations:
+        if isinstance(kind, MountObservations):
+            sources += [f"the mount of {name}" for name in kind.names(network, a.estimate)]
+        elif np.isfinite(scale_sigma(replace(network, observations=(kind,)), a.estimate)):
+            name = f"{kind.single} {kind.group}" if isinstance(kind, Group) else kind.name
+            sources.append(f"the {name}")
+    if mounts is not None:
+        held = mounts.position.any(axis=1) & ~mounts.free.any(axis=1)
+        sources += [f"the mount of {a.estimate.cameras[k].name}" for k in np.flatnonzero(held)]
+    return (remark("scale_unchecked", given=sources[0]),) if len(sources) == 1 else ()
 
 
 def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:

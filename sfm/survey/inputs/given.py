@@ -8,7 +8,7 @@ rules of all tables.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -199,6 +199,7 @@ class ScaleBar:
     end: str  # name of the second point
     length: float  # object unit
     sigma: float  # standard deviation, object unit
+    table: int = field(default=0, repr=False)  # number of the table of distances, 0: of none
 
     def __post_init__(self) -> None:
         for what, value in (("length", self.length), ("sigma", self.sigma)):

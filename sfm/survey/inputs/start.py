@@ -402,4 +402,5 @@ def scale_bars(bars: Sequence[ScaleBar], points: Sequence[str]) -> ScaleBars:
         np.array([index[bar.end] for bar in bars], dtype=np.int64),
         np.array([bar.length for bar in bars], dtype=float),
         np.array([bar.sigma for bar in bars], dtype=float),
+        np.array([bar.table for bar in bars], dtype=np.int64),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -148,7 +148,7 @@ class Survey:
             "unit": head.unit,
             "source": where,
             "cameras": cameras,
-            "scale_bars": (*self.scale_bars, *(bar for table in self.tables for bar in bars_of(table))),
+            "scale_bars": (*self.scale_bars, *self._distances()),
             "copied": tuple(
                 dict.fromkeys((*self.copied, *(n for table in self.tables for n in table.copies)))
             ),
@@ -170,6 +170,13 @@ class Survey:
             object.__setattr__(self, name, value)
         self._place_plate(where)
         refuse_contradictions(self)
+
+    def _distances(self) -> Iterator[ScaleBar]:
+        """Yield the bars of tables of distances, which are numbered."""
+        number = max((bar.table for bar in self.scale_bars), default=0)
+        for table in self.tables:
+            number += table.kind == DISTANCE
+            yield from bars_of(table, number)
 
     def _place_plate(self, where: str) -> None:
         """Use the points of a calibration plate as control, and as start values if there are none."""

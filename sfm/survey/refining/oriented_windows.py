@@ -338,7 +338,7 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
         points=network.points + added.points,
         image_points=joined,
         control=ObjectPoints(n + control.point, control.xyz, control.covariance),
-        scale_bars=ScaleBars(n + bars.start, n + bars.end, bars.length, bars.sigma),
+        scale_bars=bars.renumbered(n + np.arange(len(added.points))),
     ), replace(estimate, points=np.concatenate([estimate.points, targets.points]))
 
 
