@@ -196,8 +196,13 @@ class CoordinateDifferences(PointPairs):
         return d, np.broadcast_to(np.eye(3), (len(d), 3, 3))
 
     def mistakes(self) -> Mapping[str, Self]:
-        """Return the differences between exchanged points."""
-        return {**super().mistakes(), "exchanged": replace(self, value=-self.value)}
+        """Return the differences between exchanged points, and those with X and Y exchanged.
+
+        In a network of any attitude both are differences in a left-handed system, and any such one is.
+        """
+        swapped = replace(self, value=self.value[:, [1, 0, 2]], sigma=self.sigma[:, [1, 0, 2]])
+        exchanged = replace(self, value=-self.value)
+        return {**super().mistakes(), "exchanged": exchanged, "mirrored": swapped}
 
 
 class HorizontalDirections(Group):

@@ -394,6 +394,21 @@ def test_a_mistake_in_a_whole_table_is_named(
     assert {one.severity for one in said if one.kind == "kind_wrong"} == {"warning"}  # it does no harm
 
 
+@pytest.mark.parametrize(("level", "readings"), [(False, ("exchanged", "mirrored")), (True, ("mirrored",))])
+def test_left_handed_differences_have_two_readings_unless_heights_decide(
+    level: bool, readings: tuple[str, ...], tmp_path: Path
+) -> None:
+    network, truth = network_of("left-handed", ("coordinate difference", "height difference", "rigid frame"))
+    right, heights, frame = network.observations
+    swapped = right.with_values(right.values * [1.0, -1.0, 1.0])  # as X and Y exchanged, and a rotation by Z
+    given = {"coordinate difference": [swapped], "rigid frame": [frame]}
+    given |= {"height difference": [heights]} if level else {}
+    remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
+    said = {one.names("of"): one for one in remarks if one.kind == "kind_wrong"}
+    assert said[("coordinate differences",)].names("mistake") == readings
+    assert (", or if " in said[("coordinate differences",)].text) is not level
+
+
 @pytest.mark.parametrize(
     ("mistake", "lengths", "angles"),
     [("thousandfold", 1e-3, 1.0), ("thousandth", 1e3, 1.0), ("feet", 0.3048, 1.0), ("gon", 1.0, 0.9)],
