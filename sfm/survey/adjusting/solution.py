@@ -8,7 +8,6 @@ assumptions are tested.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,18 +19,15 @@ from sfm.adjustment.quality.correlations import estimate_error_correlation, with
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
-
-from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.tables import as_judged, judge_tables
+from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
