@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 
-from sfm.remarks.catalogue import SUBJECTS
+from sfm.remarks.catalogue import SUBJECTS, TESTS
 from sfm.remarks.kind import FIELD, Grade, Kind, Unless
 
 BEGIN, END = "<!-- remarks: written by docs/remark_tables.py -->", "<!-- end of remarks -->"
@@ -17,12 +17,17 @@ VARIES = "…"
 
 
 def remark_tables() -> str:
-    """Return one table of remarks for each subject of the catalogue, in Markdown."""
+    """Return one table of remarks for each subject of the catalogue, and that of the tests, in Markdown."""
     parts = []
     for subject, rows in SUBJECTS.items():
         parts += [f"### {subject}", "", "| remark | severity | cause | remedy |", "|---|---|---|---|"]
         parts += [_row(kind) for kind in rows]
         parts.append("")
+    parts += ["### What was tested", "", "| test | tested on | result, or why not |", "|---|---|---|"]
+    for row in TESTS.values():
+        cells = (f"{_pattern(row.test)} `{row.name}`", _pattern(row.on), _pattern(row.result))
+        parts.append("| " + " | ".join(cells) + " |")
+    parts.append("")
     return "\n".join(parts)
 
 
@@ -51,7 +56,8 @@ def _pattern(sentence: str) -> str:
             return spec.split("|")[1]
         return f"{VARIES} {spec}s" if spec and spec[0].isalpha() else VARIES
 
-    return FIELD.sub(field, sentence.replace("[[", "").replace("]]", ""))
+    alternatives = re.sub(r"\]\]\[\[(?=[A-Z{])", " / ", sentence)
+    return FIELD.sub(field, alternatives.replace("[[", "").replace("]]", ""))
 
 
 def _severity(kind: Kind) -> str:

@@ -328,7 +328,7 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
         try:
             return sensor_width_mm(make, model)
         except BackendError as error:
-            note(remark("sensor_not_looked_up", camera=f"{make} {model}", reason=str(error)))
+            note(remark("camera_assumed", cameras=f"{make} {model}", reason=str(error)))
             return None
 
     return width

@@ -24,8 +24,6 @@ from sfm.remarks.verdict import NOT_JUDGED, Verdict
 from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution
 from sfm.targets.outlines import LIKELIEST_FIRST, Flag, count_flags
 
-COPIES = ("copy_of_file", "copy_of_picture", "copy_of_image_points", "copy_of_errors")
-
 
 @dataclass(frozen=True)
 class FailedImage:
@@ -37,7 +35,7 @@ class FailedImage:
     @property
     def is_copy(self) -> bool:
         """Whether it is a copy of another photograph, which is used instead."""
-        return self.reason.kind in COPIES
+        return self.reason.kind == "copies"
 
 
 @dataclass(frozen=True)
@@ -181,6 +179,7 @@ class SurveyResult:
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()
     seconds: tuple[StageTime, ...] = ()  # computing time of each stage, in order
     settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, its content)
+    automatic_points: bool = False  # whether all points are of natural texture, which nobody names
     weights: str = "components"  # weighting of image points and other observations: components | stated
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 
@@ -193,6 +192,11 @@ class SurveyResult:
     def remarks(self) -> tuple[Remark, ...]:
         """All remarks of the verdict, the most serious first."""
         return self.verdict.remarks
+
+    @property
+    def tests(self) -> tuple[Remark, ...]:
+        """What was tested, and what could not be."""
+        return self.verdict.tests
 
     @property
     def network(self) -> Network:

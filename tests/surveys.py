@@ -169,8 +169,9 @@ def plates() -> Scene:
 
 def remarks_on_given(result: SurveyResult) -> tuple[Remark, ...]:
     """Return what a survey found of its scale bars, control and orientation before the adjustment."""
-    kinds = {row.name for row in given_values.ROWS}
-    return tuple(one for one in result.remarks if one.kind in kinds)
+    kinds = {row.name for row in given_values.ROWS} | {"scale_unchecked"}
+    kinds |= {f"given_{how}_checked" for how in ("partly", "weakly")} | {"given_unchecked"}
+    return tuple(one for one in (*result.remarks, *result.tests) if one.kind in kinds)
 
 
 def survey_of(

@@ -40,14 +40,12 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, st
 def test_a_survey_is_not_compared_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     survey = write_observed_survey(tmp_path / "s", "alone", images=5, points=12, backend="colmap")
     out = tmp_path / "out"
-    code, told = run(capsys, "adjust", survey, "--out", out)
-    assert code == 0 and INSTALL_PYCOLMAP in " ".join(told.split())
-    line = f"Not compared with another adjuster: {INSTALL_PYCOLMAP}."
-    remarks = json.loads((out / "summary.json").read_text(encoding="utf-8"))["verdict"]["remarks"]
-    (found,) = [one for one in remarks if one["kind"] == "adjuster_not_compared"]
-    assert found["text"] == line and found["severity"] == "note"
-    assert "Not compared with another adjuster: pycolmap" in (out / "report.html").read_text(encoding="utf-8")
-    assert line in " ".join((out / "report.txt").read_text(encoding="utf-8").split())
+    assert run(capsys, "adjust", survey, "--out", out)[0] == 0
+    tests = json.loads((out / "summary.json").read_text(encoding="utf-8"))["verdict"]["tests"]
+    (found,) = [one for one in tests if one["kind"] == "not_compared"]
+    assert found["subjects"] == {"what": ["adjuster"], "reason": [INSTALL_PYCOLMAP]}
+    for page in ("report.html", "report.txt"):
+        assert "not compared: pycolmap" in " ".join((out / page).read_text(encoding="utf-8").split())
 
 
 @pytest.mark.parametrize("arguments", [("validate", "--networks", 1), ("refine", "MODEL", "--images", ".")])
@@ -104,7 +102,7 @@ def test_a_camera_that_was_not_looked_up_is_reported() -> None:
     unknown: list[Remark] = []
     assert sfm.api.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
     (one,) = unknown
-    assert one.kind == "sensor_not_looked_up" and one.names("camera") == ("OLYMPUS C4040Z",)
+    assert one.kind == "camera_assumed" and one.names("cameras") == ("OLYMPUS C4040Z",)
     assert one.names("reason") == (INSTALL_PYCOLMAP,)
 
 

@@ -237,13 +237,14 @@ def totals(rows: Sequence[SurveyRow]) -> dict[str, int]:
 def batch_remarks(rows: Sequence[SurveyRow]) -> tuple[Remark, ...]:
     """Return the remarks on the outcomes of the surveys of a batch."""
     kinds = {
-        "surveys_failed": [row.survey for row in rows if row.status == "failed"],
-        "surveys_set_aside": [row.survey for row in rows if row.status == "set aside"],
         "surveys_not_dependable": [row.survey for row in rows if row.status == "done" and not row.succeeded],
         "surveys_with_warnings": [row.survey for row in rows if row.verdict == "fair"],
-        "adjuster_differs_in_surveys": [row.survey for row in rows if row.comparison == "differs"],
     }
-    return tuple(remark(kind, surveys=names) for kind, names in kinds.items() if names)
+    ended = {how: [row.survey for row in rows if row.status == how] for how in ("failed", "set aside")}
+    return (
+        *(remark("surveys_failed", how=how, surveys=names) for how, names in ended.items() if names),
+        *(remark(kind, surveys=names) for kind, names in kinds.items() if names),
+    )
 
 
 def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:

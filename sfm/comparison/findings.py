@@ -102,9 +102,7 @@ def _remark_on_differences(found: ResultComparison, longest: FloatArray, unit: s
         return remark("no_majority_agrees", first=found.names[0], second=found.names[1])
     names = [name for name, differs in zip(found.points, found.significant, strict=True) if differs]
     if not names:
-        return remark(
-            "points_differ_together", statistic=found.global_statistic, critical=found.global_critical
-        )
+        return remark("points_differ", statistic=found.global_statistic, critical=found.global_critical)
     largest = float(longest[found.significant].max())
     tested = int(np.isfinite(found.statistic).sum())
     return remark(

@@ -364,9 +364,9 @@ def judge_points(
         return PointTest(sigma, why, nothing, np.nan, ~every, np.nan, np.nan, every)
 
     if not n:
-        return without(remark("no_common_points"))
+        return without(remark("untestable", reason="no points are common"))
     if not any(has_sigma(one) for one in (a, b)):
-        return without(remark("no_sigmas"))
+        return without(remark("no_covariance", unknown="sigmas"))
     known = [one for one in (a, b) if has_sigma(one)]
     points, free, together = pairs
     if all(one.covariance is not None for one in known):
@@ -386,11 +386,11 @@ def judge_points(
         sigma[together] = 0.0  # held in both results, or overwritten below
         return _congruency_test(found, free, sigma, together)
     if not all(one.datum in FREE_DATUMS for one in known):
-        return without(remark("no_joint_covariance"))
+        return without(remark("no_covariance", unknown="covariance"))
     difference = transform.apply(b.estimate.points[pb]) - a.estimate.points[pa]
     statistic, critical, global_critical = _single_tests(difference, blocks, points.redundancy, alpha)
     if not np.isfinite(statistic).any():
-        return without(remark("no_sigmas"))
+        return without(remark("no_covariance", unknown="sigmas"))
     mean = float(np.nanmean(statistic))
     return PointTest(
         *(sigma, None, statistic, critical, statistic > critical, mean, global_critical, every),

@@ -287,9 +287,9 @@ def remarks_of_pair(found: Displacements) -> Iterator[Remark]:
             distance=(float(length[found.moved].max()), unit),
         )
     if d.held_alike:
-        yield remark("held_alike", cameras=d.held_alike, first=first, second=second)
+        yield remark("cameras_held", how="alike", cameras=d.held_alike, first=first, second=second)
     if d.held_apart:
-        yield remark("held_apart", cameras=d.held_apart, first=first, second=second)
+        yield remark("cameras_held", how="apart", cameras=d.held_apart, first=first, second=second)
 
 
 @checked_arguments()

@@ -83,15 +83,12 @@ class Acceptance:
         """
         unknown = np.array([decision == UNKNOWN for decision in self.decision])
         exceeding = int((unknown & (np.abs(self.error) > self.limit)).sum())
+        total, undecided = len(self.error), self.count(UNDECIDED)
+        out, without = self.count(OUT) + exceeding, int(unknown.sum()) - exceeding
         decided = [
-            remark(kind, **{name: number, "total": len(self.error)})
-            for kind, name, number in (
-                ("lengths_outside", "outside", self.count(OUT)),
-                ("lengths_exceed_limit", "exceeding", exceeding),
-                ("lengths_undecided", "undecided", self.count(UNDECIDED)),
-                ("lengths_without_sigma", "unknown", int(unknown.sum()) - exceeding),
-            )
-            if number
+            *([remark("out_of_tolerance", out=out, total=total, unknown=exceeding or None)] if out else []),
+            *([remark("tolerance_undecided", undecided=undecided, total=total)] if undecided else []),
+            *([remark("tolerance_unknown", unknown=without, total=total)] if without else []),
         ]
         return judge((*decided, *self.lacking, remark("temperature_unknown")), HEADLINES)
 
@@ -231,12 +228,12 @@ def _unmet_requirements(
     lines = list(dict.fromkeys(lengths.line))
     found = []
     if len(lines) < MIN_LINES:
-        found.append(remark("lines_missing", lines=len(lines), needed=MIN_LINES))
+        found.append(remark("lengths_lacking", lines=len(lines), needed=MIN_LINES))
     of_line: dict[str, FloatArray] = {}
     for line in lines:
         rows = np.array([k for k, one in enumerate(lengths.line) if one == line])
         if len(rows) < MIN_LENGTHS:
-            found.append(remark("line_short_of_lengths", line=line, lengths=len(rows), needed=MIN_LENGTHS))
+            found.append(remark("lengths_lacking", line=line, lengths=len(rows), needed=MIN_LENGTHS))
         longest = directions[rows[np.argmax(lengths.length[rows])]]
         of_line[line] = longest / np.linalg.norm(longest)
         off = np.linalg.norm(np.cross(directions[rows], of_line[line]), axis=1)
@@ -246,8 +243,8 @@ def _unmet_requirements(
         for second in lines[i + 1 :]:
             cosine = min(1.0, abs(float(of_line[first] @ of_line[second])))
             if np.rad2deg(np.arccos(cosine)) < SAME_DIRECTION_DEG:
-                found.append(remark("lines_parallel", lines=(first, second)))
+                found.append(remark("lengths_lacking", parallel=(first, second)))
     longest = float(lengths.length.max())
     if longest < MIN_LONGEST * diagonal:
-        found.append(remark("longest_length_short", longest=(longest, unit), diagonal=(diagonal, unit)))
+        found.append(remark("lengths_lacking", longest=(longest, unit), diagonal=(diagonal, unit)))
     return found

@@ -351,12 +351,8 @@ class _Work:
 
     def quantity(self, name: str, what: str, kind: str, function: Function) -> Quantity:
         variance = float(self.points.covariance_between([function])[0, 0])
-        remarks = []
-        if not np.isnan(variance):
-            if self.points.depends_on_datum(function).any():
-                remarks.append(remark("datum_dependent"))
-            if not self.points.correlated_among(function.points):
-                remarks.append(remark("correlations_unknown"))
+        dependent = not np.isnan(variance) and self.points.depends_on_datum(function).any()
+        remarks = [remark("datum_dependent")] if dependent else []
         sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
         return Quantity(name, what, kind, float(function.value[0]), sigma, tuple(remarks))
 
@@ -395,9 +391,9 @@ class _Work:
         if points.covariance is None:
             yield remark("no_precision")
         elif points.sample is not None:
-            yield remark("covariance_of_sample", known=len(points.sample), total=len(points.names))
+            yield remark("covariance_incomplete", known=len(points.sample), total=len(points.names))
         elif not points.correlated:
-            yield remark("covariance_of_single_points")
+            yield remark("covariance_incomplete", known=0, total=len(points.names))
         if not points.has_scale:
             yield remark("network_units")
         for fit in self.shapes.values():

@@ -7,17 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.quality.consistency import FAMILY, Consistency
+from sfm.adjustment.quality.consistency import FAMILY, Consistency, larger_than_the_others
 from sfm.adjustment.quality.statistics import more_than_chance
-from sfm.conventions import BoolArray, FloatArray
+from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.distributions import t_ppf
-from sfm.judgement.calibrated_cameras import CalibratedCamera
+from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.result import PhotographTargets, SurveyResult
 
 SURE_SIGMAS = 3.0  # standard deviations beyond which a deviation of a camera is considered real
-MAX_OFFSET_FRACTION = 0.25  # of the diagonal, half way to a corner: no principal point is farther off centre
 DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected
 
 
@@ -37,7 +35,7 @@ def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ..
     for one in calibrated:
         rms = one.projection_rms_px
         if np.isinf(rms):
-            found.append(remark("camera_not_determined", camera=one.name))
+            found.append(remark(CALIBRATION_FAILED, camera=one.name))
             continue
         times = rms / sigma if sigma > 0 else None
         weak = remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times)
@@ -72,11 +70,11 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         at, (width, height) = camera.principal_point_px, camera.size_px
         diagonal = float(np.hypot(width, height))
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
-        far = unless_note(remark("principal_point_far", camera=camera.name, share=away))
-        remarks += far
         sigma = _principal_sigma_px(result, number) / diagonal
-        if away - SURE_SIGMAS * sigma > MAX_OFFSET_FRACTION:
-            remarks.append(remark("principal_point_outside", camera=camera.name, share=away, sigma=sigma))
+        surely = away - SURE_SIGMAS * sigma
+        off = remark("principal_point_far", camera=camera.name, share=away, sigma=sigma, surely=surely)
+        far = unless_note(off)
+        remarks += far
         other = _format_around(at, width, height) if far else None
         if other is not None:
             remarks.append(
@@ -179,30 +177,3 @@ def sharpness_remarks(
                 )
             )
     return tuple(remarks)
-
-
-def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> BoolArray:
-    """Return which values exceed the others by more than chance explains, fewer than half of them, (n,).
-
-    Args:
-        values: values to compare, (n,).
-        level: probability that chance alone marks any of them.
-
-    Source: Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics
-    25(2), 165-172; one-sided.
-    """
-    n = len(values)
-    order = np.argsort(-values, kind="stable")
-    outliers = 0
-    for k in range((n - 1) // 2):
-        kept = values[order[k:]]
-        left = n - k
-        if left < 3 or not kept.std():
-            break
-        t = float(t_ppf(1 - level / left, left - 2))
-        critical = (left - 1) * t / np.sqrt((left - 2 + t**2) * left)
-        if (kept[0] - kept.mean()) / kept.std(ddof=1) > critical:
-            outliers = k + 1
-    large: BoolArray = np.zeros(n, dtype=bool)
-    large[order[:outliers]] = True
-    return large

@@ -24,8 +24,6 @@ from sfm.adjustment.quality.statistics import component_tests, more_than_chance,
 from sfm.adjustment.quality.variance_components import (
     IMAGE_POINTS,
     INTERIOR,
-    VarianceComponents,
-    by_kind,
 )
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
@@ -49,7 +47,7 @@ from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
-UNREADABLE = "photograph_unreadable"
+UNREADABLE = "photographs_unreadable"
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # Below this redundancy number, the rest of a value's error is smaller than rounding and the neglected second
 # order of other errors, and w magnifies those.
@@ -65,7 +63,6 @@ ADJUSTMENT_HEADLINES: Mapping[Level, str] = {
     "fair": "The adjustment worked, with remarks: {found}.",
     "bad": "The adjustment has no dependable result.",
 }
-SIGMA0_LOW = 0.5  # sigma0 over the stated value below which this is called pessimistic
 
 
 def judge_survey(result: SurveyResult) -> SurveyResult:
@@ -81,11 +78,11 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *photograph_remarks(result),
         *result.stage_remarks,
         *other_solution_remarks(result),
-        *sigma0_remarks(sigma0_of(a), statistics.kinds, a),
+        *sigma0_remarks(sigma0_of(a), a),
         *residual_remarks(longest_residual(a)),
-        *(untested_remarks(a) if result.reject == "none" else ()),
+        *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
-        *consistency_remarks(consistency),
+        *consistency_remarks(consistency, int(a.rejected.sum()), named=not result.automatic_points),
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
         *given_remarks(result, given_of(a, result.length_unit), statistics, check_coordinates(result)),
@@ -121,11 +118,11 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
             else ()
         ),
         *a.remarks,
-        *sigma0_remarks(sigma0_of(a), by_kind(a), a),
+        *sigma0_remarks(sigma0_of(a), a),
         *residual_remarks(longest_residual(a)),
-        *(() if rejects else untested_remarks(a)),
+        *gross_error_remarks(a, rejects=rejects),
         *ray_remarks(a),
-        *consistency_remarks(consistency_of(a)),
+        *consistency_remarks(consistency_of(a), int(a.rejected.sum())),
     )
     photographs = f"{oriented} of {counted(total, 'photograph')}"
     return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))
@@ -182,7 +179,7 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
         remarks.append(remark("photographs_missing", missing=missing, total=total, share=missing / total))
         remarks += _mirrored(result)
     if unreadable:
-        remarks.append(remark("photographs_unreadable", photographs=unreadable))
+        remarks.append(remark(UNREADABLE, photographs=unreadable))
     if copies:
         remarks.append(remark("copies", copies=copies))
     return tuple(remarks)
@@ -204,39 +201,32 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
     A flat valley of c contains many solutions; those in between add nothing.
     """
-    found: list[Remark] = []
+    found: dict[bool, Remark] = {}
     for other in sorted(result.other_solutions, key=lambda one: -one.moved):
-        one = (
-            remark("other_solution_reversed", vPv=other.vPv, moved=other.moved)
-            if other.reflected
-            else remark(
-                "other_solution",
-                camera=other.camera,
-                c=(other.c, other.unit),
-                vPv=other.vPv,
-                moved=other.moved,
-                **({"c_moved": other.c_moved} if other.c_moved else {}),
-            )
-        )
-        if all(one.kind != before.kind for before in found):
-            found.append(one)
-    return tuple(found)
+        of_camera = {"camera": other.camera, "c": (other.c, other.unit), "c_moved": other.c_moved or None}
+        parts = {"reversed": "object"} if other.reflected else of_camera
+        farthest = remark("other_solution", vPv=other.vPv, moved=other.moved, **parts)
+        found.setdefault(other.reflected, farthest)
+    return tuple(found.values())
 
 
-def sigma0_remarks(sigma0: Sigma0, kinds: VarianceComponents, adjustment: Adjustment) -> tuple[Remark, ...]:
-    """Return remarks on a sigma0 far from its a priori value, and on errors shared by neighbours."""
+def sigma0_remarks(sigma0: Sigma0, adjustment: Adjustment) -> tuple[Remark, ...]:
+    """Return sigma0 as a test of the stated value, and the remark on a sigma0 that is far above it.
+
+    The remark states errors that neighbours share.
+    """
     parts, shared = {}, adjustment.error_correlation
     if shared is not None and shared.common > shared.alone:
         parts["common"] = (shared.sigmas_px(adjustment.sigma0_px)[1], "px")
         parts["length"] = (shared.length_px, "px")
     stated = (sigma0.stated_px, "px")
-    remarks = [*unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=stated, **parts))]
-    image = component_tests(kinds, alpha=2 * LEVEL)[0]
-    if sigma0.ratio < SIGMA0_LOW and image.statistic < image.lower:
-        remarks.append(
-            remark("sigma_px_cautious", stated=(sigma0.stated_px, "px"), found=(sigma0.image_points_px, "px"))
-        )
-    return tuple(remarks)
+    tested = remark(
+        "image_sigma_tested",
+        tested=2 * int((~adjustment.rejected).sum()),
+        stated=stated,
+        found=(sigma0.image_points_px, "px"),
+    )
+    return (tested, *unless_note(remark("sigma0_high", ratio=sigma0.ratio, stated=stated, **parts)))
 
 
 def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
@@ -251,24 +241,21 @@ def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
     return unless_note(kept) if np.isfinite(worst.over_sigma) else ()
 
 
-def untested_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the test of single image coordinates, for an adjustment that rejects nothing."""
+def gross_error_remarks(a: Adjustment, *, rejects: bool) -> tuple[Remark, ...]:
+    """Return the test of the accepted image coordinates; as a remark if nothing was rejected."""
     found = robust_test(a)
-    if not found.far_more:
-        return ()
-    return (
-        remark(
-            "gross_errors_kept",
-            beyond=found.beyond,
-            tested=found.tested,
-            critical=found.critical,
-            chance=found.expected,
-        ),
-    )
+    numbers = {
+        "beyond": found.beyond,
+        "tested": found.tested,
+        "critical": found.critical,
+        "chance": found.expected,
+    }
+    tested = (remark("gross_errors_tested", **numbers),) if found.tested else ()
+    return tested if rejects or not found.far_more else (*tested, remark("gross_errors_kept", **numbers))
 
 
 def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return remarks on points that lost more rays than by chance, on points with two rays, and on a pair.
+    """Return the points that lost more rays than by chance, and those with two rays, whose errors remain.
 
     Known coordinates check the rays of a point, however few there are.
     """
@@ -278,27 +265,38 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     lost = np.bincount(point[rejected & took_part], minlength=n)
     rays = np.bincount(point[took_part], minlength=n)
     most = np.flatnonzero(more_than_chance(lost, rays, FAMILY))
-    remarks = []
-    if len(most):
-        remarks.append(remark("rays_rejected", points=[network.points[j] for j in most]))
     by_rays = np.ones(n, dtype=bool)
     if a.datum == "control":
         by_rays[network.control.complete.point] = False
-    if len(network.images) == 2 and by_rays.any():
-        remarks.append(remark("two_photographs"))
     two = int((by_rays & (rays - lost == 2)).sum())
-    if two:
-        remarks.append(remark("two_rays", two=two, total=n))
-    return tuple(remarks)
+    names = [network.points[j] for j in most] or None
+    return (
+        remark("rays_tested", tested=int(took_part.sum()), more=len(most), points=names),
+        *((remark("third_ray_missing", two=two, total=n),) if two else ()),
+    )
 
 
-def consistency_remarks(found: Consistency) -> tuple[Remark, ...]:
-    """Return remarks on the tests of points and photographs."""
+def consistency_remarks(found: Consistency, rejected: int, *, named: bool = True) -> tuple[Remark, ...]:
+    """Return the tests of points and photographs, and remarks on those that a person can correct.
+
+    Args:
+        found: the tests.
+        rejected: number of rejected image points.
+        named: whether a person named the points; nobody can correct those of natural texture.
+    """
     remarks = []
-    if found.doubtful:
-        remarks.append(remark("points_doubtful", points=[one.point for one in found.doubtful]))
-    if found.large:
-        remarks.append(remark("points_with_large_residuals", points=found.large))
+    doubtful = [one.point for one in found.doubtful]
+    if found.tested:
+        large = {"larger": len(found.large), "points": found.large or None}
+        of_rejected = {"doubtful": len(doubtful), "points": doubtful or None}
+        remarks += [
+            remark("points_tested", tested=found.tested, **large),
+            remark("doubtful_tested", tested=rejected, **of_rejected),
+        ]
+    if named and doubtful:
+        remarks.append(remark("points_doubtful", points=doubtful))
+    if named and found.outlying:
+        remarks.append(remark("points_with_large_residuals", points=found.outlying))
     uneven = found.uneven
     if uneven is not None:
         remarks.append(
@@ -353,6 +351,10 @@ def given_remarks(
         *_kinds(statistics, {test.what for test in result.given_tests}),
         *_checks(checks, result.length_unit),
         *_scale(result),
+        *(
+            remark("given_tested", of=one.what, chi2=one.statistic, dof=one.dof, p=one.probability)
+            for one in result.given_tests
+        ),
     )
 
 
@@ -383,11 +385,11 @@ def _differing(given: Given) -> Iterator[Remark]:
         worst = _beyond_chance(kind) if kind else None
         if kind and worst:
             shift = abs(worst.w) * np.sqrt((1 - worst.r) / worst.r)
-            yield remark("given_differs", shift=shift, **_parts(worst, kind))
+            yield remark("given_differs", shift=shift, harm=shift, **_parts(worst, kind))
     for kind in given.exterior:
         worst = _beyond_chance(kind)
         if worst:
-            yield remark("orientation_differs", **_parts(worst, kind))
+            yield remark("given_differs", harm=0.0, **_parts(worst, kind))
 
 
 def _beyond_chance(kind: GivenResiduals) -> GivenValue | None:
@@ -408,24 +410,26 @@ def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tup
 
 
 def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...]:
-    """Return the remark on the worst coordinate that took no part, or on most of them together."""
+    """Return the remark on the coordinates that took no part and differ."""
     tested = [one for one in checks if np.isfinite(one.test)]
     critical = -normal_ppf(LEVEL / (2 * max(len(tested), 1)))
     beyond = [one for one in tested if abs(one.test) > critical]
     if not beyond:
         return ()
-    points, off = {one.point for one in tested}, {one.point for one in beyond}
-    if 2 * len(off) > len(points):
-        farthest = max(abs(one.difference) for one in beyond)
-        return (remark("checks_contradict", count=len(off), all=len(points), distance=(farthest, unit)),)
-    worst = max(beyond, key=lambda one: abs(one.test))
+    points = {one.point for one in tested}
+    differing = list(dict.fromkeys(one.point for one in beyond))
+    coordinates = sorted({one.coordinate for one in beyond})
+    farthest = max(abs(one.difference) for one in beyond)
     return (
         remark(
-            "check_differs",
-            coordinate=worst.coordinate,
-            point=worst.point,
-            difference=(abs(worst.difference), unit),
-            sigmas=abs(worst.test),
+            "checks_differ",
+            points=differing,
+            coordinates=coordinates,
+            count=len(differing),
+            all=len(points),
+            more=2 * len(differing) - len(points),
+            distance=(farthest, unit),
+            sigmas=max(abs(one.test) for one in beyond),
         ),
     )
 

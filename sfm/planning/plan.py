@@ -223,7 +223,7 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
         yield remark("plan_short_of_wanted", times=plan.shortfall)
     few = int((p.rays < MIN_RAYS).sum())
     if few:
-        yield remark("plan_points_with_few_rays", few=few, needed=MIN_RAYS)
+        yield remark("plan_has_few", few=few, needed=MIN_RAYS)
     bad = [c for c in plan.calibrations if not c.good]
     if bad:
         reasons = tuple(dict.fromkeys(reason for c in bad for reason in c.reasons))
@@ -233,19 +233,18 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
         yield remark("plan_photographs_apart", photographs=plan.unusable, needed=MIN_POINTS)
     if plan.design is not None and plan.design.limit:
         yield remark("plan_limited", limit=plan.design.limit)
-    if p.adjustment.expected_defect == MOTIONS:
-        yield remark("plan_without_scale")
-    if p.planned.mesh is None:
-        yield remark("plan_without_surface")
     uncoded = [s.station for s in plan.shots if s.coded < MIN_CODES]
     if uncoded:
-        yield remark("plan_few_codes", photographs=uncoded, needed=MIN_CODES)
-    if np.isnan(p.planned.normals).any():
-        yield remark("plan_without_normals")
-    if plan.seeing.sigma_px is None:
-        yield remark("plan_sigma_of_targets")
-    if plan.seeing.depth is None:
-        yield remark("plan_without_depth_of_field")
+        yield remark("plan_has_few", photographs=uncoded, needed=MIN_CODES)
+    assumed = {
+        "known scale": p.adjustment.expected_defect == MOTIONS,
+        "no surface": p.planned.mesh is None,
+        "no normals": bool(np.isnan(p.planned.normals).any()),
+        "precision of targets": plan.seeing.sigma_px is None,
+        "no depth of field": plan.seeing.depth is None,
+    }
+    if any(assumed.values()):
+        yield remark("plan_assumes", assumed=[name for name, is_assumed in assumed.items() if is_assumed])
 
 
 @dataclass(frozen=True)

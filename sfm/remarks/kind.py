@@ -1,6 +1,6 @@
-"""Kind: a row of the catalogue of remarks, which turns a remark into sentences.
+"""Rows of the catalogue, which turn a remark into sentences: `Kind`, and `Tested` of the table of tests.
 
-Sentence, cause and remedy are texts with fields in braces. Each field shows one part of the remark:
+Their texts have fields in braces. Each field shows one part of the remark:
 
     {point}                 names, listed          {distance}            number with its unit
     {points:point}          "3 points"             {count:point}         the same for a number
@@ -37,13 +37,35 @@ MIN_PROBABILITY = 1e-3  # smaller probabilities are written as "p < 0.001"
 # 48(2)).
 EXPECTED_SIGMAS = 3.0
 NOUNS = {  # subjects of remarks, by their names in the data
+    # plates, by their codes
+    "aprilgrid": "AprilGrid",
+    "charuco": "ChArUco board",
+    "checkerboard": "checkerboard",
+    "grid": "calibration plate",
+    "adjuster": "another adjuster",
     "bars": "the scale bars",
     "cameras": "Interior parameters",
     "centres": "the projection centres",
     "control": "the control points",
     "coordinates": "Coordinates",
     "coordinates without control": "Coordinates of the network without the control points",
+    "datum": "the datum points",
+    "diameters": "the targets with given diameters",
+    "observations": "the survey observations",
+    "covariance": "covariances",
+    "sigmas": "standard deviations",
+    "alike": "at the same values",
+    "apart": "at different values or in one of them",
     "lengths": "the given lengths",
+    "pipeline": "another pipeline",
+    "object": "the object reversed in depth",
+    "scale": "the scale",
+    # what a plan assumes
+    "known scale": "a scale without error",
+    "no surface": "that no surface hides a point",
+    "no normals": "that points are seen from everywhere",
+    "precision of targets": "the precision that the targets allow, without errors of lens and sensor",
+    "no depth of field": "that all distances are sharp",
     # mistakes in tables of survey observations
     "counter-clockwise": "directions are counted counter-clockwise",
     "elevation": "angles are counted from the horizon",
@@ -102,33 +124,16 @@ class Unless:
 
 
 @dataclass(frozen=True)
-class Kind:
+class Row:
     """A row of the catalogue."""
 
     name: str
-    severity: Severity | Grade | Unless
-    sentence: str  # with fields, see the module docstring
-    cause: str  # why it happens, with the same fields
-    remedy: str  # advice, with the same fields
-    short: str = ""  # noun for it in sentences of other remarks that have this kind as a subject
-    explains: tuple[str, ...] = ()  # kinds that follow from it and whose remedies would mislead
-
-    @property
-    def fields(self) -> frozenset[str]:
-        """Names of the parts in the sentence."""
-        return frozenset(name for name, _ in FIELD.findall(self.sentence))
-
-    def severity_of(self, one: Remark) -> Severity:
-        """Return the severity of a remark of this kind."""
-        if isinstance(self.severity, str):
-            return self.severity
-        return self.severity.severity_of(one)
 
     def write(self, text: str, one: Remark) -> str:
         """Fill the fields of a text with the parts of a remark.
 
         Args:
-            text: sentence, cause or remedy of this kind.
+            text: text of this row.
             one: the remark.
 
         Raises:
@@ -149,6 +154,38 @@ class Kind:
             return _written(stated if spec.startswith(".") else parts, name, spec)
 
         return FIELD.sub(field, text)
+
+
+@dataclass(frozen=True)
+class Tested(Row):
+    """A row of the table "What was tested": a test, and its result or why there is none."""
+
+    test: str
+    on: str  # what was tested, with fields
+    result: str  # with fields
+
+
+@dataclass(frozen=True)
+class Kind(Row):
+    """A kind of remark, which leads a reader to an action."""
+
+    severity: Severity | Grade | Unless
+    sentence: str  # with fields, see the module docstring
+    cause: str  # why it happens, with the same fields
+    remedy: str  # advice, with the same fields
+    short: str = ""  # noun for it in sentences of other remarks that have this kind as a subject
+    explains: tuple[str, ...] = ()  # kinds that follow from it and whose remedies would mislead
+
+    @property
+    def fields(self) -> frozenset[str]:
+        """Names of the parts in the sentence."""
+        return frozenset(name for name, _ in FIELD.findall(self.sentence))
+
+    def severity_of(self, one: Remark) -> Severity:
+        """Return the severity of a remark of this kind."""
+        if isinstance(self.severity, str):
+            return self.severity
+        return self.severity.severity_of(one)
 
 
 def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
-    from sfm.remarks.kind import Kind
+    from sfm.remarks.kind import Kind, Tested
 
 Severity = Literal["note", "warning", "error"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the most serious first
@@ -47,19 +47,38 @@ class Remark:
 
     @property
     def row(self) -> Kind:
-        """Row of its kind in the catalogue."""
+        """Row of its kind in the catalogue; KeyError for a test."""
         from sfm.remarks.catalogue import KINDS
 
         return KINDS[self.kind]
 
     @property
+    def test(self) -> Tested | None:
+        """Row of the table of tests; None if it is a remark that leads to an action."""
+        from sfm.remarks.catalogue import TESTS
+
+        return TESTS.get(self.kind)
+
+    @property
+    def tested(self) -> tuple[str, str, str]:
+        """Test, what was tested, and the result or why there is none, of a row of the table of tests."""
+        from sfm.remarks.catalogue import TESTS
+
+        row = TESTS[self.kind]
+        return self._write(row.test), self._write(row.on), self._write(row.result)
+
+    @property
     def severity(self) -> Severity:
         """Severity, from the catalogue and from the remarks that it explains: note, warning or error."""
+        if self.test is not None:
+            return "note"
         return min(self.row.severity_of(self), self.at_least, key=SEVERITIES.index)
 
     @property
     def text(self) -> str:
-        """Sentence of the catalogue."""
+        """Sentence of the catalogue; of a test what was tested, and the result."""
+        if self.test is not None:
+            return "{}, {}: {}.".format(*self.tested)
         return self._write(self.row.sentence)
 
     @property
@@ -79,7 +98,7 @@ class Remark:
             role: tuple(KINDS[name].short or name if name in KINDS else name for name in names)
             for role, names in self.subjects.items()
         }
-        return self.row.write(text, replace(self, subjects=subjects))
+        return (self.test or self.row).write(text, replace(self, subjects=subjects))
 
     def number(self, name: str) -> float:
         """Return the value of a number, or NaN if the remark has no number of that name."""
@@ -91,18 +110,22 @@ class Remark:
         return self.subjects.get(role, ())
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the remark for JSON: kind, severity, text, subjects, numbers with units, cause, remedy."""
+        """Return the remark for JSON: kind, subjects, numbers with units, and its texts.
+
+        The texts of a remark are severity, text, cause and remedy; those of a test are test, on and result.
+        """
+        if self.test is None:
+            texts = {"severity": self.severity, "text": self.text, "cause": self.cause, "remedy": self.remedy}
+        else:
+            texts = dict(zip(("test", "on", "result"), self.tested, strict=True))
         return {
             "kind": self.kind,
-            "severity": self.severity,
-            "text": self.text,
+            **texts,
             "subjects": {role: list(names) for role, names in self.subjects.items()},
             "numbers": {
                 name: {"value": one.value if math.isfinite(one.value) else None, "unit": one.unit}
                 for name, one in self.numbers.items()
             },
-            "cause": self.cause,
-            "remedy": self.remedy,
         }
 
 
@@ -117,9 +140,10 @@ def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] |
     Raises:
         KeyError: the catalogue has no such kind.
     """
-    from sfm.remarks.catalogue import KINDS
+    from sfm.remarks.catalogue import KINDS, TESTS
 
-    KINDS[kind]  # a misspelt kind fails where the remark is made
+    if kind not in TESTS:
+        KINDS[kind]  # a misspelt kind fails where the remark is made
     subjects: dict[str, tuple[str, ...]] = {}
     numbers: dict[str, Quantity] = {}
     for name, part in parts.items():

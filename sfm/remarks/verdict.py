@@ -35,6 +35,7 @@ class Verdict:
     level: Level
     headline: str
     remarks: tuple[Remark, ...]  # the most serious first
+    tests: tuple[Remark, ...] = ()  # what was tested, and what could not be
 
     @property
     def lines(self) -> tuple[Line, ...]:
@@ -59,7 +60,8 @@ class Verdict:
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         remarks = [one.as_dict() for one in self.remarks]
-        return {"headline": self.headline, "verdict": self.level, "remarks": remarks}
+        tests = [one.as_dict() for one in self.tests]
+        return {"headline": self.headline, "verdict": self.level, "remarks": remarks, "tests": tests}
 
 
 NOT_JUDGED = Verdict("bad", "The result was not judged.", ())
@@ -73,10 +75,12 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     stated instead.
 
     Args:
-        remarks: all remarks on the result, in reading order within a severity.
+        remarks: all remarks on the result, in reading order within a severity, and all tests.
         headlines: headline of each level for this kind of result.
     """
-    every = tuple(remarks)
+    found = tuple(remarks)
+    tests = tuple(one for one in found if one.test is not None)
+    every = tuple(one for one in found if one.test is None)
     every = tuple(
         replace(one, at_least=_worst_explained(one, every))
         for one in every
@@ -84,7 +88,7 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
     )
     order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
-    return Verdict(level, headlines[level], order)
+    return Verdict(level, headlines[level], order, tests)
 
 
 def _explains(cause: Remark, one: Remark) -> bool:

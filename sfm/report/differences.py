@@ -31,6 +31,7 @@ from sfm.report.page import (
     Section,
     Table,
     axes,
+    tested_section,
     values_of,
 )
 from sfm.report.phrases import finer_unit, fixed, general, length_of, significant
@@ -98,16 +99,18 @@ def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
             strict=True,
         )
     ]
+    verdict = verdict_of_comparison(found)
     return Page(
         "comparison",
         "Comparison",
         f"{second} minus {first}",
-        verdict_of_comparison(found),
+        verdict,
         (
             Section("Figures", _figures(found, known), note),
             Section("Test", *_test(found, tested)),
             Section("Picture", picture),
             *(Section(f"Camera {one.camera}", *_camera(one, second)) for one in found.interior),
+            tested_section(verdict),
             Section("Points", FoldedParts(counted(len(rows), "point"), Table(columns, rows, "differences"))),
         ),
         summary=_summary(found, tested),

@@ -28,6 +28,7 @@ from sfm.report.page import (
     Section,
     Table,
     axes,
+    tested_section,
     values_of,
 )
 from sfm.report.phrases import finer_unit, general, significant
@@ -66,6 +67,7 @@ def page(found: EpochSeries) -> Page:
         (
             Section("Series", plot_series(found)),
             *(_section(pair, k) for k, pair in enumerate(found.pairs)),
+            tested_section(verdict),
         ),
         viewer=displacements_viewer(found),
         summary={

@@ -31,6 +31,7 @@ from sfm.report.page import (
     Tile,
     axes,
     facts,
+    tested_section,
     values_of,
 )
 from sfm.report.phrases import fixed, general, signed, significant, with_sigma
@@ -394,6 +395,7 @@ def acceptance_page(found: Acceptance) -> Page:
         a.verdict,
         (
             Section("Figures", figures, note, plot("errors", PICTURE, length_error_figure(found))),
+            tested_section(a.verdict),
             Section("Lengths", Table(columns, list(rows), "lengths")),
         ),
         summary=summary,

@@ -292,6 +292,13 @@ class Section:
         self.parts = tuple(part for part in parts if part is not None)
 
 
+def tested_section(verdict: Verdict) -> Section:
+    """Return the section on what was tested, on what, and with which result; empty if nothing was."""
+    rows = [one.tested for one in verdict.tests]
+    table = Table(columns("test", "tested on", "result or why not"), rows) if rows else None
+    return Section("What was tested?", table, key="tested")
+
+
 @dataclass(frozen=True)
 class Tile:
     """A key figure at the top of a page."""

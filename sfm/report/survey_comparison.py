@@ -22,7 +22,7 @@ def adjuster_parts(f: Findings) -> Iterator[Part]:
         yield Paragraph("The survey did not request a comparison.")
         return
     d, name = both.comparison, program_name(both.backend)
-    alike = " ".join(one.text for one in of_kind(f.verdict.remarks, "adjuster_fits_alike"))
+    alike = " ".join(one.text for one in of_kind(f.verdict.tests, "adjuster_fits_alike"))
     better = " ".join(one.text for one in of_kind(f.verdict.remarks, "adjuster_fits_better"))
     if both.stopped_early:
         short = significant(d.max_sigmas)

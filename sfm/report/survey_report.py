@@ -39,6 +39,7 @@ from sfm.report.page import (
     columns,
     columns_of,
     facts,
+    tested_section,
 )
 from sfm.report.pages import text, wrapped
 from sfm.report.phrases import (
@@ -248,6 +249,11 @@ def quality(report: Report) -> Section:
         *(photographs, report.plot("photographs"), *quality_of.component_parts(f)),
         key="quality",
     )
+
+
+def tested(report: Report) -> Section:
+    """Return the section on what was tested."""
+    return tested_section(report.f.verdict)
 
 
 def rejected(report: Report) -> Section:
@@ -518,7 +524,7 @@ def baseline(report: Report) -> Section:
 
 
 SECTIONS: tuple[Callable[[Report], Section], ...] = (
-    *(worked, quality, rejected, comparison, baseline),
+    *(worked, quality, tested, rejected, comparison, baseline),
     *(coordinates, photographs, process),
 )
 """The sections of the report, in their order."""

@@ -82,6 +82,7 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,
+        automatic_points=survey.tie_points is not None,
         plates=_plates(survey, code),
         check_points=_check_points(survey),
         equipment=survey.equipment,
@@ -208,16 +209,16 @@ def compare_solution(
             try:
                 adjusters = compare_adjusters(solution.adjustment, others.adjuster)
             except MissingLibraryError as error:
-                remarks.append(remark("adjuster_not_compared", reason=str(error)))
+                remarks.append(remark("not_compared", what="adjuster", reason=str(error)))
             except KolinearError as error:
-                remarks.append(remark("adjuster_failed", reason=str(error)))
+                remarks.append(remark("comparison_failed", what="adjuster", reason=str(error)))
     if others.mapper is not None and files is not None:
         with clock.stage("baseline"):
             try:
                 mapped = others.mapper(files.folder, files.by_camera())
                 baseline = compare_baseline(solution.adjustment, mapped, seconds=own_seconds)
             except MissingLibraryError as error:
-                remarks.append(remark("pipeline_not_compared", reason=str(error)))
+                remarks.append(remark("not_compared", what="pipeline", reason=str(error)))
             except KolinearError as error:
-                remarks.append(remark("pipeline_failed", reason=str(error)))
+                remarks.append(remark("comparison_failed", what="pipeline", reason=str(error)))
     return SurveyComparison(adjusters, baseline, tuple(remarks))

@@ -147,7 +147,7 @@ def _remark_on_unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> 
     unknown = [name for name in given.names if name not in known] if given is not None else []
     if given is None or not unknown:
         return ()
-    return (remark("diameters_of_unknown", targets=unknown),)
+    return (remark("names_missing", of="diameters", names=unknown),)
 
 
 def _remarks_on_diameters(
@@ -174,8 +174,8 @@ def _remarks_on_diameters(
         if abs(np.log(given / seen)) > np.log1p(OTHER_SIZE):
             remarks.append(
                 remark(
-                    "diameter_differs",
-                    targets=int(common.sum()),
+                    "diameters_differ",
+                    differing=int(common.sum()),
                     stated=(given, survey.unit),
                     found=(seen, survey.unit),
                 )
@@ -191,7 +191,6 @@ def _remarks_on_diameters(
                 found=(2 * found[worst], survey.unit),
                 differing=int(differs.sum()),
                 total=int(single.sum()),
-                limit=(100 * OTHER_SIZE, "%"),
             )
         )
     return tuple(remarks)

@@ -14,7 +14,6 @@ import numpy as np
 from sfm.conventions import IntArray
 from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate
-from sfm.remarks.remark import remark
 from sfm.survey.orientation import Oriented, orient_with_models
 from sfm.survey.rigs import middle_rotation, with_moments
 
@@ -42,8 +41,8 @@ def agree_on_clocks(oriented: Oriented) -> Oriented:
     if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(LEVEL, dof, dof):
         return oriented
     said = tuple(
-        remark("clock_differs", **one.subjects, ahead=one.numbers["ahead"])
-        if one.kind == "clocks_unsure"
+        replace(one, subjects={role: names for role, names in one.subjects.items() if role != "unsure"})
+        if one.kind == "clock_differs"
         else one
         for one in measured.remarks
     )

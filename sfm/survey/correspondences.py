@@ -95,7 +95,7 @@ def find_correspondences(oriented: Oriented, *, jobs: int = 1) -> Correspondence
     named = {name for name, _ in left_out}
     lost = start.estimate.oriented & ~circles.estimate.oriented
     left_out += tuple(
-        (photographs.names[i], remark("photograph_with_few_accepted", needed=MIN_IMAGE_POINTS))
+        (photographs.names[i], remark("photograph_with_few_fitting", needed=MIN_IMAGE_POINTS))
         for i in np.flatnonzero(lost)
         if photographs.names[i] not in named
     )

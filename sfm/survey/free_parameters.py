@@ -251,9 +251,9 @@ def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int)
     for name, (value, sigma) in settings.weighted[:1]:
         unit = units[MODELS[settings.model].names.index(name)]
         observed = remark(
-            "c_observed",
+            "parameters_chosen",
             camera=settings.name,
-            parameter=name,
+            weighted=name,
             photographs=photographs,
             given=(value, unit),
             sigma=(sigma, unit),
@@ -262,6 +262,6 @@ def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int)
     if settings.free:
         freed = settings.free
         found.append(
-            remark("parameters_freed", camera=settings.name, parameters=freed, photographs=photographs)
+            remark("parameters_chosen", camera=settings.name, parameters=freed, photographs=photographs)
         )
     return found or [remark("interior_held", camera=settings.name, photographs=photographs)]

@@ -250,8 +250,8 @@ def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
         unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
     return (
-        *([remark("observations_unused", observations=unused)] if unused else []),
-        *([remark("observations_identical", observations=survey.copied)] if survey.copied else []),
+        *([remark("names_missing", of="observations", names=unused)] if unused else []),
+        *([remark("rows_identical", rows=survey.copied)] if survey.copied else []),
         *([remark("frame_points_computed", points=computed)] if computed else []),
     )
 

@@ -109,7 +109,8 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     if held and len(network.images) > 2:
         held += (remark("pair_contradicted", others=len(network.images) - 2),)
     elif held:
-        wrong_c = tuple(replace(one, kind="c_looks_wrong_of_pair") for one in wrong_c)
+        of_pair = {"pair": ("c",)}
+        wrong_c = tuple(replace(one, subjects={**one.subjects, **of_pair}) for one in wrong_c)
     found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
     if survey.tie_points:
         found = replace(

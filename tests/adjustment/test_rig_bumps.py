@@ -45,7 +45,7 @@ def test_a_bump_of_six_sigma_is_named(cameras: int, moved: int) -> None:
     assert found.photograph == network.images[moved]
     assert found.shift == pytest.approx(shift, rel=0.7)
     (said,) = bump_remarks(b, "m")
-    assert said.kind == "rig_bumped" and said.names("photographs") == (network.images[moved],)
+    assert said.kind == "rig_contradicted" and said.names("photographs") == (network.images[moved],)
 
 
 def test_two_bumps_are_both_named() -> None:

@@ -351,5 +351,5 @@ def test_only_rounds_in_a_row_that_do_not_converge_end_reweighting(monkeypatch: 
     apart = run_with((0, 2, 4))
     assert len(rounds) == every and apart.remarks == ()
     broken = run_with((1, 2, 3))
-    assert len(rounds) == 4 + 1 and kinds_of(broken.remarks) == ("reweighting_not_converging",)
+    assert len(rounds) == 4 + 1 and kinds_of(broken.remarks) == ("rejection_not_converging",)
     assert broken.remarks[0].number("rounds") == rejection.MAX_VAGUE_WEIGHTS + 1

@@ -216,7 +216,7 @@ def test_more_reweightings_without_convergence_help_no_network(monkeypatch: pyte
             except GeometryError:
                 break
             found.append(point_error(a, truth))
-            if "reweighting_not_converging" not in kinds_of(a.remarks) and not len(found) > 1:
+            if "rejection_not_converging" not in kinds_of(a.remarks) and not len(found) > 1:
                 break
             ended += len(found) == 1
         monkeypatch.undo()

@@ -87,6 +87,11 @@ def test_the_first_command_of_the_guide_determines_its_network(tmp_path: Path) -
     assert found["verdict"] == "good"
 
 
+def assumed(out: Path) -> set[str]:
+    found = json.loads((out / "plan.json").read_text(encoding="utf-8"))["remarks"]
+    return {name for one in found if one["kind"] == "plan_assumes" for name in one["subjects"]["assumed"]}
+
+
 def kinds(out: Path) -> set[str]:
     found = json.loads((out / "plan.json").read_text(encoding="utf-8"))
     return {one["kind"] for one in found["remarks"]}
@@ -103,13 +108,13 @@ def test_a_plan_has_one_focus_and_says_what_it_takes_as_known(
     given = (tmp_path / "points.csv", *LENS, "--free", "none", "--stations", "ring:6", "--out", out)
     assert plan(*given) == 0
     capsys.readouterr()
-    assert {"plan_without_scale", "plan_without_surface", "plan_without_normals"} <= kinds(out)
+    assert {"no surface", "no normals", "known scale"} <= assumed(out)
     assert len({row["focus"] for row in rows_of(out / "shots.csv")}) == 1
     assert (
         plan(*given, *("--f-number", 22, "--focus", 150, "--confusion-um", 200), "--scale-bar", "a,d,0.01")
         == 0
     )
-    assert "plan_without_scale" not in kinds(out)
+    assert "known scale" not in assumed(out) and "no depth of field" not in assumed(out)
     assert {row["focus"] for row in rows_of(out / "shots.csv")} == {"150.0"}
     # what has no normal cannot be painted
     assert plan(out, "--out", tmp_path / "simulation", command="simulate") == 2

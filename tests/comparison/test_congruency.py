@@ -170,7 +170,7 @@ def test_without_a_common_datum_or_correlations_no_verdict_is_given() -> None:
     first, second = epoch(2, "minimal"), epoch(3, "minimal")
     assert compare_results(first, second, align="none").untested == remark("no_common_datum")
     found = compare_results(replace(first, covariance=None), replace(second, covariance=None))
-    assert found.changed is None and kinds_of(remarks(found)) == ("no_joint_covariance",)
+    assert found.changed is None and kinds_of(remarks(found)) == ("no_covariance",)
     approximate = compare_results(*(replace(epoch(k, "free"), covariance=None) for k in (2, 3)))
     assert approximate.approximate and approximate.changed is False
     held = compare_results(epoch(2, "control"), epoch(3, "control"), align="none")

@@ -129,14 +129,14 @@ def test_a_calibration_that_is_held_is_reported(tmp_path: Path) -> None:
         verdict = verdict_of_epochs(found)
         text = write_page(found, tmp_path / "out").read_text(encoding="utf-8")
         assert all(one.text in text for one in verdict.remarks)
-        return tuple(one for one in verdict.remarks if one.kind.startswith("held_"))
+        return tuple(one for one in verdict.remarks if one.kind == "cameras_held")
 
     assert told(first, second) == ()
     (alike,) = told(held(first), held(second))
-    assert alike.kind == "held_alike" and alike.names("cameras") == (name,)
+    assert alike.names("how") == ("alike",) and alike.names("cameras") == (name,)
     for other in (second, held(second, more=1e-3)):
         (apart,) = told(held(first), other)
-        assert apart.kind == "held_apart" and apart.names("cameras") == (name,)
+        assert apart.names("how") == ("apart",) and apart.names("cameras") == (name,)
 
 
 def test_epochs_with_other_names_and_of_two_objects_are_reported() -> None:

@@ -80,35 +80,35 @@ def test_errors_are_proven_or_undecided() -> None:
     assert found.error[-1] == pytest.approx(0.2, abs=5 * SIGMA)
     near = accepted(*volume(error=0.04))  # the limit at 1 m
     assert near.decision[-1] == "undecided" and near.verdict.level == "fair"
-    assert near.verdict.remarks[0].kind == "lengths_undecided"
+    assert near.verdict.remarks[0].kind == "tolerance_undecided"
     blind = accepted(*volume(sigma=0.0))
     unknown = replace(blind.lengths, sigma=np.full(35, np.nan))
     found = accepted(volume()[0], unknown)
     assert found.count("not known") == 35
     assert found.lacking == ()
-    assert found.verdict.remarks[0].kind == "lengths_without_sigma" and found.verdict.level == "fair"
+    assert found.verdict.remarks[0].kind == "tolerance_unknown" and found.verdict.level == "fair"
     result, lengths = volume(error=616e3)
     found = accepted(result, replace(lengths, sigma=np.full(35, np.nan)))
     first, second = found.verdict.remarks[:2]
-    assert found.verdict.level == "bad" and first.kind == "lengths_exceed_limit"
-    assert first.number("exceeding") == 1
-    assert second.kind == "lengths_without_sigma" and second.number("unknown") == 34
+    assert found.verdict.level == "bad" and first.kind == "out_of_tolerance"
+    assert first.number("out") == first.number("unknown") == 1
+    assert second.kind == "tolerance_unknown" and second.number("unknown") == 34
 
 
 def test_what_part_1_asks_for_and_the_data_lack_is_said() -> None:
     result, lengths = volume(lines=5)
     few = accepted(result, lengths, diagonal=4000.0)
     lines, longest = few.lacking
-    assert lines.kind == "lines_missing" and (lines.number("lines"), lines.number("needed")) == (5, 7)
-    assert longest.kind == "longest_length_short" and longest.number("diagonal") == 4000
+    assert lines.kind == "lengths_lacking" and (lines.number("lines"), lines.number("needed")) == (5, 7)
+    assert longest.kind == "lengths_lacking" and longest.number("diagonal") == 4000
     assert longest.number("longest") == lengths.length.max() and few.verdict.level == "fair"
     kept = np.arange(len(lengths.length)) != 0
     fewer = CalibratedLengths(*(tuple(np.array(x)[kept]) for x in (lengths.line, lengths.start, lengths.end)),
                               lengths.length[kept], lengths.sigma[kept])  # fmt: skip
-    assert remark("line_short_of_lengths", line="1", lengths=4, needed=5) in accepted(result, fewer).lacking
+    assert remark("lengths_lacking", line="1", lengths=4, needed=5) in accepted(result, fewer).lacking
     same = replace(lengths, line=tuple("A" if k == 0 else one for k, one in enumerate(lengths.line)))
     told = accepted(result, same).lacking
-    assert remark("lines_parallel", lines=("A", "1")) in told
+    assert remark("lengths_lacking", parallel=("A", "1")) in told
     crossed = replace(lengths, line=tuple("1" if one == "2" else one for one in lengths.line))
     assert remark("line_not_straight", line="1") in accepted(result, crossed).lacking
 
@@ -175,4 +175,6 @@ def test_the_command_knows_where_the_scale_comes_from(tmp_path: Path) -> None:
         assert told.exit_code == code, told.output
     summary = json.loads((tmp_path / "out" / "acceptance.json").read_text(encoding="utf-8"))
     kinds = [one["kind"] for one in summary["remarks"]]
-    assert kinds[:2] == ["lengths_outside", "lines_missing"] and summary["remarks"][0]["text"] in told.output
+    assert (
+        kinds[:2] == ["out_of_tolerance", "lengths_lacking"] and summary["remarks"][0]["text"] in told.output
+    )

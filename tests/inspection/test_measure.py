@@ -172,7 +172,7 @@ def test_a_free_network_has_remarks_where_its_datum_counts(tmp_path: Path) -> No
     single = measured(
         tmp_path, '[[distance]]\nname = "d"\nfrom = "p1"\nto = "p2"\n', replace(result, covariance=None)
     )
-    assert "correlations_unknown" in kinds_of(single.quantities[0].remarks)
+    assert "covariance_incomplete" in kinds_of(single.remarks)
 
 
 def test_targets_stand_off_on_the_side_of_the_cameras(tmp_path: Path) -> None:

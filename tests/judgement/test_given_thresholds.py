@@ -176,7 +176,7 @@ def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:
     one = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, others[0]))))
     assert kinds_of(one) == ("scale_contradicted",) and one[0].names("given") == ("9 - 20", "4 - 13")
     both = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=(*wrong, *others))))
-    assert kinds_of(both)[0] == "bar_left_out" and both[0].names("given") == ("9 - 20",)
+    assert kinds_of(both)[0] == "scale_left_out" and both[0].names("given") == ("9 - 20",)
     differ = (replace(wrong[0], length=right[0]), wrong[1])
     alone = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=differ)))
     assert kinds_of(alone) == ("scale_contradicted",) and len(set(alone[0].names("given"))) == 2

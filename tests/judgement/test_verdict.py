@@ -53,7 +53,7 @@ def test_photographs_without_start_values_are_missing(made: tuple[Network, Estim
     (missing,) = [one for one in verdict.remarks if one.kind == "photographs_missing"]
     assert verdict.level == "fair" and "5 of 6 photographs" in verdict.headline
     assert missing.number("missing") == 1
-    assert not {"image_points_rejected", "rays_rejected"} & set(kinds_of(verdict.remarks))
+    assert not {"image_points_rejected", "rays_tested"} & set(kinds_of(verdict.remarks))
 
 
 @pytest.mark.parametrize(("reject", "kept"), [("none", True), ("huber", False), ("tau", False)])
@@ -81,7 +81,7 @@ def test_files_that_cannot_be_read_are_no_missing_photographs(
     unreadable: int, level: str, made: tuple[Network, Estimate]
 ) -> None:
     """They made right results bad: half of a folder may be files of another kind."""
-    reason = remark("photograph_unreadable", reason="not a photograph")
+    reason = remark("photographs_unreadable", reason="not a photograph")
     failed = tuple(FailedImage(f"{k}.jpg", reason) for k in range(unreadable))
     adjustment = sfm.adjust(*made)
     result = SurveyResult("s", "m", 6 + unreadable, failed, adjustment, np.full(30, -1), None)

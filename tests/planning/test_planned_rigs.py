@@ -91,7 +91,8 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
     assert "gain by plumb lines: points 1." in printed and "rig stereo: camera 2 0.4" in printed
     (mount,) = found["rigs"][0]["mounts"]
     assert 0 < mount["base"]["sigma"] < 1e-4 and found["photographs"] == 12
-    assert "plan_without_scale" not in {one["kind"] for one in found["remarks"]}
+    (assumes,) = (one for one in found["remarks"] if one["kind"] == "plan_assumes")
+    assert "known scale" not in assumes["subjects"]["assumed"]
 
 
 def test_a_camera_of_a_rig_that_sees_nothing_is_named() -> None:

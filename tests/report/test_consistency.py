@@ -90,7 +90,7 @@ def test_false_alarms_keep_to_their_level() -> None:
     assert max(_false_alarms(300).values()) <= 9  # 3 expected at 1 %; 10 once in 1000
 
 
-def test_a_point_with_half_of_its_rays_rejected_is_a_remark() -> None:
+def test_a_point_with_half_of_its_rays_rejected_is_named() -> None:
     network, truth = make_network(seed_of("third"), images=6, points=30, free=("c",))
     seen = network.image_points
     rows = np.flatnonzero(seen.point == 4)[:3]
@@ -100,7 +100,7 @@ def test_a_point_with_half_of_its_rays_rejected_is_a_remark() -> None:
     xy[rows[2]] += (-11.0, 0.0)
     spoiled = replace(network, image_points=replace(seen, xy=xy))
     verdict = findings_of(run_survey(survey_of(spoiled, truth, adjust={"reject": "tau"}))).verdict
-    (found,) = of_kind(verdict.remarks, "rays_rejected")
+    (found,) = of_kind(verdict.tests, "rays_tested")
     assert found.names("points") == (network.points[4],)
 
 
@@ -119,11 +119,8 @@ def test_image_points_without_noise_are_a_good_survey(number: int) -> None:
     assert result.adjustment.is_exact and result.adjustment.sigma0 > 0
     verdict = findings_of(result).verdict
     assert verdict.level == "good"
-    assert {one.kind for one in verdict.remarks} == {
-        "scale_undefined",
-        "sigma_px_cautious",
-        "handedness_unchecked",
-    }
+    assert {one.kind for one in verdict.remarks} == {"scale_undefined"}
+    assert {"image_sigma_tested", "handedness_unchecked"} <= {one.kind for one in verdict.tests}
 
 
 def test_residuals_are_rounding_up_to_a_billionth_of_the_coordinates() -> None:

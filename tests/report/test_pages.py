@@ -182,7 +182,8 @@ def test_comparison_is_written_with_every_point(
     summary = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert summary["significant"] == ["5"] and summary["changed"] is True
     page = path.read_text(encoding="utf-8")
-    said, approximate = verdict_of_comparison(moved[0]).remarks
+    verdict = verdict_of_comparison(moved[0])
+    (said,), (approximate,) = verdict.remarks, verdict.tests
     assert (
         approximate.kind == "tested_singly"
         and said.kind == "points_differ"
@@ -198,7 +199,7 @@ def test_comparison_without_sigmas_says_so(tmp_path: Path) -> None:
     found = compare_results(Solution("a", network, truth), Solution("b", measured_again(network), truth))
     page = write_page(found, tmp_path / "out", xyz=truth.points).read_text()
     verdict = verdict_of_comparison(found)
-    assert kinds_of(verdict.remarks) == ("no_sigmas",) and verdict.remarks[0].text in page
+    assert kinds_of(verdict.remarks) == ("no_covariance",) and verdict.remarks[0].text in page
     assert json.loads((tmp_path / "out" / "comparison.json").read_text())["changed"] is None
 
 
@@ -229,7 +230,7 @@ def test_nothing_in_common_is_no_agreement(tmp_path: Path) -> None:
         Solution("b", replace(other, images=network.images), truth),
         align="cameras",
     )
-    assert kinds_of(verdict_of_comparison(photographs_only).remarks) == ("no_common_points",)
+    assert kinds_of(verdict_of_comparison(photographs_only).remarks) == ("untestable",)
     write_page(photographs_only, tmp_path / "out", xyz=truth.points[:0])
 
 

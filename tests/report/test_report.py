@@ -104,13 +104,13 @@ def result(adjustment: Adjustment, tmp_path_factory: pytest.TempPathFactory) -> 
         survey="synthetic " + EVIL,
         unit="m",
         images_total=9,
-        failed=(FailedImage(EVIL + ".jpg", remark("photograph_unreadable", reason="3 bytes")),),
+        failed=(FailedImage(EVIL + ".jpg", remark("photographs_unreadable", reason="3 bytes")),),
         adjustment=adjustment,
         code=np.where(np.arange(len(network.points)) < 10, np.arange(len(network.points)), -1),
         comparison=None,
         photographs=tuple(photographs),
         control_check=ControlCheck(("1", "2"), np.array([[3e-5, 0, 4e-5], [-3e-5, 0, -4e-5]]), 1.5),
-        stage_remarks=(remark("scale_bars_missing", bars=["1 - 2"]),),
+        stage_remarks=(remark("names_missing", of="bars", names=["1 - 2"]),),
         seconds=(StageTime("targets", 1.25),),
     )
 
@@ -327,7 +327,7 @@ def test_a_new_section_is_a_function_and_a_row(result: SurveyResult, monkeypatch
     assert lines[at + 1] == "  dry in m"
     keys = [one.key for one in page_of(found).sections if one.parts]
     assert keys == [
-        *("worked", "quality", "rejected", "comparison", "coordinates", "photographs", "process"),
+        *("worked", "quality", "tested", "rejected", "comparison", "coordinates", "photographs", "process"),
         "weather",
     ]
     assert [one for one in lines if one.endswith("===")] == [
@@ -486,7 +486,7 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
 def test_verdict(result: SurveyResult) -> None:
     assert findings_of(result).verdict.level == "fair"
     assert set(kinds_of(findings_of(result).verdict.remarks)) >= {
-        "scale_bars_missing",
+        "names_missing",
         "photographs_unreadable",
     }
     fine = replace(result, images_total=8, failed=(), stage_remarks=())
@@ -510,7 +510,11 @@ def test_every_remark_is_shown_once_by_every_renderer(
 ) -> None:
     missing = [f"control point {k} with a name of some length" for k in range(4)]
     more = replace(
-        result, stage_remarks=(remark("control_missing", points=missing), remark("scale_undefined", unit="m"))
+        result,
+        stage_remarks=(
+            remark("names_missing", of="control", names=missing),
+            remark("scale_undefined", unit="m"),
+        ),
     )
     findings = findings_of(more)
     text = text_report(findings)
@@ -528,7 +532,7 @@ def test_every_remark_is_shown_once_by_every_renderer(
 
 
 def test_of_many_remarks_of_a_kind_the_first_are_shown() -> None:
-    many = [remark("control_missing", points=[str(k)]) for k in range(8)]
+    many = [remark("names_missing", of="control", names=[str(k)]) for k in range(8)]
     lines = lines_of([*many, remark("scale_undefined", unit="m")])
     assert [one.severity for one in lines] == ["warning"] * 6 + ["note"]
     assert [bool(one.remedy) for one in lines] == [True] + [False] * 5 + [True]
@@ -701,11 +705,11 @@ def test_the_terminal_says_once_why_photographs_are_lost(
     result: SurveyResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Reasons that are alike are one line, and those that a remark of these photographs explains none."""
-    few, apart = (remark(kind, **{what: 0}, needed=4) for kind, what in REASONS)
+    few, apart = (remark("photograph_with_few_points", seen=seen, needed=4) for seen in (0, 2))
     lost = (FailedImage("lost 1", few), FailedImage("lost 2", few), FailedImage("lost 3", apart))
     for explained in ((), ("lost 2", "lost 3")):
         group = remark("not_connected", photographs=explained, oriented=8, needed=4)
-        board = remark("checkerboard_not_found", photographs=explained, size="7 x 9")
+        board = remark("plate_not_found", plate="checkerboard", photographs=explained, size="7 x 9")
         said = replace(result, failed=lost, stage_remarks=(group, board) if explained else ())
         print_result(findings_of(said), Path("page"), seconds=1.0, verbose=False)
         told = [line.strip() for line in capsys.readouterr().out.splitlines()]
@@ -715,9 +719,6 @@ def test_the_terminal_says_once_why_photographs_are_lost(
         assert [line.split(":")[0] for line in reasons] == (
             ["lost 1"] if explained else ["lost 1, lost 2, each", "lost 3"]
         )
-
-
-REASONS = (("photograph_with_few_points", "seen"), ("photograph_not_connected", "shared"))
 
 
 def test_numbers_of_one_quantity_are_written_alike(

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from sfm.conventions import AnyArray, rotation_from_vector
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind, remark
+from sfm.remarks.remark import of_kind, remark
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.report.survey_report import text_report
@@ -45,14 +45,15 @@ def test_the_offset_at_which_cameras_keep_their_mounts_is_taken(wrong: bool, tmp
     now, other = (late, right) if wrong else (right, late)
     rig = survey.rigs[0].model_copy(update={"moment": "moments.csv"})
     survey = replace(survey, rigs=(rig,), moments=now, other_moments=other)
-    unsure = remark("clocks_unsure", camera="camera 2", reference="camera 1", ahead=(10.0, "s"))
+    parts = {"camera": "camera 2", "reference": "camera 1", "ahead": (10.0, "s")}
+    unsure = remark("clock_differs", unsure="as they are", **parts)  # type: ignore[arg-type]
     measured = replace(
         measured, network=with_moments(survey, replace(measured.network, moment=None)), remarks=(unsure,)
     )
     oriented = agree_on_clocks(orient_with_models(survey, measured))
     found, agreed, start = oriented.survey, oriented.measured, oriented.orientation
     assert found.moments == right
-    assert kinds_of(agreed.remarks) == (("clock_differs",) if wrong else ("clocks_unsure",))
+    assert [one.severity for one in agreed.remarks] == ["note" if wrong else "warning"]
     assert agreed.network.moment is not None and start.estimate.mounts is not None
     spread, count = rotation_spread(agreed.network.camera, agreed.network.moment, start.estimate)
     assert count == 8 and spread < 1e-5
@@ -101,8 +102,8 @@ def test_clocks_one_interval_off_in_exif_data_are_tried_at_both_offsets(late: bo
     result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.converged and a.sigma0 * a.sigma_px < 0.1 and len(a.network.images) == 2 * moments - 1
-    (said,) = (*of_kind(result.remarks, "clock_differs"), *of_kind(result.remarks, "clocks_unsure"))
-    assert said.kind == ("clock_differs" if late else "clocks_unsure")
+    (said,) = of_kind(result.remarks, "clock_differs")
+    assert said.severity == ("note" if late else "warning")
     assert said.number("ahead") == pytest.approx(-INTERVAL_S if late else INTERVAL_S)
     words = text_report(findings_of(result))
     assert "nan" not in words.split() and "inf" not in words.split() and "e+1" not in words

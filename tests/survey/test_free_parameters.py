@@ -71,7 +71,7 @@ def test_a_convergent_network_frees_what_it_determines_and_demands() -> None:
     free = set(found.cameras[0].free)
     assert free >= USUAL | {"b1"}  # b1 is 2e-4, a third of a pixel at the edge
     (note,) = found.remarks
-    assert note.kind == "parameters_freed" and note.severity == "note" and note.number("photographs") == 12
+    assert note.kind == "parameters_chosen" and note.severity == "note" and note.number("photographs") == 12
     assert set(note.names("parameters")) == free
     a = adjust(network, found.estimate, datum=Datum("free"), reject="none")
     assert a.sigma0 < 1.1
@@ -135,12 +135,10 @@ def test_three_photographs_observe_c_with_what_exif_data_are_worth() -> None:
     assert {"K1"} <= set(one.free)
     assert found.estimate.cameras[0].value("c") == 10.2 and not found.estimate.cameras[0].free[0]
     observed, freed = found.remarks
-    assert (
-        observed.kind == "c_observed" and observed.severity == "note" and observed.number("photographs") == 3
-    )
-    assert "weighted with its start value: 10.2 mm, standard deviation 1.02 mm" in observed.text
+    assert observed.kind == "parameters_chosen" and observed.number("photographs") == 3
+    assert "weighted with its start value 10.2 mm, standard deviation 1.02 mm" in observed.tested[2]
     assert observed.number("given") == 10.2 and observed.number("sigma") == pytest.approx(1.02)
-    assert freed.kind == "parameters_freed" and set(freed.names("parameters")) == set(one.free)
+    assert freed.kind == "parameters_chosen" and set(freed.names("parameters")) == set(one.free)
 
 
 def test_c_that_the_survey_states_is_observed_whatever_the_orientation_began_from() -> None:

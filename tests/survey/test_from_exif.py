@@ -42,7 +42,7 @@ def test_photographs_with_positions_are_placed_by_them(tmp_path: Path) -> None:
     result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.datum == "control" and len(a.network.images) == 6
-    (found,) = of_kind(result.remarks, "exif_positions")
+    (found,) = of_kind(result.tests, "exif_positions")
     assert (found.number("positions"), found.number("photographs")) == (5, 6)
     assert (found.number("latitude"), abs(found.number("longitude"))) == (0, 180)
     assert np.abs(a.estimate.position - truth).max() < 5 * 0.5  # with the axes: east, north, up
@@ -243,7 +243,7 @@ def test_a_second_offset_of_clocks_that_fits_as_well_is_named(tmp_path: Path) ->
     photographed(tmp_path, "right", (times[1:] - 10.0).tolist())
     survey = survey_of(tmp_path, 0.5)
     _, (found,) = moments_from_exif(survey, find_photographs(survey))
-    assert found.kind == "clocks_unsure" and found.severity == "warning"
+    assert found.kind == "clock_differs" and found.severity == "warning"
     assert found.number("ahead") == pytest.approx(-10.0)
 
 

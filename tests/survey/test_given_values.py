@@ -88,7 +88,7 @@ def test_a_photograph_with_a_wrong_given_orientation_is_oriented_anew_and_report
     result = run_survey(survey_of(network, truth, start=replace(truth, position=position, rotation=rotation)))
     assert len(result.network.images) == 8 and result.adjustment.converged
     assert longest_residual(result.adjustment).over_sigma < 6
-    (replaced,) = of_kind(result.remarks, "orientation_replaced")
+    (replaced,) = of_kind(result.remarks, "approximate_unused")
     assert replaced.names("photograph") == ("image 4",) and replaced.number("image_points") == 40
 
 
@@ -383,8 +383,8 @@ def test_heights_check_points_of_which_place_is_control(tmp_path: Path) -> None:
         assert [(row.point, row.coordinate) for row in rows_of_check] == [(str(j), "Z") for j in range(5, 10)]
         tests = np.array([row.test for row in rows_of_check])
         assert (np.abs(np.delete(tests, 2)) < 4).all()
-        said = [one for one in found.verdict.remarks if one.kind == "check_differs"]
+        said = [one for one in found.verdict.remarks if one.kind == "checks_differ"]
         assert bool(said) == bool(wrong) and found.verdict.level == ("fair" if wrong else "good")
         if wrong:
-            assert (said[0].names("coordinate"), said[0].names("point")) == (("Z",), ("7",))
+            assert (said[0].names("coordinates"), said[0].names("points")) == (("Z",), ("7",))
             assert said[0].number("sigmas") == pytest.approx(abs(tests[2])) and abs(tests[2]) > 30

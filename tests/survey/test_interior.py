@@ -126,8 +126,8 @@ def test_inner_constraints_on_chosen_points(tmp_path: Path) -> None:
     result = run_survey(read_survey(path))
     a = result.adjustment
     assert a.datum_points is not None and a.datum_points.sum() == 3
-    (missing,) = of_kind(result.remarks, "datum_points_missing")
-    assert missing.names("points") == ("q",)
+    (missing,) = of_kind(result.remarks, "names_missing")
+    assert missing.names("names") == ("q",)
     on = [a.network.points.index(name) for name in ("p1", "p5", "p9")]
     changed = change_datum(all_points, Datum("free", a.datum_points))
     # carried over without a new adjustment, from points that were adjusted in another datum

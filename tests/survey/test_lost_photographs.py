@@ -64,7 +64,7 @@ def test_groups_that_are_not_connected_are_reported_with_what_would_connect_them
     assert lost.kind == "not_connected" and lost.number("oriented") == 6 and lost.number("needed") == 4
     assert lost.names("photographs") == ("image 7", "image 8", "image 9", "image 10")
     assert lost.names("shared") == ("21", "22") and lost.names("points") and lost.names("others")
-    assert found.failures[0] == ("image 7", remark("photograph_not_connected", shared=2, needed=4))
+    assert found.failures[0] == ("image 7", remark("photograph_with_few_points", seen=2, needed=4))
 
 
 def test_points_of_one_oriented_photograph_connect_nothing() -> None:

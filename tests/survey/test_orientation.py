@@ -54,18 +54,18 @@ def write_exterior(path: Path, names: tuple[str, ...], position: np.ndarray, rot
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
-def copy_of(kind: str) -> Remark:
-    return remark(kind, original="photo 2 again.png")
+def copy_of(same: str) -> Remark:
+    return remark("copies", original="photo 2 again.png", same=same)
 
 
-@pytest.mark.parametrize(("more", "kind"), [(b"", "copy_of_file"), (b"\0", "copy_of_picture")])
+@pytest.mark.parametrize(("more", "same"), [(b"", "files"), (b"\0", "pictures")])
 def test_copies_of_a_photograph_are_no_observations(
-    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path, more: bytes, kind: str
+    plain: SurveyResult, survey_file: Path, store: MeasuredStore, tmp_path: Path, more: bytes, same: str
 ) -> None:
     folder = changed(survey_file, tmp_path / "copies")
     (folder / "photo 2 again.png").write_bytes((folder / "photo 2.png").read_bytes() + more)
     result = run_survey(read_survey(folder / "survey.toml"), store=store)
-    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_of(kind))]
+    assert [(f.image, f.reason) for f in result.failed] == [("photo 2.png", copy_of(same))]
     assert result.images_total == 6 and result.failed[0].is_copy
     assert result.adjustment.redundancy == plain.adjustment.redundancy
 

@@ -77,7 +77,7 @@ def test_photographs_of_another_size_are_a_second_camera(
     ("count", "camera", "kind"),
     [
         (1, "", "photograph_of_other_size"),
-        (3, "fixed = {K1 = 1e-4}", "photograph_outside_calibration"),
+        (3, "fixed = {K1 = 1e-4}", "photograph_of_other_size"),
     ],
 )
 def test_too_few_of_them_are_left_out_with_a_remark(

@@ -108,7 +108,7 @@ def test_another_object_with_the_same_sheet_is_left_out(folder: Path, globs: lis
     result = surveyed(folder, globs)
     assert {one.image[0] for one in result.failed} == {"b"}
     assert len(result.failed) == (3 if agree else 1)
-    assert all(one.reason.kind == "photograph_with_codes_elsewhere" for one in result.failed)
+    assert all(one.reason.kind == "photograph_of_second_object" for one in result.failed)
     assert bool(result.failed[0].reason.names("agreeing")) == agree
     assert (result.code >= 0).all() and len(result.code) == len(PLACES) - 1
 
@@ -137,8 +137,8 @@ def test_a_photograph_with_three_codes_and_a_tenth_elsewhere_is_left_out(
 def test_a_code_that_moved_is_reported_and_costs_no_photograph(folder: Path) -> None:
     result = surveyed(folder, ["a*", "c*"])
     assert result.failed == ()
-    (moved,) = of_kind(result.remarks, "code_at_several_places", "code_rays_apart")
-    assert moved.names("code") == (str(FIRST_CODE),) and moved.names("photographs")
+    (moved,) = of_kind(result.remarks, "codes_at_several_places")
+    assert moved.names("codes") == (str(FIRST_CODE),) and moved.names("photographs")
     assert all(name.startswith("c") for name in moved.names("photographs"))
 
 

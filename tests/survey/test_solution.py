@@ -38,7 +38,7 @@ def test_a_failing_comparison_leaves_the_survey(tmp_path: Path) -> None:
     result = run_survey(survey, others=OtherPrograms(refuse))  # type: ignore[arg-type]
     assert result.comparison is None
     assert result.adjustment.converged
-    (failed,) = of_kind(result.remarks, "adjuster_failed")
+    (failed,) = of_kind(result.remarks, "comparison_failed")
     assert failed.names("reason") == ("COLMAP is not installed",)
 
 
@@ -111,7 +111,7 @@ def test_weights_converge_on_the_image_points_that_are_accepted(tmp_path: Path) 
 def test_weights_that_do_not_converge_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(variance_components, "MAX_ROUNDS", 0)
     result = run_survey(read_survey(barred_survey(tmp_path / "barred")))
-    assert of_kind(result.remarks, "weights_not_converged")
+    assert of_kind(result.remarks, "rejection_not_converging")
 
 
 def test_a_point_with_one_ray_is_named(tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_a_pipeline_that_fails_does_not_lose_the_survey(survey: Survey, tmp_path
 
     result = run_survey(survey, others=OtherPrograms(mapper=mapper))
     assert result.baseline is None
-    (failed,) = of_kind(result.remarks, "pipeline_failed")
+    (failed,) = of_kind(result.remarks, "comparison_failed")
     assert failed.names("reason") == ("COLMAP's mapper found no model",)
     page = write_result(findings_of(result), tmp_path / "out").read_text(encoding="utf-8")
     assert "And COLMAP mapper by itself?" not in page and "found no model" in page

@@ -402,10 +402,10 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(network.control.covariance[0], np.diag([0, 0.01, 0.04]))
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
     missing = [
-        (one.kind, *one.names("points"), *one.names("bars"))
+        (*one.names("of"), *one.names("names"))
         for one in datum_remarks(read_survey(path), network, has_scale=True)
     ]
-    assert missing == [("control_missing", "elsewhere"), ("scale_bars_missing", "a - lost")]
+    assert missing == [("control", "elsewhere"), ("bars", "a - lost")]
     assert estimate.oriented.tolist() == [False, True]
     np.testing.assert_array_equal(estimate.position[1], [10, 20, 30])
     np.testing.assert_allclose(np.degrees(angles_from_rotation(estimate.rotation[1])), [1, -2, 179])

@@ -229,8 +229,8 @@ def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
     Z, known = a.estimate.points[:, 2], truth.points[order, 2]
     assert Z - Z.mean() == pytest.approx(known - known.mean(), abs=1e-3)
     found = findings_of(result)
-    (said,) = [one for one in found.verdict.remarks if one.kind == "scale_bars_missing"]
-    assert said.names("bars") == ("1 - elsewhere",)
+    (said,) = [one for one in found.verdict.remarks if one.kind == "names_missing"]
+    assert said.names("names") == ("1 - elsewhere",)
     assert len(a.network.scale_bars) == 12
     write_result(found, tmp_path / "out")
     stored = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["further_observations"]
@@ -284,7 +284,7 @@ def test_a_wrong_antenna_position_leaves_and_its_photograph_stays(tmp_path: Path
     assert len(result.adjustment.network.images) == 8
     remarks = {said.kind: said for said in findings_of(result).verdict.remarks}
     assert remarks["observations_wrong"].names("observations") == (f"antenna position {network.images[3]}",)
-    assert remarks["observations_unused"].names("observations") == ("plane wall",)
+    assert remarks["names_missing"].names("names") == ("plane wall",)
 
 
 def test_planes_are_met_on_either_side_of_large_offsets() -> None:
@@ -607,8 +607,8 @@ def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
     lines = table_of(tmp_path, network, {"distance": [tape]})
     lines += '[[survey_observations]]\nkind = "rigid frame"\nfile = "probe.csv"\n\n'
     result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
-    assert "observations_unused" not in {one.kind for one in result.remarks}
-    (computed,) = [one for one in result.remarks if one.kind == "frame_points_computed"]
+    assert "names_missing" not in {one.kind for one in result.remarks}
+    (computed,) = [one for one in result.tests if one.kind == "frame_points_computed"]
     assert computed.names("points") == ("probe beside", "probe tip")
     (found,) = result.adjustment.group_parameters
     sigma = np.sqrt(np.diagonal(found.covariance))
@@ -627,9 +627,9 @@ def test_a_frame_with_one_point_in_the_photographs_is_said(others: tuple[str, ..
     (tmp_path / "frame.csv").write_text("\n".join(["group,point,X,Y,Z,sX,sY,sZ", *rows]), "utf-8")
     lines = '[[survey_observations]]\nkind = "rigid frame"\nfile = "frame.csv"\n\n'
     result = run_survey(read_survey(written(tmp_path, network, truth, lines)))
-    (unused,) = (one for one in result.remarks if one.kind == "observations_unused")
-    assert "rigid frame F" in unused.names("observations") and "a rigid frame 2" in unused.cause
-    assert len(unused.names("observations")) == 1 + len(others)
+    (unused,) = (one for one in result.remarks if one.kind == "names_missing")
+    assert "rigid frame F" in unused.names("names") and "a rigid frame 2" in unused.cause
+    assert len(unused.names("names")) == 1 + len(others)
 
 
 def test_differences_of_directions_have_no_mean() -> None:
@@ -713,9 +713,9 @@ def test_copied_rows_count_once(kind: str, tmp_path: Path) -> None:
     first, second = (result.adjustment for result in found)
     assert first.redundancy == second.redundancy
     np.testing.assert_array_equal(first.estimate.points, second.estimate.points)
-    said = [one for one in found[1].remarks if one.kind == "observations_identical"]
-    assert len(said[0].names("observations")) == len(set(zip(*(end.tolist() for end in ends), strict=True)))
-    assert not [one for one in found[0].remarks if one.kind == "observations_identical"]
+    said = [one for one in found[1].remarks if one.kind == "rows_identical"]
+    assert len(said[0].names("rows")) == len(set(zip(*(end.tolist() for end in ends), strict=True)))
+    assert not [one for one in found[0].remarks if one.kind == "rows_identical"]
 
 
 @pytest.mark.parametrize("orientation", [0.0, np.pi / 2, np.pi, -np.pi / 2, 4.0])

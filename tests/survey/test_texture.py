@@ -108,7 +108,7 @@ def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int
     textured = replace(survey, tie_points=TiePointSettings())
     found = solve_survey(textured, matched)
     assert len(found.adjustment.network.images) == (10 if stays else 9)
-    told = [("image 10", remark("photograph_with_few_accepted", needed=15))]
+    told = [("image 10", remark("photograph_with_few_fitting", needed=15))]
     assert list(found.dropped_images) == ([] if stays else told)
 
 
@@ -122,7 +122,7 @@ def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
     survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
     found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
     reasons = {(one.reason.kind, one.reason.number("needed")) for one in found.left_out}
-    assert reasons == {("point_of_lost_photographs", 3)}
+    assert reasons == {("point_not_determined", 3)}
 
 
 IMAGES, ZOOMED = 9, (3, 4, 7)

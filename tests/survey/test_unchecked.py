@@ -63,14 +63,15 @@ def test_only_given_points_in_space_check_the_handedness() -> None:
     # approximate values, and centres that are not used, place nothing
     for given in ({}, {"start": truth}, {"exterior": centres}, {"control": three}):
         found = run_survey(survey_of(mirrored, truth, scale_bars=bars, **given))
-        assert "handedness_unchecked" in kinds_of(found.remarks)
+        assert "handedness_unchecked" in kinds_of(found.tests)
         assert findings_of(found).verdict.level == "good"
     for given in ({"control": space}, {"exterior": centres, "datum": {"kind": "control"}}):
         for one in (network, mirrored):
-            judged = kinds_of(run_survey(survey_of(one, truth, **given)).remarks)
+            result = run_survey(survey_of(one, truth, **given))
+            judged = kinds_of((*result.remarks, *result.tests))
             assert "handedness_unchecked" not in judged and ("given_mirrored" in judged) is (one is mirrored)
     flat = run_survey(survey_of(mirrored, truth, control=plane))
-    assert "handedness_unchecked" in kinds_of(flat.remarks)
+    assert "handedness_unchecked" in kinds_of(flat.tests)
 
 
 def test_control_without_its_wrong_point_checks_the_handedness() -> None:
@@ -256,7 +257,7 @@ def test_two_ray_points_are_reported() -> None:
     rng = seed_of("two rays")
     network, truth = add_narrow_points(*make_network(rng, images=6, points=30), rng, 7)
     verdict = findings_of(run_survey(survey_of(network, truth))).verdict
-    (said,) = (one for one in verdict.remarks if one.kind == "two_rays")
+    (said,) = (one for one in verdict.tests if one.kind == "third_ray_missing")
     assert (said.number("two"), said.number("total")) == (7, 37)
 
 
@@ -278,7 +279,7 @@ def test_a_copy_among_the_image_points_is_no_photograph() -> None:
     )
     result, plain = (run_survey(survey_of(one, truth)) for one in (copied, network))
     assert [(one.image, one.reason) for one in result.failed] == [
-        ("again", remark("copy_of_image_points", original="image 4"))
+        ("again", remark("copies", original="image 4", same="image points"))
     ]
     assert result.adjustment.redundancy == plain.adjustment.redundancy and result.images_total == 8
 

@@ -70,7 +70,7 @@ def test_c_of_three_photographs_that_is_wrong_by_far_is_not_believed(number: int
     """Held at its start value, nothing stated, the object was 6 and 11 sigma wrong, and good."""
     found = outcome_of(number, c_sigma=0.4)
     assert not found.is_wrong_and_believed
-    assert "c_observed" in found.kinds
+    assert "parameters_chosen" in found.kinds
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> Non
 def test_a_pair_does_not_determine_the_c_that_was_found_for_it() -> None:
     """c 40 % too long, found because the pair could be oriented with it: 18 sigma wrong and called fair."""
     found = outcome_of(1321)
-    assert found.level == "bad" and found.kinds[0] == "c_looks_wrong_of_pair"
+    assert found.level == "bad" and found.kinds[0] == "c_looks_wrong"
 
 
 def test_two_photographs_that_the_third_contradicts_are_bad() -> None:

@@ -94,7 +94,7 @@ def test_of_three_bars_the_wrong_one_is_left_out(factor: float) -> None:
     network, truth = _scene("three bars")
     result = run_survey(survey_of(network, truth, scale_bars=_bars(truth, [1.0, factor, 1.0])))
     (said,) = remarks_on_given(result)
-    assert said.kind == "bar_left_out" and said.names("given") == ("2 - 12",)
+    assert said.kind == "scale_left_out" and said.names("given") == ("2 - 12",)
     assert _factor(said) == pytest.approx(factor, rel=2e-3)
     unit = {10.15: 10.0, 1000.0: 1000.0}.get(factor)  # 2.5 is no inch
     assert said.number("unit_factor") == unit if unit else "unit_factor" not in said.numbers

@@ -187,7 +187,7 @@ def outcome_of(number: int, c_sigma: float | None = None) -> Outcome:
         c,
         weak.words,
         tuple(one.text for one in verdict.remarks),
-        kinds_of(verdict.remarks),
+        kinds_of((*verdict.remarks, *verdict.tests)),
     )
 
 

@@ -90,10 +90,10 @@ def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tu
         return ()
     cameras = {bump.camera for bump in found}
     theirs = [k for k, camera in enumerate(a.estimate.cameras) if camera.name in cameras]
-    most = 2 * len(found) >= int(np.isin(a.network.camera, theirs).sum())
     return (
         remark(
-            "rig_contradicted" if most else "rig_bumped",
+            "rig_contradicted",
+            share=len(found) / int(np.isin(a.network.camera, theirs).sum()),
             photographs=[bump.photograph for bump in found],
             cameras=list(dict.fromkeys(bump.camera for bump in found)),
             distance=(max(bump.shift for bump in found), unit),

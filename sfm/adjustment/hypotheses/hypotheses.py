@@ -66,8 +66,8 @@ MAX_WORK = 3e8
 MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 MIN_OF_BODY = 3  # points that determine the six motions of a body
-OF_FREE_POINTS = (  # remarks that do not apply to given points
-    *("assumptions_untested", "photographs_untested"),
+OF_FREE_POINTS = (  # tests that do not apply to given points
+    *("assumptions_tested", "assumptions_untested", "photographs_untested"),
     *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
 )
 # Shift of coordinates, in standard deviations, below which a cause does not matter.
@@ -141,6 +141,8 @@ def _judge_free(
         unchecked = unchecked_assumptions(plain, len(moving), without)
     except np.linalg.LinAlgError:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
+    tested = remark("assumptions_tested", photographs=photographs, causes=len(causes))
+    unchecked = (tested, *unchecked)
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)

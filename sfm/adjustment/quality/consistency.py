@@ -28,7 +28,7 @@ from sfm.adjustment.quality.variance_components import VarianceComponents, by_ph
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, chi2_isf, chi2_sf
+from sfm.distributions import LEVEL, chi2_isf, chi2_sf, normal_ppf, t_ppf
 from sfm.network import Estimate, rows_of
 
 MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
@@ -53,6 +53,8 @@ class Consistency:
 
     large: tuple[str, ...]  # points with residuals jointly larger than chance allows
     uneven: Uneven | None  # None if the photographs are equally good
+    outlying: tuple[str, ...] = ()  # those of `large` that stand out from the spread of all points
+    tested: int = 0  # points whose residuals were tested together
     doubtful: tuple[DoubtfulPoint, ...] = ()  # points with another ray that may be the wrong one
 
 
@@ -70,20 +72,64 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
     of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
     fixed = {name for name, covariance in of_point if not covariance.any()}
     doubtful = tuple(one for one in doubtful_points(adjustment, parts, rays) if one.point not in fixed)
-    return Consistency(_large(adjustment, parts, rays), _uneven(by_photograph(adjustment)), doubtful)
+    large, outlying, tested = _large(adjustment, parts, rays)
+    return Consistency(large, _uneven(by_photograph(adjustment)), outlying, tested, doubtful)
 
 
-def _large(adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]) -> tuple[str, ...]:
-    """Return the points with accepted residuals that are jointly larger than chance allows."""
+def _large(
+    adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]
+) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """Return the points with jointly large residuals, those that stand out, and the number of tested points.
+
+    Accepted residuals of a point are large if chance does not explain them. Real targets differ in
+    quality, so that many are. A point stands out if its normal score is beyond the spread of all scores.
+    """
     network, n = adjustment.network, len(adjustment.network.points)
     level = level_of_single(FAMILY, n)
-    large: list[str] = []
+    probability = np.ones(n)
     for j, rows in enumerate(rays):
         accepted = rows[~adjustment.rejected[rows]]
         r = float(adjustment.redundancy_numbers[accepted].sum())
-        if r > 1 and chi2_sf(parts.q[accepted].sum(), r) < level:
-            large.append(network.points[j])
-    return tuple(large)
+        if r > 1:
+            probability[j] = float(chi2_sf(parts.q[accepted].sum(), r))
+    tested = np.flatnonzero(probability < 1)
+    large = probability[tested] < level
+    smallest = np.finfo(float).tiny
+    score = -normal_ppf(np.clip(probability[tested], smallest, 1 - np.finfo(float).eps))
+    outlying = large & larger_than_the_others(score)
+    return (
+        tuple(network.points[j] for j in tested[large]),
+        tuple(network.points[j] for j in tested[outlying]),
+        len(tested),
+    )
+
+
+def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> BoolArray:
+    """Return which values exceed the others by more than chance explains, fewer than half of them, (n,).
+
+    Args:
+        values: values to compare, (n,).
+        level: probability that chance alone marks any of them.
+
+    Source: Rosner (1983), Percentage points for a generalized ESD many-outlier procedure, Technometrics
+    25(2), 165-172; one-sided.
+    """
+    n = len(values)
+    large: BoolArray = np.zeros(n, dtype=bool)
+    order = np.argsort(-values, kind="stable")
+    removed = np.arange(min((n - 1) // 2, n - 2))
+    if not len(removed):
+        return large
+    kept = values[order] - np.median(values)
+    left = n - removed
+    total, squares = (np.cumsum(part[::-1])[::-1][removed] for part in (kept, kept**2))
+    mean = total / left
+    spread = np.sqrt(np.maximum(squares - total * mean, 0.0) / (left - 1))
+    t = t_ppf(1 - level / left, left - 2)
+    critical = (left - 1) * t / np.sqrt((left - 2 + t**2) * left)
+    beyond = np.flatnonzero(kept[removed] - mean > critical * spread)
+    large[order[: beyond[-1] + 1 if len(beyond) else 0]] = True
+    return large
 
 
 def _uneven(photographs: VarianceComponents) -> Uneven | None:

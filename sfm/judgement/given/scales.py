@@ -240,9 +240,8 @@ def _left_out(
 ) -> Remark:
     """Return the remark that a bar, a plate or given points were left out because of their scale."""
     off, sigma = _difference(model, wrong, k)
-    kind = "bar_left_out" if k < bars and not names[k].startswith(TABLE) else "scale_left_out"
-    kind = "plate_size_left_out" if names[k] in plates else kind
-    return remark(kind, given=names[k], **numbers_of_scale(off, sigma))
+    what = "plate" if names[k] in plates else "given"
+    return remark("scale_left_out", **{what: names[k]}, **numbers_of_scale(off, sigma))
 
 
 def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:

@@ -193,7 +193,7 @@ def orient(
     unused = (
         remark("approximate_unused", before=before, now=now)
         if before < now
-        else remark("approximate_contradicts_control")
+        else remark("approximate_unused", control="control")
     )
     return replace(without, remarks=(*without.remarks, unused))
 
@@ -418,9 +418,9 @@ def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
     count = np.bincount(growth.network.image_points.image, minlength=len(after))
     return tuple(
         remark(
-            "orientation_replaced",
+            "approximate_unused",
             photograph=growth.network.images[i],
-            before=round(before[i] * count[i]),
+            fitting=round(before[i] * count[i]),
             after=round(after[i] * count[i]),
             image_points=int(count[i]),
         )
@@ -486,12 +486,12 @@ def _reasons(growth: Growth, rays: IntArray, parallel: BoolArray) -> tuple[tuple
     out = []
     for j in np.flatnonzero(~growth.estimate.determined & (measured > 0)):
         if measured[j] < 2:
-            reason = remark("point_with_few_rays", rays=1, needed=2)
+            reason = remark("point_not_determined", rays=1, needed=2)
         elif rays[j] < 2:
-            reason = remark("point_of_lost_photographs", measured=int(measured[j]), needed=2)
+            reason = remark("point_not_determined", measured=int(measured[j]), least=2)
         elif parallel[j]:
-            reason = remark("point_with_parallel_rays", rays=int(rays[j]))
+            reason = remark("point_not_determined", parallel=int(rays[j]))
         else:
-            reason = remark("point_with_rays_apart", rays=int(rays[j]))
+            reason = remark("point_contradicted", rays=int(rays[j]))
         out.append((growth.network.points[j], reason))
     return tuple(out)

@@ -1,4 +1,4 @@
-"""The catalogue of remarks: one row for each kind, and one module for each subject.
+"""The catalogue of remarks: one row for each kind, and one module for each subject. `tested` has the tests.
 
 To add a kind, add a row. The tables in `docs/symptoms.md` are generated from these rows.
 """
@@ -16,8 +16,9 @@ from sfm.remarks.catalogue import (
     measuring,
     photographs,
     plans,
+    tested,
 )
-from sfm.remarks.kind import Kind
+from sfm.remarks.kind import Kind, Tested
 
 SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
     {
@@ -39,3 +40,4 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
     }
 )
 KINDS: Mapping[str, Kind] = MappingProxyType({row.name: row for rows in SUBJECTS.values() for row in rows})
+TESTS: Mapping[str, Tested] = MappingProxyType({row.name: row for row in tested.ROWS})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind
+from sfm.remarks.kind import WRONG_SIGMAS, Grade, Kind, Unless
 
 # A warning if the 95 % value reaches one pixel, which no one expects of a calibrated camera. An error if the
 # standard deviation reaches one pixel and is large compared with the image points of the calibration, so that
@@ -12,29 +12,12 @@ NOT_CALIBRATED = Grade("rms", warning=0.51, error=1.0, at_most=Grade("times", er
 
 ROWS = (
     Kind(
-        "parameters_freed",
-        "note",
-        "{parameters} of camera {camera} {parameters:was|were} adjusted, as {photographs:photograph} "
-        "{photographs:determines|determine} {parameters:it|them}.",
-        "the survey file does not state what is free",
-        "Write free = [] to hold all parameters fixed.",
-    ),
-    Kind(
         "fisheye_taken",
         "note",
         "Camera {camera} has a fisheye lens and was adjusted with model opencv_fisheye: of {total} image "
         "points, {fitting} {fitting:fits|fit} this model and {before} a central perspective.",
         "the survey file does not state the model",
         "State the model in the survey file, which saves the trial.",
-    ),
-    Kind(
-        "c_observed",
-        "note",
-        "With {photographs:photograph}, {parameter} of camera {camera} was weighted with its start value: "
-        "{given}, standard deviation {sigma}.",
-        "the survey file does not state what is free; so few photographs may leave it uncertain, and the "
-        "focal length in EXIF data is no more certain",
-        "State a calibration, or add photographs, some turned by 90 degrees.",
     ),
     Kind(
         "interior_held",
@@ -71,19 +54,11 @@ ROWS = (
     ),
     Kind(
         "c_looks_wrong",
-        "warning",
+        Unless("pair", "warning", "error"),
         "c = {given} of camera {camera} looks wrong: starting from {better}, {oriented} of {total} "
-        "photographs can be oriented instead of {before}.",
+        "photographs can be oriented instead of {before}.[[ Two photographs do not determine {pair}.]]",
         "a wrong start value of c or a wrong size of the pixels",
-        "Correct c_mm and pixel_mm, or free c.",
-    ),
-    Kind(
-        "c_looks_wrong_of_pair",
-        "error",
-        "c = {given} of camera {camera} looks wrong: starting from {better}, {oriented} of {total} "
-        "photographs can be oriented instead of {before}. Two photographs do not determine it.",
-        "a wrong start value of c or a wrong size of the pixels",
-        "Give a calibrated c, or add photographs.",
+        "Correct c_mm and pixel_mm, or free c; give a calibrated c for two photographs, or add some.",
         explains=("interior_held_of_pair",),
     ),
     Kind(
@@ -121,22 +96,14 @@ ROWS = (
     Kind(
         "calibration_failed",
         "error",
-        "Camera {camera} is not calibrated: c was held fixed at {held}, as the photographs do not determine "
-        "it.",
+        "Camera {camera} is not calibrated, as the photographs do not determine it[[: c was held fixed at "
+        "{held}]].",
         "frontal photographs, whose distance absorbs an error of c, or too few of them",
         "Add photographs that are tilted by 30 to 45 degrees relative to the plate, in several directions.",
         explains=(
-            *("interior_held", "held_to_converge", "held_parameter", "c_held_contradicted"),
-            *("held_weakly_tested", "camera_varies", "camera_weakly_tested", "given_weakly_checked"),
+            *("interior_held", "held_to_converge", "held_parameter", "c_held_contradicted", "camera_varies"),
             *("given_not_exact", "scale_contradicted", "sigma0_high", "points_with_large_residuals"),
         ),
-    ),
-    Kind(
-        "camera_not_determined",
-        "error",
-        "The photographs do not determine camera {camera}, whose calibration is the result.",
-        "frontal photographs, whose distance absorbs an error of c, or too few of them",
-        "Add photographs that are tilted by 30 to 45 degrees relative to the plate, in several directions.",
     ),
     Kind(
         "margin_not_calibrated",
@@ -157,20 +124,12 @@ ROWS = (
     ),
     Kind(
         "principal_point_far",
-        Grade("share", warning=0.1),  # of the diagonal; a decentred lens or sensor has 0.01 or 0.02
+        # Of the diagonal; a decentred lens or sensor has 0.01 or 0.02. Half way to a corner there is none.
+        Grade("share", warning=0.1, also=Grade("surely", warning=0.25, error=0.25)),
         "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
-        "photograph.",
-        "the network hardly determines it, or the photographs are cropped",
-        "Hold it fixed, or add photographs turned by 90 degrees.",
-    ),
-    Kind(
-        "principal_point_outside",
-        "error",
-        "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
-        "photograph (standard deviation {sigma:%}): no camera has it there.",
-        "a camera that the photographs only seem to determine, wrong matches, or cropped photographs",
-        "Hold it fixed, or give uncropped photographs.",
-        explains=("principal_point_far",),
+        "photograph (standard deviation {sigma:%}).",
+        "a camera that the photographs hardly determine, wrong matches, or cropped photographs",
+        "Hold it fixed, give uncropped photographs, or add photographs turned by 90 degrees.",
     ),
     Kind(
         "pixels_distorted",

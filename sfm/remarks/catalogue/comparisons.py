@@ -13,14 +13,6 @@ OTHER_PROGRAMS = (
         "Read the comparison in the report.",
     ),
     Kind(
-        "adjuster_fits_alike",
-        "note",
-        "The image points do not separate the solutions of Kolinear and {program}: v'Pv differs by {gap} "
-        "variances.",
-        "the network hardly determines the camera model of the comparison",
-        "The survey is valid; to compare the cameras, photograph from more directions and distances.",
-    ),
-    Kind(
         "adjuster_fits_better",
         "warning",
         "The camera of {program} with {parameters} free fits {times} times better: RMS {rms} instead of "
@@ -29,32 +21,11 @@ OTHER_PROGRAMS = (
         "Free these parameters.",
     ),
     Kind(
-        "adjuster_failed",
+        "comparison_failed",
         "warning",
-        "The comparison with another adjuster failed: {reason}.",
-        "the other program refused the network",
+        "The comparison with {what:@} failed: {reason}.",
+        "the other program refused the network or the photographs",
         "The survey is valid without it.",
-    ),
-    Kind(
-        "pipeline_failed",
-        "warning",
-        "The comparison with another pipeline failed: {reason}.",
-        "the other program refused the photographs",
-        "The survey is valid without it.",
-    ),
-    Kind(
-        "adjuster_not_compared",
-        "note",
-        "Not compared with another adjuster: {reason}.",
-        "a library is not installed",
-        "Install it to compare.",
-    ),
-    Kind(
-        "pipeline_not_compared",
-        "note",
-        "Not compared with another pipeline: {reason}.",
-        "a library is not installed",
-        "Install it to compare.",
     ),
 )
 REFINING = (
@@ -142,17 +113,12 @@ ROWS = (
     Kind(
         "points_differ",
         "error",
-        "{differing:point} of {tested} {differing:differs|differ} significantly, by up to {distance}: "
-        "{points}.",
-        "points moved between the surveys, or an observation of one of them is wrong",
-        "See the table of points.",
-    ),
-    Kind(
-        "points_differ_together",
-        "error",
-        "The points differ as a whole (T {statistic}, limit {critical}), but no single point does.",
-        "many small displacements, or standard deviations that are too small",
-        "Look for a pattern in the figure.",
+        "[[{differing:point} of {tested} {differing:differs|differ} significantly, by up to {distance}: "
+        "{points}]][[The points differ as a whole (T {statistic}, limit {critical}), but no single point "
+        "does]].",
+        "points moved between the surveys, an observation of one of them is wrong, or standard deviations "
+        "are too small",
+        "See the table of points, and look for a pattern in the figure.",
     ),
     Kind(
         "no_majority_agrees",
@@ -170,28 +136,6 @@ ROWS = (
         "Adjust both with per_photograph for the parameters, and compare again.",
     ),
     Kind(
-        "tested_part",
-        "note",
-        "{tested} of {points} points {tested:is|are} tested: those whose joint covariance both results "
-        "store.",
-        "of many points, results store the covariance of a sample only",
-        "Nothing needs to be done.",
-    ),
-    Kind(
-        "tested_singly",
-        "note",
-        "The test is approximate: the covariance between points is not known.",
-        "the result is of another program, or of an older version",
-        "Compare results that this version computed.",
-    ),
-    Kind(
-        "no_common_points",
-        "warning",
-        "No points are common: only photographs and cameras are compared.",
-        "names, image points and positions differ",
-        "Make the names agree.",
-    ),
-    Kind(
         "same_image_points",
         "warning",
         "Not tested: {share:%} of the image points of {first} are also those of {second}.",
@@ -199,11 +143,12 @@ ROWS = (
         "Compare results of separate photographs.",
     ),
     Kind(
-        "no_sigmas",
+        "no_covariance",
         "warning",
-        "Not tested: the standard deviations of the common points are not known.",
-        "neither result has them",
-        "Compare with a result that has standard deviations.",
+        "Not tested: {unknown:@} of the common points are not known.",
+        "another program or an older version computed the results; in a minimal datum or one of control, and "
+        "between different datums, nothing can be tested without them",
+        "Compare results that this version computed.",
     ),
     Kind(
         "no_common_datum",
@@ -213,19 +158,11 @@ ROWS = (
         "Align them by points or control.",
     ),
     Kind(
-        "no_joint_covariance",
-        "warning",
-        "Not tested: the covariance between the points is not known.",
-        "in a minimal datum or one of control, and between different datums, nothing can be tested "
-        "without it",
-        "Run the survey again with this version, which stores it.",
-    ),
-    Kind(
         "untestable",
         "warning",
         "Not tested: {reason}.",
-        "too few points in common, or points that determine no datum",
-        "Compare results with more points in common.",
+        "names, image points or positions differ, too few points are common, or they determine no datum",
+        "Make the names agree, or compare results with more points in common.",
     ),
     Kind(
         "displaced",
@@ -235,20 +172,13 @@ ROWS = (
         "See the table of displacements.",
     ),
     Kind(
-        "held_alike",
+        "cameras_held",
         "note",
-        "{first} and {second} hold the interior orientation of camera {cameras} fixed at the same "
-        "values: no standard deviation includes its error.",
-        "its effect cancels only where photographs and object are the same; the rest can pass for a movement",
+        "{first} and {second} hold the interior orientation of camera {cameras} fixed, {how:@}: no standard "
+        "deviation includes its error.",
+        "its effect cancels only where values, photographs and object are the same; the rest can pass for a "
+        "movement",
         "Adjust it (free), or together from a calibration with standard deviations (--together).",
-    ),
-    Kind(
-        "held_apart",
-        "note",
-        "The interior orientation of camera {cameras} is held fixed in only one of {first} and {second}, "
-        "or at different values: no standard deviation includes its error.",
-        "its effect does not cancel, and can pass for a movement",
-        "Adjust it (free).",
     ),
     Kind(
         "mount_changed",
@@ -257,13 +187,5 @@ ROWS = (
         "{critical}).",
         "the camera was taken off or knocked, or the frame of the rig bent",
         "For each survey, use the mounts that were calibrated nearest to it in time.",
-    ),
-    Kind(
-        "one_camera",
-        "note",
-        "Camera {camera} has one interior orientation in {epochs}, and they agree on it (T {statistic}, "
-        "limit {critical}).",
-        "the epochs were adjusted together",
-        "Nothing needs to be done.",
     ),
 )

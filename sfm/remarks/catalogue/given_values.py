@@ -21,43 +21,12 @@ DATUM = (
         "Measure a scale bar or control.",
     ),
     Kind(
-        "control_missing",
+        "names_missing",
         "warning",
-        "Control is not in the result: {points}.",
-        "names that no measured point has, or points with too few rays",
+        "Of {of:@}, {names} {names:is|are} not in the result.",
+        "names that no measured point or target has, or points with too few rays: a plane needs 4, a line "
+        "3, a rigid frame 2, a station 2 targets",
         "Correct the names: those of points.csv; coded targets have their numbers.",
-    ),
-    Kind(
-        "scale_bars_missing",
-        "warning",
-        "Scale bars have an end that is not in the result: {bars}.",
-        "names that no measured point has, or points with too few rays",
-        "Correct from and to: names of points.csv; coded targets have their numbers.",
-    ),
-    Kind(
-        "model_keeps_frame",
-        "note",
-        "The model keeps its frame and scale.",
-        "neither control nor scale bars in the survey",
-        "Give control or scale bars for lengths in the object unit.",
-    ),
-    Kind(
-        "datum_points_missing",
-        "warning",
-        "Datum points are not in the network: {points}.",
-        "names that no measured point has, or points with too few rays",
-        "Correct the names in datum.points.",
-    ),
-    Kind(
-        "exif_positions",
-        "note",
-        "EXIF data give the projection centres of {positions} of {photographs} photographs, used as "
-        "observations: X east and Y north (WGS 84) from latitude {latitude:.3f}, longitude "
-        "{longitude:.3f}, Z the height as stated, above sea level or the ellipsoid.",
-        "exif_sigma_m in [exterior]. EXIF data do not state the reference of heights. Standard "
-        "deviations do not include errors that photographs share: those of the receiver, metres over "
-        "minutes, and the offset of its antenna from the camera",
-        "Use bars or control for scale and coordinates that must be better than the receiver.",
     ),
     Kind(
         "exif_positions_far",
@@ -76,24 +45,11 @@ DATUM = (
     Kind(
         "approximate_unused",
         "warning",
-        "The given approximate values orient {before} of the {now} photographs that can be oriented without "
-        "them, and were not used.",
-        "the values contradict the photographs",
-        "Correct or complete [approximate], or leave it out.",
-    ),
-    Kind(
-        "approximate_contradicts_control",
-        "warning",
-        "The given approximate values contradict the control and were not used.",
-        "the values are in another frame, or control is wrong",
-        "Correct or complete [approximate], or leave it out.",
-    ),
-    Kind(
-        "orientation_replaced",
-        "warning",
-        "The given orientation of {photograph} was replaced: {before} of {image_points:image point} "
-        "{before:fits|fit} it, {after} {after:fits|fit} the new one.",
-        "the given orientation is wrong",
+        "[[The given orientation of {photograph} was replaced: {fitting} of {image_points:image point} "
+        "{fitting:fits|fit} it, {after} {after:fits|fit} the new one]][[The given approximate values orient "
+        "{before} of the {now} photographs that can be oriented without them, and were not used]][[The given "
+        "approximate values contradict {control:@} and were not used]].",
+        "the values are wrong or in another frame, or control is wrong",
         "Correct or complete [approximate], or leave it out.",
     ),
 )
@@ -103,7 +59,7 @@ WRONG_SIZE = "pitch is mistyped or nominal, or a plate was printed to another sc
 DETECTED = Grade("shift", error=WRONG_SIGMAS)
 # Kinds that follow if fixed or weighted coordinates with a wrong shape distort the network.
 PULLED = (
-    *("image_points_rejected", "rays_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
+    *("image_points_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
     *("points_with_large_residuals", "photographs_uneven"),
 )
 ROWS = (
@@ -123,56 +79,31 @@ ROWS = (
         "Correct {observations:this value|these values}, or state a larger standard deviation.",
     ),
     Kind(
-        "observations_unused",
-        "warning",
-        "{observations:survey observation} {observations:was|were} not used: {observations}.",
-        "their points or photographs are not in the result, or too few points of a group are: a plane "
-        "needs 4, a line 3, a rigid frame 2, a station 2 targets",
-        "Correct the names, or look among the points that were left out.",
-    ),
-    Kind(
-        "observations_identical",
+        "rows_identical",
         "note",
-        "{observations:survey observation} {observations:is|are} more than once in a table with the same "
-        "numbers: {observations}. Each counts once.",
+        "{rows:row} of a table {rows:is|are} there more than once with the same numbers: {rows}. Each counts "
+        "once.",
         "rows that were copied into the table twice",
         "Remove the copies; measurements that were repeated differ in a digit.",
     ),
     Kind(
-        "frame_points_computed",
-        "note",
-        "{points:point} of rigid frames {points:is|are} in no photograph and {points:was|were} computed "
-        "from the other points of the frame: {points}.",
-        "a tip that touches the object, or a mistyped name",
-        "Nothing needs to be done if photographs do not show {points:it|them}; otherwise correct the name.",
-    ),
-    Kind(
-        "bar_left_out",
-        "warning",
-        "Scale bar {given} [[differs by {off:+} from]][[is {times} times]] the length that the other "
-        "given values imply, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
-        "between {finer} and {coarser}]]. It was left out.",
-        CHECK_THE_LIST,
-        "Correct the length of this bar or remove it.",
-    ),
-    Kind(
         "scale_left_out",
         "warning",
-        "The scale of {given:@} [[differs by {off:+} from]][[is {times} times]] that of the other given "
-        "values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as between {finer} "
-        "and {coarser}]]. They were left out.",
-        "coordinates or lengths in another unit or of another temperature, a tape that is too long, a print "
-        "that shrank, or points that moved",
-        "Correct these values or remove them.",
+        "The scale of [[{given:@bar}]][[{plate}]] [[differs by {off:+} from]][[is {times} times]] that of "
+        "the other given values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
+        "between {finer} and {coarser}]]. It was left out.",
+        "a mistyped, nominal or wrongly named length, another unit or temperature, a tape that is too long, a "
+        "print that shrank, or points that moved",
+        "Correct these values or remove them; state plate_sigma for a plate.",
     ),
     Kind(
         "scale_contradicted",
         "error",
-        "No dependable scale: {given:@bar}[[ and {agreeing:scale bar}]] contradict one another by "
-        "[[{off}]][[a factor of {times}]], {sigmas} standard deviations[[; nearly a factor of "
-        "{unit_factor}, as between {finer} and {coarser}]].",
+        "No dependable scale: [[{given:@bar}]][[mounts of {cameras}]][[ and {agreeing:scale bar}]][[ and "
+        "{others:@}]] contradict one another by [[{off}]][[a factor of {times}]], {sigmas} standard "
+        "deviations[[; nearly a factor of {unit_factor}, as between {finer} and {coarser}]].",
         CHECK_THE_LIST,
-        "Check these lengths and their unit; a third length shows which one is wrong.",
+        "Check these lengths, bases and their unit; a third source of scale shows which one is wrong.",
     ),
     Kind(
         "mount_contradicted",
@@ -183,24 +114,6 @@ ROWS = (
         "another convention of rotations or signs, the mount of another camera, or a camera that was moved",
         "Give X, Y, Z and the rotation of this camera in the image axes of the reference camera, or remove "
         "its mount.",
-    ),
-    Kind(
-        "mounts_scale_contradicted",
-        "error",
-        "No dependable scale: the scale by the given {cameras:mount|mounts} of {cameras} [[differs by "
-        "{off:+} from]][[is {times} times]] that by {others:@}, {sigmas} standard deviations[[; nearly a "
-        "factor of {unit_factor}, as between {finer} and {coarser}]]. Given mounts were not used.",
-        CHECK_THE_LIST,
-        "Check the base and these values and their unit; a third source of scale shows which is wrong.",
-    ),
-    Kind(
-        "plate_size_left_out",
-        "warning",
-        "The size of {given} [[differs by {off:+} from]][[is {times} times]] the size that the other "
-        "given values imply, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
-        "between {finer} and {coarser}]]. It was left out.",
-        WRONG_SIZE,
-        "Correct pitch of this plate, or state plate_sigma.",
     ),
     Kind(
         "plate_sizes_contradict",
@@ -295,72 +208,21 @@ ROWS = (
     ),
     Kind(
         "given_differs",
-        DETECTED,
-        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations, and "
-        "shifts it by {shift} standard deviations.",
-        CHECK_THE_LIST,
+        Grade("harm", error=WRONG_SIGMAS),  # the shift of a coordinate or length, 0 of an orientation
+        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations[[, "
+        "and shifts it by {shift} standard deviations]].",
+        "a mistyped number, wrong ends or name, another unit, a point that moved; another order or sense "
+        "of the angles",
         "Correct this value, or state a larger standard deviation.",
     ),
     Kind(
-        "orientation_differs",
-        "warning",
-        "The given {given} differs from the adjusted one by {difference}, {sigmas} standard deviations.",
-        "another order or sense of the angles, an instrument not aligned with the camera, or standard "
-        "deviations that are too small",
-        "Correct this value, or state a larger standard deviation.",
-    ),
-    Kind(
-        "check_differs",
-        "warning",
-        "{coordinate} of check point {point} differs from its given value by {difference}, {sigmas} standard "
-        "deviations.",
-        CHECK_THE_LIST,
-        "Check this coordinate, and the control near it.",
-    ),
-    Kind(
-        "checks_contradict",
-        "error",
+        "checks_differ",
+        Grade("more", error=1.0),  # more of them differ than agree
         "{count} of the {all} check points {count:differs from its|differ from their} given coordinates, "
-        "by up "
-        "to {distance}.",
-        "wrong control or scale, a weak network, or check points in another system or of another epoch",
+        "by up to {distance} in {coordinates}, {sigmas} standard deviations: {points}.",
+        "wrong control or scale, a weak network, or check points that are mistyped, moved or in another "
+        "system",
         "Find out whether control or check points are wrong before you use the result.",
-    ),
-    Kind(
-        "scale_unchecked",
-        "note",
-        "The scale rests on {given:@bar} alone: nothing checks it.",
-        "one length or one source of lengths",
-        "Add a scale bar from another source.",
-    ),
-    Kind(
-        "given_unchecked",
-        "note",
-        "Nothing checks {given:@} among {of:@}.",
-        "no more given values than the datum needs",
-        "Add control or scale bars.",
-    ),
-    Kind(
-        "given_partly_checked",
-        "note",
-        "An error of {given:@} among {of:@} would be detected in some directions only.",
-        "only a few more given values than the datum needs",
-        "Add control or scale bars.",
-    ),
-    Kind(
-        "given_weakly_checked",
-        "note",
-        "An error of {given:@} among {of:@} may remain undetected and shift the result by up to {sigmas} "
-        "of its standard deviations.",
-        "few control points or bars, all on one side, or one far more precise than the others",
-        "Add control or scale bars.",
-    ),
-    Kind(
-        "given_not_judged",
-        "note",
-        "The image points alone do not determine the network: only residuals check {of:@}.",
-        "photographs that only the control connects or calibrates",
-        "Add photographs with common points.",
     ),
     Kind(
         "scale_implausible",

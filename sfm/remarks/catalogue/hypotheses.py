@@ -40,14 +40,6 @@ ADJUSTMENT = (
         "set sigma_px to what the residuals show only where none is found.",
     ),
     Kind(
-        "sigma_px_cautious",
-        "note",
-        "The stated standard deviation of the image points, {stated}, is pessimistic: residuals show "
-        "{found}.",
-        "sigma_px is larger than the errors of the measurements",
-        "Set sigma_px to what the residuals show.",
-    ),
-    Kind(
         "residual_kept",
         RESIDUAL,
         "The residual of point {point} in {photograph} is {length}, {over_sigma} times its standard "
@@ -73,26 +65,14 @@ ADJUSTMENT = (
         "Look at the rejected image points in the report.",
     ),
     Kind(
-        "snooping_not_converging",
+        "rejection_not_converging",
         "warning",
-        "Data snooping ended after {rounds:round} that did not converge.",
-        "gross errors in most of the observations, or an undetermined network",
-        "Look for misidentified points and wrong start values.",
-    ),
-    Kind(
-        "reweighting_not_converging",
-        "warning",
-        "Reweighting ended after {rounds:round} that did not converge.",
-        "gross errors in most of the observations, or an undetermined network",
-        "Look for misidentified points and wrong start values.",
-    ),
-    Kind(
-        "snooping_unsolvable",
-        "warning",
-        "Data snooping ended early: with {more:image point} rejected instead of {rejected}, the network "
-        "is not determined.",
-        "rejections leave a photograph or a point without the rays that determine it",
-        "Look at the rejected image points; add photographs.",
+        "The rejection of gross errors ended early[[ after {rounds:round} that did not converge]][[: with "
+        "{more:image point} rejected instead of {rejected}, the network is not determined]][[: the "
+        "weights of {groups} did not converge]].",
+        "gross errors in most of the observations, or a network that few image points determine",
+        "Look at the rejected image points and for wrong start values; add photographs, or set "
+        'adjust.weights = "stated".',
     ),
     Kind(
         "photograph_without_weight",
@@ -102,13 +82,6 @@ ADJUSTMENT = (
         "the robust estimator gives all image points of a photograph a small weight",
         "Remove {photographs:the photograph|these photographs}, or correct {photographs:its|their} "
         "misidentified points.",
-    ),
-    Kind(
-        "weights_not_converged",
-        "warning",
-        "The weights of {groups} did not converge.",
-        "each set of weights rejects other image points",
-        'Look at the rejected image points, or set adjust.weights = "stated".',
     ),
     Kind(
         "held_to_converge",
@@ -121,26 +94,11 @@ ADJUSTMENT = (
         "{parameters:the parameter|the parameters} out of free.",
     ),
     Kind(
-        "better_solution_taken",
-        "note",
-        "The image points allow two solutions for c of camera {camera}: {first}, found first, and "
-        "{better}, which was taken because its v'Pv is {vPv} times as large.",
-        "a flat object or a narrow range of angles",
-        "Give a calibrated c, or add photographs at larger angles and other distances.",
-    ),
-    Kind(
         "other_solution",
         SOLUTION,
-        "The image points allow another solution with c of camera {camera} at {c} (v'Pv {vPv} times that of "
-        "the result); points differ by {moved} standard deviations (RMS)[[, c by {c_moved}]].",
-        "a flat object or a narrow range of angles: the photographs allow two shapes",
-        "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
-    ),
-    Kind(
-        "other_solution_reversed",
-        SOLUTION,
-        "The image points allow another solution, the object reversed in depth (v'Pv {vPv} times that of the "
-        "result); points differ by {moved} standard deviations (RMS).",
+        "The image points allow another solution[[ with c of camera {camera} at {c}]][[, {reversed:@}]] "
+        "(v'Pv {vPv} times that of the result); points differ by {moved} standard deviations (RMS)[[, c "
+        "by {c_moved}]].",
         "a flat object or a narrow range of angles: the photographs allow two shapes",
         "Hold c fixed at a calibrated value, or add photographs at larger angles and other distances.",
     ),
@@ -250,25 +208,15 @@ ROWS = (
         short="control points of a different shape",
     ),
     Kind(
-        "rig_bumped",
-        "warning",
+        "rig_contradicted",
+        # Of most photographs of these cameras, if some still share the pose of their rig, which bends it.
+        Grade("share", error=0.5, at_most=Grade("bound", error=1)),
         "{photographs:photograph} of {cameras} {photographs:contradicts|contradict} the rig, by up to "
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
-        "the camera was moved on its rig, or photographed at another moment while rig or object moved",
-        "If the camera stayed at its new place, list the photographs before and after it as blocks of the "
-        "rig; otherwise correct the {photographs:moment|moments}, or leave {photographs:the photograph|the "
-        "photographs} out.",
-        short="a camera that moved on its rig",
-    ),
-    Kind(
-        "rig_contradicted",
-        Grade("bound", error=1),  # photographs that still share the pose of their rig, which bends it
-        "Most photographs of {cameras} contradict the rig, by up to {distance} and {angle}, {shift} standard "
-        "deviations: {photographs}.",
-        "a wrong mount was given, the camera moved to another place during the survey, or the cameras were "
-        "not triggered together",
-        "Check the mounts that were given; list the photographs from each place of the camera as blocks of "
-        "the rig.",
+        "the camera was moved on its rig, a wrong mount was given, or rig or object moved between cameras "
+        "that were not triggered together",
+        "Check the mount that was given; list the photographs from each place of the camera as blocks of the "
+        "rig, correct their moments, or leave single ones out.",
         short="a camera that is not where its rig places it",
     ),
     Kind(
@@ -282,7 +230,7 @@ ROWS = (
     ),
     Kind(
         "windows_elsewhere",
-        SHIFT,
+        Grade("shift", warning=EXPECTED_SIGMAS),  # of these points alone
         "From {from} on, the windows of {points:point} show a different spot, up to {distance} away, "
         f"{{shift}} standard deviations: {{points}}.{INSTEAD}",
         "an edge in front of another surface, shine, shadows, or something that moved",
@@ -301,66 +249,12 @@ ROWS = (
         explains=OF_GIVEN,
     ),
     Kind(
-        "too_many_to_test",
-        "note",
-        "One camera for all photographs and one shape of the object are assumed but not tested: there "
-        "are too many photographs ({photographs}).",
-        "the tests need the normal equations of all photographs at once",
-        "Survey parts of the object separately to test them.",
-    ),
-    Kind(
-        "assumptions_untested",
-        "note",
-        "One camera for all photographs and one shape of the object are assumed but not tested: the "
-        "image points alone do not determine the network.",
-        "too few photographs or points, or rejected ones without which the network falls apart",
-        "Take more photographs from more directions.",
-    ),
-    Kind(
-        "photographs_untested",
-        "note",
-        "The object is assumed to keep its shape in all of {photographs:photograph}: a test needs {needed}.",
-        "too few photographs to show in which of them the object differs",
-        "Take more photographs.",
-    ),
-    Kind(
-        "cameras_untested",
-        "note",
-        "Each of {cameras:camera} is assumed not to change; this is not tested, as there are too many.",
-        "cameras with only one or a few photographs each",
-        "In the survey file, combine entries that describe the same camera.",
-    ),
-    Kind(
-        "camera_weakly_tested",
-        "note",
-        "A change of the camera may shift coordinates[[ of the network without {without:@}]] by up to "
-        "{sigmas} standard deviations before a test detects it.",
-        "few photographs, or all from about the same directions",
-        "Take more photographs from more directions, some of them rolled by 90 degrees.",
-    ),
-    Kind(
         "calibrated_from_few",
         "warning",
         "Camera {camera} is calibrated from {photographs} alone: almost nothing would show that it "
         "changed, or that the given points are wrong.",
         "one or two photographs of a camera do not show how much others would differ from them",
         "Take four photographs or more, tilted by 30 to 45 degrees and rolled by 90 degrees.",
-    ),
-    Kind(
-        "shape_weakly_tested",
-        "note",
-        "A deformation of the object may shift coordinates[[ of the network without {without:@}]] by up "
-        "to {sigmas} standard deviations before a test detects it.",
-        "few photographs, or few that show the same points before and after",
-        "Photograph the whole object twice, one round after the other.",
-    ),
-    Kind(
-        "held_weakly_tested",
-        "note",
-        "Wrong held {parameters} of camera {camera} may shift coordinates[[ of the network without "
-        "{without:@}]] by up to {sigmas} standard deviations before a test detects them.",
-        "the exterior orientation of the photographs absorbs errors of these parameters",
-        "Calibrate the camera, or take more photographs from more directions and add the parameters to free.",
     ),
     Kind(
         "two_places",
@@ -376,12 +270,5 @@ ROWS = (
         "Points {first} and {second} are swapped in {photographs}.",
         "they were confused when the photographs were measured",
         "Swap the two in these photographs.",
-    ),
-    Kind(
-        "image_points_misnamed",
-        "note",
-        "{count:rejected image point} {count:lies|lie} where another point is seen, in {photographs}.",
-        "a point was misidentified",
-        "Correct these image points if you need them; the result does not depend on them.",
     ),
 )

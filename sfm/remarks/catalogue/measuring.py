@@ -6,21 +6,6 @@ from sfm.remarks.kind import Grade, Kind
 
 POINTS = (
     Kind(
-        "rays_rejected",
-        "warning",
-        "More rays of {points:point} were rejected than expected by chance: {points}.",
-        "a point moved, was misidentified, or is hard to measure",
-        "Look at {points:its|their} rejected image points in the report.",
-    ),
-    Kind(
-        "two_rays",
-        "note",
-        "{two:point} of {total} {two:has|have} only two rays: errors along the epipolar line remain "
-        "undetected.",
-        "only two photographs show {two:it|them}",
-        "Add a photograph of {two:this point|these points}.",
-    ),
-    Kind(
         "points_not_determined",
         "note",
         "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
@@ -38,37 +23,18 @@ POINTS = (
         "{points:it|them}.",
     ),
     Kind(
-        "point_with_few_rays",
+        "point_not_determined",
         "note",
-        "It has {rays:ray}; {needed} are needed.",
-        "the point is in fewer photographs than it needs",
-        "Add photographs of the point, if you need it.",
+        "[[It has {rays:ray}; {needed} are needed]][[Fewer than {least} of its {measured} rays are from "
+        "photographs in the result]][[Its {parallel} rays are parallel within their precision]].",
+        "the point is far away, in fewer photographs than it needs, or they were taken from one place",
+        "Add photographs of the point from other positions, if you need it.",
     ),
     Kind(
-        "point_of_lost_photographs",
-        "note",
-        "Fewer than {needed} of its {measured} rays are from photographs in the result.",
-        "photographs that show it are not in the result",
-        "See the reasons of these photographs.",
-    ),
-    Kind(
-        "point_with_parallel_rays",
-        "note",
-        "Its {rays} rays are parallel within their precision.",
-        "the point is far away, or its photographs were taken from one place",
-        "Add photographs from other positions.",
-    ),
-    Kind(
-        "point_with_rays_apart",
+        "point_contradicted",
         "warning",
-        "Its {rays} rays do not meet in front of their photographs.",
-        "the point moved, or was misidentified in a photograph",
-        "Correct its image points, or do without it.",
-    ),
-    Kind(
-        "point_with_rays_rejected",
-        "warning",
-        "{accepted} of its {measured} rays {accepted:was|were} accepted; {needed} are needed.",
+        "[[Its {rays} rays do not meet in front of their photographs]][[{accepted} of its {measured} rays "
+        "{accepted:was|were} accepted; {needed} are needed]].",
         "the point moved, was misidentified in a photograph, or its rays are almost parallel",
         "Correct its image points, or do without it.",
     ),
@@ -89,22 +55,6 @@ POINTS = (
         "leave out {points:the point if you do not trust it|any that you do not trust}.",
     ),
     Kind(
-        "image_points_identical",
-        "note",
-        "{image_points:image point} {image_points:appears|appear} more than once at the same position: "
-        "{image_points}. Each counts once.",
-        "repeated rows in the table",
-        "Remove the copies.",
-    ),
-    Kind(
-        "image_points_averaged",
-        "note",
-        "{image_points:image point} {image_points:was|were} measured more than once and averaged: "
-        "{image_points}.",
-        "the measurements differ by no more than chance",
-        "Nothing needs to be done.",
-    ),
-    Kind(
         "image_points_contradicting",
         "warning",
         "{image_points:image point} {image_points:was|were} measured at different positions and left "
@@ -113,10 +63,10 @@ POINTS = (
         "Correct the names.",
     ),
     Kind(
-        "code_at_several_places",
+        "codes_at_several_places",
         "warning",
-        "Code {code} is read at several positions: {photographs} {photographs:shows|show} it elsewhere "
-        "than {others:other photograph}[[, at {points}]].",
+        "{codes:code} {codes:has|have} rays that do not meet at one position: {codes}, in "
+        "{photographs}[[; the other positions are {points}]].",
         "a target was moved, two targets share a number, or a code was misread",
         "Remove one of the targets, or survey the states separately.",
     ),
@@ -130,18 +80,11 @@ POINTS = (
     Kind(
         "plate_points_apart",
         "warning",
-        "{points:point} of the plate {points:has|have} rays that do not meet at one position, from "
-        "{photographs}: {points}.",
-        "a board of another size, of which a part was named; a lens that the model does not describe; or a "
-        "plate that was bent",
+        "{points:point} of the plate {points:is|are} elsewhere than in the other photographs[[, in "
+        "{photographs}]]: {points}[[; {agreeing} {agreeing:agrees|agree} with it]].",
+        "a board of another size, of which a part was named; another or a bent plate; or a lens that the "
+        "model does not describe",
         "Let kolinear init draft the survey anew; it finds rows, columns and model of the lens.",
-    ),
-    Kind(
-        "code_rays_apart",
-        "warning",
-        "The rays to code {code} from {photographs} do not meet.",
-        "a target was moved, two targets share a number, or a code was misread",
-        "Remove one of the targets, or survey the states separately.",
     ),
     Kind(
         "codes_too_small",
@@ -173,51 +116,39 @@ POINTS = (
         "Add photographs at smaller angles; coordinates may be worse than their standard deviations.",
     ),
     Kind(
-        "diameter_differs",
-        "warning",
-        "The stated diameter of {targets:target} is {stated}, but the ellipses show {found}.",
-        "the diameter is that of a ring, or in another unit, or the scale is wrong",
-        "State the diameter of the dot in the object unit, and check the scale bars.",
-    ),
-    Kind(
         "diameters_differ",
         "warning",
-        "The ellipses of {differing} of {total} targets differ by more than {limit} from the stated "
-        "{differing:diameter|diameters}, most that of {target}: {stated} stated, {found} found.",
-        "diameters are those of rings, or in another unit, or of other targets",
-        "State the diameters of the dots in the object unit, by the ids of the targets.",
-    ),
-    Kind(
-        "diameters_of_unknown",
-        "warning",
-        "Diameters are stated for targets that are not in the survey: {targets}.",
-        "ids that no target has",
-        "Correct the ids in the table of diameters.",
+        "The ellipses of {differing:target}[[ of {total}]] contradict the stated "
+        "{differing:diameter|diameters}[[, most that of {target}]]: {stated} stated, {found} found.",
+        "diameters are those of rings, or in another unit, or of other targets, or the scale is wrong",
+        "State the diameters of the dots in the object unit, and check the scale bars.",
     ),
 )
 ROWS = (
     Kind(
         "out_of_tolerance",
         "error",
-        "{tolerance}: {out} of {total} deviations {out:is|are} proven to be out of tolerance: {points}.",
-        "the object deviates from its drawing by more than tolerance and uncertainty",
-        "See the table of deviations.",
+        "[[{tolerance}: ]]{out} of {total} deviations {out:is|are} out of tolerance[[: {points}]][[; the "
+        "standard deviation of {unknown} is unknown]].",
+        "the deviation is larger than the tolerance and the uncertainty, or the column sigma is empty",
+        "See the table of deviations; enter standard deviations of the calibration.",
     ),
     Kind(
         "tolerance_undecided",
         "warning",
-        "{tolerance}: {undecided} of {total} deviations {undecided:is|are} too close to the limit to be "
+        "[[{tolerance}: ]]{undecided} of {total} deviations {undecided:is|are} too close to the limit to be "
         "decided.",
-        "the uncertainty of the measurement reaches across the limit",
-        "Measure with a smaller uncertainty: take more photographs, or move closer.",
+        "the uncertainty of the measurement or of the calibration reaches across the limit",
+        "Measure with a smaller uncertainty: take more photographs, move closer, or use lengths with a "
+        "better calibration.",
     ),
     Kind(
         "tolerance_unknown",
         "warning",
-        "{tolerance}: {unknown} of {total} deviations {unknown:has|have} no standard deviation and "
+        "[[{tolerance}: ]]{unknown} of {total} deviations {unknown:has|have} no standard deviation and "
         "{unknown:is|are} not decided.",
-        "the result has no covariance of these points",
-        "Run the survey again with this version, or measure a result with standard deviations.",
+        "the result has no covariance of these points, or the column sigma of the lengths is empty",
+        "Measure a result with standard deviations; enter those of the calibration.",
     ),
     Kind(
         "nominal_missing",
@@ -234,20 +165,13 @@ ROWS = (
         "Adjust it with Kolinear (kolinear adjust).",
     ),
     Kind(
-        "covariance_of_sample",
+        "covariance_incomplete",
         "warning",
-        "The covariance between points is known of {known} of {total} points: standard deviations of the "
-        "others ignore correlations.",
-        "of many points, results store the covariance of a sample only",
-        "Give the points that you measure names: named points come first.",
-    ),
-    Kind(
-        "covariance_of_single_points",
-        "warning",
-        "Only the covariance of each single point is known: standard deviations of shapes and distances "
-        "ignore correlations.",
-        "the result is of another program or an older version",
-        "Run the survey again.",
+        "The covariance between points is known of {known} of {total} points: standard deviations of "
+        "shapes and distances ignore the other correlations.",
+        "the result is of another program, or of many points, of which results store the covariance of a "
+        "sample",
+        "Give the points that you measure names, as named points come first, or run the survey again.",
     ),
     Kind(
         "network_units",
@@ -286,56 +210,14 @@ ROWS = (
         "Use control or an alignment.",
     ),
     Kind(
-        "correlations_unknown",
-        "note",
-        "The correlations of the points are not known.",
-        "the joint covariance of the points was not stored",
-        "Run the survey again.",
-    ),
-    Kind(
-        "lengths_outside",
-        "error",
-        "{outside} of {total} lengths {outside:is|are} proven to be outside the limit.",
-        "the error of length measurement is larger than the limit and the uncertainty of the calibration",
-        "See the table of lengths.",
-    ),
-    Kind(
-        "lengths_exceed_limit",
-        "error",
-        "{exceeding} of {total} errors of length {exceeding:exceeds|exceed} the limit; no standard "
-        "deviation of "
-        "the calibration is given that could explain {exceeding:it|them}.",
-        "the error of length measurement is larger than the limit, and the column sigma is empty",
-        "See the table of lengths; enter the standard deviations of the calibration.",
-    ),
-    Kind(
-        "lengths_undecided",
+        "lengths_lacking",
         "warning",
-        "{undecided} of {total} lengths {undecided:is|are} proven neither inside nor outside the limit.",
-        "the uncertainty of the calibration reaches across the limit",
-        "Use lengths with a better calibration.",
-    ),
-    Kind(
-        "lengths_without_sigma",
-        "warning",
-        "{unknown} of {total} lengths {unknown:has|have} no standard deviation of {unknown:its|their} "
-        "calibration and {unknown:is|are} not decided.",
-        "the column sigma is empty",
-        "Enter the standard deviations of the calibration.",
-    ),
-    Kind(
-        "lines_missing",
-        "warning",
-        "There {lines:is|are} {lines:measuring line}; part 1 asks for {needed}.",
+        "[[There {lines:is|are} {lines:measuring line}; part 1 asks for {needed}]][[Line {line} has "
+        "{lengths:length}; part 1 asks for {needed}]][[Lines {parallel} have the same direction; part 1 "
+        "asks for different ones]][[The longest length is {longest}; part 1 asks for two thirds of the "
+        "body diagonal of {diagonal}]].",
         "VDI/VDE 2634 part 1, sec. 4",
-        "Add measuring lines.",
-    ),
-    Kind(
-        "line_short_of_lengths",
-        "warning",
-        "Line {line} has {lengths:length}; part 1 asks for {needed}.",
-        "VDI/VDE 2634 part 1, sec. 4",
-        "Add lengths on this line.",
+        "Add measuring lines or longer lengths, or state the measuring volume (--diagonal).",
     ),
     Kind(
         "line_not_straight",
@@ -343,26 +225,5 @@ ROWS = (
         "The lengths of line {line} are not on one line.",
         "points of two lines share a line name",
         "Correct the column line.",
-    ),
-    Kind(
-        "lines_parallel",
-        "warning",
-        "Lines {lines} have the same direction; part 1 asks for different ones.",
-        "VDI/VDE 2634 part 1, sec. 4",
-        "Place the lines in different directions.",
-    ),
-    Kind(
-        "longest_length_short",
-        "warning",
-        "The longest length is {longest}; part 1 asks for two thirds of the body diagonal of {diagonal}.",
-        "VDI/VDE 2634 part 1, sec. 4",
-        "Add a longer length, or state the measuring volume (--diagonal).",
-    ),
-    Kind(
-        "temperature_unknown",
-        "note",
-        "The temperature of the lengths, and whether they were corrected for it, are not known here.",
-        "no file states it",
-        "Correct the lengths for temperature before the test.",
     ),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import Grade, Kind, Unless
 
 DRAFTS = (
     Kind(
@@ -14,16 +14,10 @@ DRAFTS = (
         "Use the original photographs.",
     ),
     Kind(
-        "photographs_marked_as_turned",
-        "note",
-        "{photographs:photograph} of camera {camera} {photographs:is|are} marked as rotated.",
-        "EXIF data state a rotation; pixels are read as stored, which is right for one camera",
-        "Nothing needs to be done.",
-    ),
-    Kind(
         "camera_assumed",
         "note",
-        "The files of camera {cameras} do not state the size of the pixels or the focal length.",
+        "The files of camera {cameras} do not state the size of the pixels or the focal length[[, and "
+        "COLMAP's list of cameras was not read: {reason}]].",
         "no EXIF data, or a camera that is not in the list; shapes and angles do not depend on it",
         "Give sensor_mm and c_mm if c in mm matters.",
     ),
@@ -44,17 +38,10 @@ DRAFTS = (
     Kind(
         "circles_without_codes",
         "warning",
-        "A photograph has {circles:circle}, but no code of a known family: texture orients the photographs.",
-        "targets without codes",
-        "Add coded targets.",
-    ),
-    Kind(
-        "circles_in_rows",
-        "warning",
-        "A photograph has {circles:circle}, in up to {rows} rows and {columns} columns, but no two "
-        "photographs show the same whole plate: texture orients the photographs.",
-        "a plate of dots that is cut by the border or covered, or targets without codes",
-        "If it is a plate, state its rows and columns as the survey file shows; or add coded targets.",
+        "A photograph has {circles:circle}[[, in up to {rows} rows and {columns} columns]], but no code of a "
+        "known family and no whole plate: texture orients the photographs.",
+        "targets without codes, or a plate of dots that is cut by the border or covered",
+        "Add coded targets, or state the rows and columns of the plate as the survey file shows.",
     ),
     Kind(
         "rings_not_read",
@@ -73,20 +60,13 @@ DRAFTS = (
         "If lengths matter, give the distance of neighbouring dots or crossings: --pitch for a new survey "
         "file, targets.pitch without pitch_assumed in one that exists. Cameras do not depend on it.",
     ),
-    Kind(
-        "sensor_not_looked_up",
-        "note",
-        "{camera} was not looked up in COLMAP's list of cameras: {reason}.",
-        "a library is not installed",
-        "Install it, or give sensor_mm.",
-    ),
 )
 INPUT = (
     Kind(
         "copies",
         "note",
-        "{copies:photograph} {copies:is a copy|are copies} of another, and {copies:counts|count} once: "
-        "{copies}.",
+        "[[It is a copy of {original}: the {same} are the same]][[{copies:photograph} {copies:is a copy|are "
+        "copies} of another, and {copies:counts|count} once: {copies}]].",
         "the same photograph was copied or saved again; it is not a second observation",
         "Remove the copies.",
     ),
@@ -97,14 +77,6 @@ INPUT = (
         "photographs} and left out: {image_points}.",
         "a gross error or a mistyped coordinate",
         "Correct or remove the image points that are named.",
-    ),
-    Kind(
-        "handedness_unchecked",
-        "note",
-        "Nothing checks whether image coordinates are mirrored: y must count downwards.",
-        "image points from a file, without control points or projection centres that are not all in one "
-        "plane",
-        "Compare the result with the object, or give four points that do not lie in a plane.",
     ),
 )
 ROWS = (
@@ -123,7 +95,7 @@ ROWS = (
         "{points} and {needed} of {others} would connect them.]]",
         "groups of photographs with too few common points",
         "Add a photograph that shows points of both groups.",
-        explains=("photograph_not_connected",),
+        explains=("photograph_with_few_points",),
     ),
     Kind(
         "photographs_posed_by_rig",
@@ -135,35 +107,12 @@ ROWS = (
         "rig goes unnoticed in {photographs:it|them}.",
     ),
     Kind(
-        "two_photographs",
-        "note",
-        "Two photographs: no third ray checks a point, and the camera is only as good as its given values.",
-        "a point needs three rays to be checked; uncoded targets need three to be named",
-        "Add a third photograph.",
-    ),
-    Kind(
-        "pairs_matched",
-        "note",
-        "{pairs} of {possible} pairs of photographs were matched: those with most in common[[, "
-        "neighbours in the series of {in_sequence:photograph} (EXIF time or numbers in the names)]][[, "
-        "neighbours by satellite navigation of {by_position:photograph} (EXIF)]].",
-        "matching all pairs takes time with the square of the number of photographs",
-        "Nothing needs to be done. If photographs that overlap are not connected, take one between them.",
-    ),
-    Kind(
         "clock_differs",
-        "note",
-        "According to the times in EXIF data, the clock of camera {camera} is {ahead} ahead of that of "
-        "camera {reference}; times are compared after removing this difference.",
-        "clocks that were not set to the same time",
-        "Check in the report that photographs of the same moment show the same scene.",
-    ),
-    Kind(
-        "clocks_unsure",
-        "warning",
-        "The EXIF times of camera {camera} agree with those of {reference} as they are, and as well if its "
-        "clock is {ahead} ahead.",
-        "photographs at regular intervals, of which one camera misses the first or last",
+        Unless("unsure", "note", "warning"),
+        "By the EXIF times, the clock of camera {camera} is {ahead} ahead of that of camera "
+        "{reference}[[; they agree as well {unsure}]].",
+        "clocks that were not set to the same time; or photographs at regular intervals, of which one camera "
+        "misses the first or last",
         "Check in the report that photographs of the same moment show the same scene; if not, give the "
         "moments by an expression, 'order' or a table.",
     ),
@@ -210,9 +159,21 @@ ROWS = (
     Kind(
         "plate_not_found",
         "note",
-        "The calibration plate of {size} dots was not found in {photographs:photograph}: {photographs}.",
-        "a plate without marks must be seen whole; of one with marks, enough marks must be seen",
-        "Show all of it; check the polarity of the dots.",
+        "The {plate:@} of {size} was not found in {photographs:photograph}[[, where {dots:dot} "
+        "{dots:does|do} not fit it]]: {photographs}.",
+        "it is cut off or hidden, its marks are hidden or blurred, or rows and columns are not those of the "
+        "plate; of a checkerboard they count crossings",
+        "Show all of it with its rim, larger; check rows, columns, marks and polarity, or run kolinear "
+        "init on the folder.",
+        explains=("photograph_with_few_points",),
+    ),
+    Kind(
+        "board_not_found",
+        "note",
+        "The {plate:@} of {size} was not found in {photographs:photograph}: {photographs}.",
+        "its tags are too small, blurred or hidden; rows and columns count crossings of a ChArUco board, "
+        "and two corners for each tag of an AprilGrid",
+        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
         explains=("photograph_with_few_points",),
     ),
     Kind(
@@ -223,15 +184,6 @@ ROWS = (
         "Take more photographs that show it beside the other plates, or remove it from the survey file.",
     ),
     Kind(
-        "plate_not_recognised",
-        "note",
-        "In {photographs:photograph} {dots:dot} {dots:does|do} not fit the plate of {size}: {photographs}.",
-        "rows, columns or marks are not those of the plate; its marks are hidden or blurred; or only a "
-        "part without marks is seen",
-        "Check rows, columns and marks; run kolinear init on the folder, which finds them.",
-        explains=("photograph_with_few_points",),
-    ),
-    Kind(
         "plate_looks_alike_turned",
         "warning",
         "The plate looks the same when rotated: {cameras} may count its points from different corners in "
@@ -240,31 +192,6 @@ ROWS = (
         "a plate that was hardly moved",
         "Give photographs of one moment the same number; otherwise do not compare stations of one camera "
         "with those of the other, or use a plate with marks.",
-    ),
-    Kind(
-        "checkerboard_not_found",
-        "note",
-        "The checkerboard of {size} crossings was not found in {photographs:photograph}: {photographs}.",
-        "two opposite sides of it are cut off, or it has no white rim; rows and columns count "
-        "crossings, not squares",
-        "Show all of it with its rim; check rows and columns.",
-        explains=("photograph_with_few_points",),
-    ),
-    Kind(
-        "charuco_not_found",
-        "note",
-        "The ChArUco board of {size} crossings was not found in {photographs:photograph}: {photographs}.",
-        "its tags are too small, blurred or hidden; rows and columns count crossings, not squares",
-        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
-        explains=("photograph_with_few_points",),
-    ),
-    Kind(
-        "aprilgrid_not_found",
-        "note",
-        "The AprilGrid of {size} corners was not found in {photographs:photograph}: {photographs}.",
-        "its tags are too small, blurred or hidden; rows and columns count two corners for each tag",
-        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
-        explains=("photograph_with_few_points",),
     ),
     Kind(
         "plate_side_not_found",
@@ -284,46 +211,11 @@ ROWS = (
     ),
     # reasons why single photographs are not in the result
     Kind(
-        "copy_of_file",
-        "note",
-        "It is a copy of {original}: the files are the same.",
-        "the same photograph was copied or saved again; it is not a second observation",
-        "Remove the copy.",
-    ),
-    Kind(
-        "copy_of_picture",
-        "note",
-        "It is a copy of {original}: the pictures are the same.",
-        "the same photograph was copied or saved again; it is not a second observation",
-        "Remove the copy.",
-    ),
-    Kind(
-        "copy_of_image_points",
-        "note",
-        "It is a copy of {original}: the image points are the same.",
-        "the same photograph was copied or saved again; it is not a second observation",
-        "Remove the copy.",
-    ),
-    Kind(
-        "copy_of_errors",
-        "note",
-        "It is a copy of {original}: the errors of the image points are the same.",
-        "the same photograph was copied or saved again; it is not a second observation",
-        "Remove the copy.",
-    ),
-    Kind(
-        "photograph_unreadable",
-        "warning",
-        "Not readable: {reason}.",
-        "a damaged file, or no photograph",
-        "Copy it again, or convert it to JPEG or TIFF.",
-    ),
-    Kind(
         "photographs_unreadable",
         "warning",
-        "{photographs} could not be read.",
+        "[[{photographs} could not be read]][[Not readable: {reason}]].",
         "damaged files, or files that are no photographs",
-        "Copy {photographs:it|them} again, or remove {photographs:it|them} from the folder.",
+        "Copy them again, convert them to JPEG or TIFF, or remove them from the folder.",
     ),
     Kind(
         "photographs_not_drawn",
@@ -336,24 +228,10 @@ ROWS = (
     Kind(
         "photograph_of_other_size",
         "warning",
-        "It has {size}, the others of camera {camera} have {usual} ({what}); {needed} such photographs "
-        "would form a separate camera.",
+        "It has {size}, camera {camera} has {usual} ({what})[[; {needed} such photographs would form a "
+        "separate camera]].",
         "photographs that are cropped, resampled or turned, or from another sensor",
-        "Use original photographs.",
-    ),
-    Kind(
-        "photograph_outside_calibration",
-        "warning",
-        "It has {size}, the calibration of camera {camera} is for {usual} ({what}).",
-        "photographs that are cropped or turned, or from another sensor",
         "Use original photographs, or describe their camera.",
-    ),
-    Kind(
-        "photograph_not_connected",
-        "warning",
-        "It shows {shared:point} that the oriented photographs determine; {needed} are needed.",
-        "too few common points",
-        "Add a photograph that shows points of both.",
     ),
     Kind(
         "photograph_with_few_points",
@@ -365,17 +243,18 @@ ROWS = (
     Kind(
         "photograph_with_few_fitting",
         "warning",
-        "Only {fitting} of its {points:point} {fitting:fits|fit} the network; {needed} are needed.",
+        "Too few of its image points fit the network[[, {fitting} of {points}]]: at least {needed} "
+        "{needed:is|are} needed.",
         "misidentified points, another object, or a wrong principal distance",
-        "Check its points and the camera.",
+        "Check its points and the camera, or leave it out.",
     ),
     Kind(
         "photograph_contradicting",
         "warning",
-        "{confirmed:condition} of its points {confirmed:confirms|confirm} the network, {against} of its "
-        "points "
-        "{against:contradicts|contradict} it.",
-        "another object, a mirrored picture, wrong codes, or matches of a repeated pattern",
+        "{against} of its image points {against:contradicts|contradict} the network[[, {confirmed:condition} "
+        "{confirmed:confirms|confirm} it]][[ (of {points})]].",
+        "another object or another state of it, a mirrored picture, wrong codes, or matches of a repeated "
+        "pattern",
         "Leave it out, or survey it separately.",
     ),
     Kind(
@@ -405,42 +284,10 @@ ROWS = (
     Kind(
         "photograph_of_second_object",
         "warning",
-        "{photographs} fit one another but not the others: {points:common point} {points:differs|differ} "
-        "by {misfit:%} of their spread.",
-        "a second object with the same codes, or this one in another state",
-        "Survey them separately.",
-    ),
-    Kind(
-        "photograph_with_codes_elsewhere",
-        "warning",
-        "{codes:code} {codes:is|are} elsewhere than in the others: {codes}[[; {agreeing} "
-        "{agreeing:agrees|agree} with it]].",
-        "another object with the same codes, this one in another state, or wrong codes",
+        "[[{photographs} fit one another but not the others: {points:common point} "
+        "{points:differs|differ} by {misfit:%} of their spread]][[{codes:code} {codes:is|are} elsewhere "
+        "than in the others: {codes}]][[; {agreeing} {agreeing:agrees|agree} with it]].",
+        "a second object with the same codes, this one in another state, or wrong codes",
         "Survey it separately, or correct the codes.",
-    ),
-    Kind(
-        "photograph_with_points_elsewhere",
-        "warning",
-        "{points:point} of the plate {points:is|are} elsewhere than in the others: {points}[[; {agreeing} "
-        "{agreeing:agrees|agree} with it]].",
-        "another part of a larger board, another plate, or a lens that the model does not describe",
-        "Let kolinear init draft the survey anew; it finds rows, columns and model of the lens.",
-    ),
-    Kind(
-        "photograph_not_explained",
-        "warning",
-        "{against} of its {points:point} {against:contradicts|contradict} the network, and no other c "
-        "explains "
-        "{against:it|them}.",
-        "another state of the object, another object or wrong codes",
-        "Leave it out, or survey it separately.",
-    ),
-    Kind(
-        "photograph_with_few_accepted",
-        "warning",
-        "{needed:None|Too few} of its image points {needed:was|were} accepted, at least {needed} "
-        "{needed:is|are} needed.",
-        "misidentified points, or a photograph of another object",
-        "Check its points, or leave it out.",
     ),
 )

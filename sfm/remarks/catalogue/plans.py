@@ -8,16 +8,11 @@ BATCHES = (
     Kind(
         "surveys_failed",
         "error",
-        "{surveys:survey} failed: {surveys}.",
-        "see the reason in the row of each",
-        "Correct {surveys:the survey file|the survey files}, and run the batch again with --resume.",
-    ),
-    Kind(
-        "surveys_set_aside",
-        "error",
-        "{surveys:survey} {surveys:was|were} set aside: {surveys}.",
-        "the process that computed {surveys:it|them} died, for example for lack of memory",
-        "Run {surveys:this survey alone|each of these surveys alone}.",
+        "{surveys:survey} {how}: {surveys}.",
+        "the reason in the row of each; a process that died, for example for lack of memory, sets its survey "
+        "aside",
+        "Correct the survey files, or run those that were set aside alone; run the batch again with "
+        "--resume.",
     ),
     Kind(
         "surveys_not_dependable",
@@ -32,13 +27,6 @@ BATCHES = (
         "{surveys:survey} worked with warnings: {surveys}.",
         "see the remarks in the report of each",
         "Read {surveys:its report before using the result|their reports before using the results}.",
-    ),
-    Kind(
-        "adjuster_differs_in_surveys",
-        "warning",
-        "COLMAP's adjustment differs in {surveys:survey}: {surveys}.",
-        "one of the two adjusters has not reached the minimum",
-        "Read the comparison in the report of each.",
     ),
     Kind(
         "same_optimum",
@@ -99,6 +87,13 @@ ROWS = (
         explains=("plan_does_not_calibrate",),
     ),
     Kind(
+        "plan_points_undetermined",
+        "error",
+        "{lost} of {total} points {lost:is|are} not determined: {points}.",
+        "fewer than two photographs show {lost:it|them}",
+        "Add stations that see {lost:it|them}.",
+    ),
+    Kind(
         "plan_not_connected",
         "error",
         "{photographs} {photographs:shares|share} fewer than {needed} points with {others}: they are "
@@ -109,13 +104,6 @@ ROWS = (
         explains=("plan_undetermined",),
     ),
     Kind(
-        "plan_points_undetermined",
-        "error",
-        "{lost} of {total} points {lost:is|are} not determined: {points}.",
-        "fewer than two photographs show {lost:it|them}",
-        "Add stations that see {lost:it|them}.",
-    ),
-    Kind(
         "plan_short_of_wanted",
         "warning",
         "The uncertainty is {times} times the wanted one.",
@@ -123,11 +111,12 @@ ROWS = (
         "Add stations, move closer, or allow more photographs.",
     ),
     Kind(
-        "plan_points_with_few_rays",
+        "plan_has_few",
         "note",
-        "{few:point} {few:has|have} fewer than {needed} rays.",
-        "few photographs show {few:it|them}",
-        "Add stations that see {few:it|them}.",
+        "[[{few:point} {few:has|have} fewer than {needed} rays]][[{photographs:photograph} "
+        "{photographs:has|have} fewer than {needed} positions of coded targets: {photographs}]].",
+        "few photographs show these points, or a photograph shows few points",
+        "Add stations that see these points; plan more coded targets there.",
     ),
     Kind(
         "plan_does_not_calibrate",
@@ -152,48 +141,10 @@ ROWS = (
         "Add photographs beside {photographs:it|them}.",
     ),
     Kind(
-        "plan_without_scale",
+        "plan_assumes",
         "note",
-        "The scale is assumed to be known: without a scale bar, standard deviations do not include its "
-        "error.",
-        "no scale bar and nothing else that gives the scale was planned",
-        "Give --scale-bar, or observations in a survey file with --survey.",
-    ),
-    Kind(
-        "plan_without_surface",
-        "note",
-        "The points have no surface, so that hidden ones count as seen.",
-        "only points were given",
-        "Give a mesh.",
-    ),
-    Kind(
-        "plan_few_codes",
-        "note",
-        "{photographs:photograph} {photographs:has|have} fewer than {needed} positions of coded targets: "
-        "{photographs}.",
-        "{photographs:it shows|they show} few points",
-        "Plan more coded targets there.",
-    ),
-    Kind(
-        "plan_without_normals",
-        "note",
-        "Points without normals count as seen from everywhere.",
-        "the table lacks nX, nY, nZ",
-        "Give nX, nY, nZ.",
-    ),
-    Kind(
-        "plan_sigma_of_targets",
-        "note",
-        "The standard deviation of image coordinates is the limit that the targets set; lens and sensor "
-        "add to it.",
-        "no --sigma-px was given",
-        "Give --sigma-px from an earlier survey.",
-    ),
-    Kind(
-        "plan_without_depth_of_field",
-        "note",
-        "Depth of field is not considered.",
-        "no aperture was given",
-        "Give --f-number and --focus.",
+        "The plan assumes {assumed:@}.",
+        "no scale, mesh, normals, precision or aperture was given",
+        "Give --scale-bar, a mesh, nX, nY, nZ, --sigma-px of an earlier survey, or --f-number and --focus.",
     ),
 )

@@ -63,6 +63,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
             "level": verdict.level,
             "headline": verdict.headline,
             "remarks": [one.as_dict() for one in verdict.remarks],
+            "tests": [one.as_dict() for one in verdict.tests],
         },
         **values_of(a, "converged iterations"),
         "sigma0_at_start": or_none(a.start_sigma0),

@@ -27,7 +27,6 @@ from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
 
 POSE = 6  # parameters of the pose of a photograph
-OF_RIGS = ("rig_bumped", "rig_contradicted")
 OF_CAMERAS = ("other_camera", "two_cameras", "camera_varies", "camera_drift")
 # Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
 # reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
@@ -59,7 +58,7 @@ def _models_without_copies(found: SolvedSurvey) -> Iterator[SurveyModel]:
         matched = found.model.matched
         network, estimate = without_copies(matched.network, matched.estimate, copies)
         left_out = tuple(
-            (name, remark("copy_of_errors", original=first)) for name, (first, _) in copies.items()
+            (name, remark("copies", original=first, same="errors of the image points")) for name, (first, _) in copies.items()
         )
         yield replace(
             found.model,
@@ -96,7 +95,7 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
     share = np.where(oriented, against / np.maximum(count, 1), np.inf)
     least = np.full(int(stated.max()) + 1, np.inf)
     np.minimum.at(least, stated, share)
-    named = [name for one in of_kind(found.remarks, *OF_RIGS) for name in one.names("photographs")]
+    named = [name for one in of_kind(found.remarks, "rig_contradicted") for name in one.names("photographs")]
     free = more_than_chance(against, count, ALPHA) & (share > least[stated])
     free = oriented & (free | np.isin(network.images, named))
     if not free.any():

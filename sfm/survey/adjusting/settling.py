@@ -332,7 +332,7 @@ def _adjust_with_component(
     group = np.zeros(count, dtype=np.int64)
     final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,), start=start)
     if not settled:
-        unsettled = remark("weights_not_converged", groups=IMAGE_POINTS)
+        unsettled = remark("rejection_not_converging", groups=IMAGE_POINTS)
         final = replace(final, remarks=(*final.remarks, unsettled))
     return final
 

@@ -539,7 +539,7 @@ def _dropped_photographs(start: _Prepared, settled: StableAdjustment) -> tuple[t
     reasons = {} if settled.per_photograph is None else dict(settled.per_photograph.left_out)
     task = start.task
     return tuple(
-        (name, reasons.get(name, remark("photograph_with_few_accepted", needed=int(fewest))))
+        (name, reasons.get(name, remark("photograph_with_few_fitting", needed=int(fewest))))
         for name, was, is_in, fewest in zip(
             task.network.images, start.estimate.oriented, settled.images, task.least, strict=True
         )

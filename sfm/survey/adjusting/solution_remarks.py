@@ -49,8 +49,8 @@ def remarks_on_solution(
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     return (
         *adjustment.remarks,
-        *remarks_on_left_out(left_out, measured),
-        *([remark("datum_points_missing", points=absent)] if absent else []),
+        *remarks_on_left_out(left_out, measured, named=survey.tie_points is None),
+        *([remark("names_missing", of="datum", names=absent)] if absent else []),
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
         *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
@@ -154,12 +154,12 @@ def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple
     plate = is_plate_control(survey.control, plate_control(survey.targets))
     control = [name for name in survey.control.names if name not in known] if survey.control else []
     if control and not plate:
-        remarks.append(remark("control_missing", points=control))
+        remarks.append(remark("names_missing", of="control", names=control))
     if survey.targets.pitch_assumed and survey.targets.pitch is not None:
         remarks.append(remark("plate_pitch_assumed", pitch=(survey.targets.pitch, survey.unit)))
     bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
     if bars:
-        remarks.append(remark("scale_bars_missing", bars=bars))
+        remarks.append(remark("names_missing", of="bars", names=bars))
     if not has_scale:
         remarks.append(remark("scale_undefined", unit=survey.unit))
     return tuple(remarks)
@@ -189,14 +189,14 @@ def left_out_points(
         if name in kept or not rays[j]:
             continue
         if rays[j] < needed[j]:
-            reason = remark("point_with_few_rays", rays=int(rays[j]), needed=int(needed[j]))
+            reason = remark("point_not_determined", rays=int(rays[j]), needed=int(needed[j]))
         elif name in known:
             reason = known[name]
         elif accepted_rays[j] >= needed[j]:
-            reason = remark("point_of_lost_photographs", measured=int(rays[j]), needed=int(needed[j]))
+            reason = remark("point_not_determined", measured=int(rays[j]), least=int(needed[j]))
         else:
             reason = remark(
-                "point_with_rays_rejected",
+                "point_contradicted",
                 accepted=int(accepted_rays[j]),
                 measured=int(rays[j]),
                 needed=int(needed[j]),
@@ -211,13 +211,18 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
-def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], measured: int) -> tuple[Remark, ...]:
+def remarks_on_left_out(
+    left_out: tuple[LeftOutPoint, ...], measured: int, *, named: bool
+) -> tuple[Remark, ...]:
     """Return the remarks on points that are not in the result: contradicted, or only not determined.
 
     Args:
         left_out: measured points that are not in the result, with the reason.
         measured: number of measured points.
+        named: whether a person named the points and can correct them; those of natural texture are a test.
     """
+    if left_out and not named:
+        return (remark("points_left_out", points=len(left_out), measured=measured),)
     groups = {
         "points_contradicted": [one.point for one in left_out if one.reason.severity != "note"],
         "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
@@ -241,6 +246,7 @@ def remarks_on_principal_distances(
     if _is_calibration(survey):
         return ()
     given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
+    assumed = {one.name for one in survey.cameras if one.c_assumed}
     remarks = []
     for camera, s in zip(estimate.cameras, sigma, strict=True):
         start = given.get(camera.name)
@@ -252,7 +258,7 @@ def remarks_on_principal_distances(
         if not camera.free[0]:
             held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(found, "mm"))
             remarks.append(held)
-        else:
+        elif camera.name not in assumed:
             remarks.append(
                 remark(
                     "c_far_from_given",

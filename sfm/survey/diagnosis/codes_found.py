@@ -30,11 +30,6 @@ from sfm.targets.detect import Targets, find_targets
 from sfm.targets.outlines import Flag, scale_of
 
 MIN_VIEWS = 2  # photographs that show where a missing side of a plate should be
-NOT_FOUND = {  # kinds of remarks by the codes of a board; plates of dots have other kinds
-    "checkerboard": "checkerboard_not_found",
-    "charuco": "charuco_not_found",
-    "aprilgrid": "aprilgrid_not_found",
-}
 MIN_TAGS = (
     2  # of a family in a photograph that are not read by chance; a dictionary may be part of a larger one
 )
@@ -68,11 +63,19 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         missing = [name for name in dots if dots[name] < MIN_DOTS]
         size = f"{plate.rows} x {plate.columns}"
         if missing:
-            kind = NOT_FOUND.get(plate.name, "plate_not_found")
-            remarks.append(remark(kind, photographs=missing, size=size))
+            remarks.append(
+                remark(
+                    "board_not_found" if plate.dictionary else "plate_not_found",
+                    plate=plate.name,
+                    photographs=missing,
+                    size=size,
+                )
+            )
         if strange:
             many = round(statistics.median(dots[name] for name in strange))
-            remarks.append(remark("plate_not_recognised", photographs=strange, dots=many, size=size))
+            remarks.append(
+                remark("plate_not_found", plate=plate.name, photographs=strange, dots=many, size=size)
+            )
     return tuple(remarks)
 
 

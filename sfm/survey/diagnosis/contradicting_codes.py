@@ -134,24 +134,22 @@ def remarks_on_contested(
                 photographs=[photographs.names[i] for i in sorted(images)],
             )
         )
-    for code, places in sorted(found.places.items()):
-        if code in of_plates:
-            continue
-        number = str(_number(code, naming))
-        main = found.main.get(code, UNNAMED)
-        away = sorted(image for image, at in places.items() if main not in at or len(at) > 1)
-        if main == UNNAMED or not away:
-            shown = [photographs.names[i] for i in away or sorted(places)]
-            remarks.append(remark("code_rays_apart", code=number, photographs=shown))
-            continue
-        points = sorted({naming.names[k] for i in away for k in places[i] if k not in (main, UNNAMED)})
+    codes = sorted(found.places.keys() - of_plates)
+    away: set[int] = set()
+    points: set[str] = set()
+    for code in codes:
+        places, main = found.places[code], found.main.get(code, UNNAMED)
+        elsewhere = {image for image, at in places.items() if main not in at or len(at) > 1}
+        away |= elsewhere or places.keys()
+        if main != UNNAMED:
+            points |= {naming.names[k] for i in elsewhere for k in places[i] if k not in (main, UNNAMED)}
+    if codes:
         remarks.append(
             remark(
-                "code_at_several_places",
-                code=number,
-                photographs=[photographs.names[i] for i in away],
-                others=len(places) - len(away),
-                points=points or None,
+                "codes_at_several_places",
+                codes=[str(_number(code, naming)) for code in codes],
+                photographs=[photographs.names[i] for i in sorted(away)],
+                points=sorted(points) or None,
             )
         )
     return tuple(remarks)
@@ -234,8 +232,8 @@ def _reason_for_other_object(codes: set[int], agreeing: list[str], *, plate: boo
     """Return why a photograph of another object, or of another part of a plate, is not in the result."""
     numbers = [str(code) for code in sorted(codes)]
     if plate:
-        return remark("photograph_with_points_elsewhere", points=numbers, agreeing=agreeing or None)
-    return remark("photograph_with_codes_elsewhere", codes=numbers, agreeing=agreeing or None)
+        return remark("plate_points_apart", points=numbers, agreeing=agreeing or None)
+    return remark("photograph_of_second_object", codes=numbers, agreeing=agreeing or None)
 
 
 def _number(code: int, naming: Naming) -> int:

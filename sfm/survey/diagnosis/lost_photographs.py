@@ -103,7 +103,7 @@ def explain_lost_photographs(network: Network, found: Orientation, *, named: boo
     for group in groups:
         for i in group.images:
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
-            reasons[network.images[i]] = remark("photograph_not_connected", shared=count, needed=MIN_POINTS)
+            reasons[network.images[i]] = remark("photograph_with_few_points", seen=count, needed=MIN_POINTS)
     groups.sort(key=lambda one: -len(one.images))
     remarks = (_remark_on_unconnected(network, oriented, group, named=named) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)

@@ -104,7 +104,7 @@ def find_photograph_cameras(
         if fit is None:
             out[i] = lost[i]
             if lost[i] and oriented[i]:
-                reason = remark("photograph_not_explained", against=int(against[i]), points=int(count[i]))
+                reason = remark("photograph_contradicting", against=int(against[i]), points=int(count[i]))
                 left.append((name, reason))
             continue
         camera, found = fit

@@ -243,7 +243,7 @@ def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]
 
 
 def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...]:
-    """Return remarks on photographs of a camera that were resampled or are marked as turned."""
+    """Return remarks on photographs of a camera that were resampled."""
     remarks = []
     resampled = {
         name: one.taken_px
@@ -262,9 +262,6 @@ def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...
                 taken=f"{taken[0]} x {taken[1]} px",
             )
         )
-    turned = [name for name, one in photographs.items() if one.orientation != 1]
-    if turned:
-        remarks.append(remark("photographs_marked_as_turned", camera=camera, photographs=turned))
     return tuple(remarks)
 
 

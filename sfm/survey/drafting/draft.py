@@ -238,6 +238,7 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> 
         f"images = {json.dumps(globs, ensure_ascii=False)}",
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
+        *(["c_assumed = true  # remove this once c_mm and pixel_mm are known"] if camera.assumed else []),
         *(_model_lines(camera, free) if models else ()),
     ]
     return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
@@ -448,11 +449,10 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
         remarks.append(
             remark("rings_not_read", photograph=most.photograph, dots=most.dots, ringed=len(most.crops))
         )
-    elif trial.codes == "none" and trial.lattice is not None:
-        rows, columns = trial.lattice
-        remarks.append(remark("circles_in_rows", circles=round(trial.circles), rows=rows, columns=columns))
-    elif trial.codes == "none" and trial.circles >= MIN_TARGETS:
-        remarks.append(remark("circles_without_codes", circles=round(trial.circles)))
+    elif trial.codes == "none" and (trial.lattice is not None or trial.circles >= MIN_TARGETS):
+        rows, columns = trial.lattice or (None, None)
+        circles = round(trial.circles)
+        remarks.append(remark("circles_without_codes", circles=circles, rows=rows, columns=columns))
     return tuple(remarks)
 
 

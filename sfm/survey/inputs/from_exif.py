@@ -112,8 +112,8 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
             otherwise |= {name: taken - timedelta(seconds=second) for name, taken in times.items()}
             unsure = unsure or bool(others)
             if ahead or others:
-                kind = "clocks_unsure" if others else "clock_differs"
-                remarks.append(remark(kind, camera=camera, reference=rig.cameras[0], ahead=(second, "s")))
+                clocks = {"camera": camera, "reference": rig.cameras[0], "ahead": (second, "s")}
+                remarks.append(remark("clock_differs", **clocks, unsure="as they are" if others else None))
         moments |= named_moments(corrected, rig.tolerance_s)
         other_moments |= named_moments(otherwise, rig.tolerance_s)
     if not moments:

@@ -130,6 +130,7 @@ class CameraSettings(Section):
     pixel_mm: TwoLengths | None = None  # width and height of a pixel, else from sensor_mm or EXIF, mm
     sensor_mm: TwoLengths | None = None  # width and height of the sensor, mm
     c_mm: Length | None = None  # start value of the principal distance, else the EXIF focal length, mm
+    c_assumed: bool = False  # whether c_mm or pixel_mm is assumed and not known
     # distortion model: it corrects the measured point, or distorts the ideal point
     model: Literal[tuple(MODELS)] = "brown"  # type: ignore[valid-type]
     free: Names = ()  # free parameters; [] for a calibrated camera; if missing, the photographs decide

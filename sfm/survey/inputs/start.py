@@ -75,7 +75,8 @@ def measurements_from_observations(survey: Survey) -> Measurements:
     rows = distinct[image] & ~outside
     number = np.cumsum(distinct) - 1
     failed = tuple(
-        FailedImage(every[i], remark("copy_of_image_points", original=every[j])) for i, j in copies.items()
+        FailedImage(every[i], remark("copies", original=every[j], same="image points"))
+        for i, j in copies.items()
     )
     images, owner = tuple(name for name, keep in zip(images, distinct, strict=True) if keep), owner[distinct]
     image, point = number[image[rows]], point[rows]
@@ -268,14 +269,17 @@ class MergedImagePoints:
     def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
         """Return the remarks on repeated image points."""
         kinds = {
-            "image_points_identical": self.same,
             "image_points_averaged": self.averaged,
             "image_points_contradicting": self.dropped,
         }
-        return tuple(
-            remark(kind, image_points=[f"{points[j]} in {images[i]}" for i, j in pairs])
-            for kind, pairs in kinds.items()
-            if pairs
+        same = [f"{points[j]} in {images[i]}" for i, j in self.same]
+        return (
+            *((remark("rows_identical", rows=same),) if same else ()),
+            *(
+                remark(kind, image_points=[f"{points[j]} in {images[i]}" for i, j in pairs])
+                for kind, pairs in kinds.items()
+                if pairs
+            ),
         )
 
 

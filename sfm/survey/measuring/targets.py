@@ -206,7 +206,7 @@ def each_photograph(
             originals.append(k)
         else:
             original = photographs.names[first]
-            failed[k] = FailedImage(name, remark("copy_of_file", original=original))
+            failed[k] = FailedImage(name, remark("copies", original=original, same="files"))
             progress.advance(name)
 
     def work_on(k: int) -> T:
@@ -223,7 +223,7 @@ def each_photograph(
                 except PhotographError as error:
                     reason = why_failed(error, photographs.paths[k])
                     failed[k] = FailedImage(
-                        photographs.names[k], remark("photograph_unreadable", reason=reason)
+                        photographs.names[k], remark("photographs_unreadable", reason=reason)
                     )
                 progress.advance(photographs.names[k])
         except BaseException:  # including Ctrl-C: do not wait for photographs not yet started
@@ -235,7 +235,9 @@ def each_photograph(
         first = pictures.setdefault(shown, k) if shown else k
         if first != k:
             original = photographs.names[first]
-            failed[k] = FailedImage(photographs.names[k], remark("copy_of_picture", original=original))
+            failed[k] = FailedImage(
+                photographs.names[k], remark("copies", original=original, same="pictures")
+            )
             del found[k]
     in_order = tuple(failed[k] for k in sorted(failed))
     if len(found) < MIN_PHOTOGRAPHS:
@@ -314,12 +316,12 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             held = _is_held(camera) and what != RESAMPLED
             if len(rows) < MIN_OWN or held:
                 reason = remark(
-                    "photograph_outside_calibration" if held else "photograph_of_other_size",
+                    "photograph_of_other_size",
                     camera=camera.name,
                     size=f"{size[0]} x {size[1]} px",
                     usual=f"{main[0]} x {main[1]} px",
                     what=what,
-                    needed=MIN_OWN,
+                    needed=None if held else MIN_OWN,
                 )
                 left |= dict.fromkeys(rows, reason)
                 continue

@@ -372,9 +372,9 @@ def _object_frame(
     bars = [bar for bar in survey.scale_bars if not {bar.start, bar.end} <= seen]
     remarks = []
     if lost:
-        remarks.append(remark("control_missing", points=lost))
+        remarks.append(remark("names_missing", of="control", names=lost))
     if bars:
-        remarks.append(remark("scale_bars_missing", bars=[f"{bar.start} - {bar.end}" for bar in bars]))
+        remarks.append(remark("names_missing", of="bars", names=[f"{bar.start} - {bar.end}" for bar in bars]))
     if on.sum() >= MIN_CONTROL:
         placed = fit_similarity(points[control.point[on]], control.xyz[on])
         return placed, tuple(remarks)
@@ -388,5 +388,5 @@ def _object_frame(
         if given or survey.scale_bars:
             missing = "; ".join(one.text.rstrip(".") for one in remarks)
             raise GeometryError(f"nothing gives the model its scale; {missing}")
-        return Similarity(1.0, np.eye(3), np.zeros(3)), (remark("model_keeps_frame"),)
+        return Similarity(1.0, np.eye(3), np.zeros(3)), (remark("scale_undefined", unit=survey.unit),)
     return Similarity(scale, np.eye(3), np.zeros(3)), tuple(remarks)

@@ -445,7 +445,7 @@ def adjust_finally(
         lambda factor: tested(good, factor, reject="none"), group, GROUPS
     )
     if not settled:
-        remarks.append(remark("weights_not_converged", groups=GROUPS))
+        remarks.append(remark("rejection_not_converging", groups=GROUPS))
     weights = factor[np.asarray(part.image_points.point >= matched, dtype=np.int64)]
     return tested(part, weights, reject="tau"), tuple(remarks)
 

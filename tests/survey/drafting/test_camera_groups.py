@@ -87,12 +87,11 @@ def test_where_pixel_and_principal_distance_come_from() -> None:
     assert assumed and c / pixel == pytest.approx(1.2 * 2000) and pixel == 36 / 2000
 
 
-def test_resampled_and_turned_photographs_are_reported() -> None:
+def test_resampled_photographs_are_reported() -> None:
     small = replace(PHONE, taken_px=(8000, 6000))
     (found,) = group_photographs({"a.jpg": small, "b.jpg": replace(small, orientation=6)}).cameras
-    resampled, turned = found.remarks
+    (resampled,) = found.remarks
     assert resampled.kind == "photographs_resampled" and resampled.names("taken") == ("8000 x 6000 px",)
-    assert turned.kind == "photographs_marked_as_turned" and turned.names("photographs") == ("b.jpg",)
     (found,) = group_photographs({"a.jpg": replace(PHONE, taken_px=(3000, 4000)), "b.jpg": PHONE}).cameras
     assert found.remarks == ()
 

@@ -221,7 +221,7 @@ def test_dots_in_rows_that_are_cut_are_offered_as_a_plate(tmp_path: Path) -> Non
                 cv2.circle(picture, (60 + 110 * column + 5 * row, 60 + 110 * row), 20, 30, -1, cv2.LINE_AA)
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture)
     draft = draft_survey(tmp_path)
-    (remark,) = of_kind(draft.remarks, "circles_in_rows")
+    (remark,) = of_kind(draft.remarks, "circles_without_codes")
     assert "4 rows and 5 columns" in remark.text
     section = draft.text.partition("in place of [tie_points]:\n")[2].split("\n\n")[0]
     offered = tomllib.loads("\n".join(line.removeprefix("# ") for line in section.splitlines()))

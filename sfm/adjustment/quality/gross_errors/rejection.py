@@ -272,7 +272,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
     for _ in range(MAX_ROUNDS):
         vague += not optimum.converged
         if vague > MAX_VAGUE:
-            run.remarks = (remark("snooping_not_converging", rounds=MAX_VAGUE),)
+            run.remarks = (remark("rejection_not_converging", rounds=MAX_VAGUE),)
             break
         vPv, redundancy = optimum.vPv, float(run.redundancy(optimum, weight))
         if redundancy < 2:
@@ -304,7 +304,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             optimum, weight = run.again(optimum, changed), changed
         except GeometryError:
             more, rejected = int((changed == 0).sum()), int((weight == 0).sum())
-            run.remarks = (remark("snooping_unsolvable", more=more, rejected=rejected),)
+            run.remarks = (remark("rejection_not_converging", more=more, rejected=rejected),)
             break
     return optimum, weight
 
@@ -380,5 +380,5 @@ def _reweight(
         vague = 0 if optimum.converged else vague + 1
         if change <= WEIGHT_TOLERANCE or vague > MAX_VAGUE_WEIGHTS:
             break
-    run.remarks = (remark("reweighting_not_converging", rounds=vague),) if vague > MAX_VAGUE_WEIGHTS else ()
+    run.remarks = (remark("rejection_not_converging", rounds=vague),) if vague > MAX_VAGUE_WEIGHTS else ()
     return optimum, weight
