@@ -21,7 +21,7 @@ from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
-from sfm.judgement.verdict import judge_adjustment, judge_survey
+from sfm.judgement.verdict import judge_adjustment
 from sfm.kernels.threads import cores
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey as run_stages
@@ -155,7 +155,7 @@ def write_result(
 
     with one_blas_thread():
         return write(
-            findings_of(judge_survey(result)),  # parts of a result may have been replaced
+            findings_of(result),
             Path(folder),
             write_colmap=colmap_writer(result),
             jobs=jobs or cores(),

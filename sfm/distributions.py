@@ -23,6 +23,16 @@ MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an
 MIN_LEAD = np.log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 
 
+def share_of(level: float, false_alarm: float) -> float:
+    """Return the level of a test for a user's probability that a right result is called wrong.
+
+    Args:
+        level: level of the test for FALSE_ALARM; the other one has the same share.
+        false_alarm: the probability that the user states.
+    """
+    return level * (false_alarm / FALSE_ALARM)
+
+
 def chi2_sf(x: Any, r: Any) -> Any:
     """Probability that chi-square of redundancy r is larger than x."""
     return special.chdtrc(r, np.maximum(x, 0.0))  # rounding can make a difference of squares negative

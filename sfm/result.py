@@ -244,9 +244,7 @@ class SurveyResult:
     @cached_property
     def solution(self) -> Solution:
         """The accepted image points, with their solution and covariance."""
-        return replace(
-            self.adjustment.solution, name=self.survey, unit=self.length_unit, verdict=self.verdict
-        )
+        return replace(self.adjustment.solution, name=self.survey, unit=self.length_unit, judged=self.verdict)
 
     @property
     def points(self) -> PointTable:

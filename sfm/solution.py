@@ -108,8 +108,14 @@ class Solution:
     # rad, (s, s)
     rig_covariance: FloatArray | None = None
     joint: JointCovariance | None = None  # joint covariance of an adjustment in memory; otherwise None
-    verdict: Verdict | None = None  # level, headline and all remarks; None if it was not judged
+    # verdict, or a function that judges when it is asked for; None if it was not judged
+    judged: Verdict | Callable[[], Verdict | None] | None = None
     sigma0: float = 1.0  # of unit weight: the covariances are its square times those of the stated weights
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Level, headline, all remarks and tests; None if it was not judged."""
+        return self.judged() if callable(self.judged) else self.judged
 
     @property
     def has_scale(self) -> bool:

@@ -155,6 +155,27 @@ def test_what_the_page_on_python_shows_runs(tmp_path: Path, monkeypatch: pytest.
     assert (folder / "out" / "today" / "report.html").is_file()
 
 
+def test_a_bad_survey_prints_what_the_page_on_python_shows(capsys: pytest.CaptureFixture[str]) -> None:
+    """Verdict and remarks as they are; further figures without their digits."""
+    network, _ = make_network(seed_of("arrays"), images=6, points=30, noise_px=0.1)
+    seen = network.image_points
+    given = {
+        "image": [network.images[i] for i in seen.image],
+        "point": [str(j + 1) for j in seen.point],
+        "xy": seen.xy,
+    }
+    page = (ROOT.parent / "docs" / "how-to" / "python.md").read_text(encoding="utf-8")
+    code, rest = page.split("```python\n")[3].split("```", 1)
+    capsys.readouterr()
+    exec(compile(code, "python.md", "exec"), given)
+    printed = capsys.readouterr().out.splitlines()
+    shown = rest.split("```text\n")[1].split("```")[0].splitlines()
+    verdict = printed.index("The survey has no dependable result.")
+    assert (printed[0], printed[verdict:]) == (shown[0], shown[verdict:])
+    without = [re.sub(r"\d+", "0", " ".join("\n".join(lines).split())) for lines in (printed, shown)]
+    assert without[0] == without[1]
+
+
 def test_a_survey_made_in_python_is_that_of_its_file(observed_survey: Path, result: SurveyResult) -> None:
     said = sfm.read_survey(observed_survey)
     given = said.observations

@@ -7,6 +7,7 @@ Sizes and pixels missing in a summary are taken from the COLMAP model in the fol
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -32,10 +33,12 @@ from sfm.files.covariance_file import (
 from sfm.files.csv_tables import CsvTable
 from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
-from sfm.files.plain_text import Name, Pixel, Side, Text, or_none, read_json
+from sfm.files.plain_text import Name, Pixel, Side, Text, as_plain, or_none, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
 from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
 from sfm.reduced_network import CORRELATION_LIMIT
+from sfm.remarks.remark import Quantity, Remark
+from sfm.remarks.verdict import Verdict
 from sfm.solution import MEASURED, SeenTargets, Solution
 
 SIGMAS, SIGMAS_PX = ("sX", "sY", "sZ"), ("sx_px", "sy_px")
@@ -44,7 +47,9 @@ COLMAP_SIDE_FILE = f"colmap/{SIDE_FILE}"
 
 
 def read_result(folder: Path) -> Solution:
-    """Read the tables of a result, without rejected image points.
+    """Read the tables of a result, without rejected image points, and its verdict.
+
+    The verdict is None if the result was not judged, or by a version with other kinds of remarks.
 
     Raises:
         SurveyFileError: with file and line number.
@@ -77,6 +82,7 @@ def read_result(folder: Path) -> Solution:
         joint,
         summary.datum.kind if summary.datum else "",
         covariance_points=of_points,
+        judged=None if summary.verdict is None else summary.verdict.content,
     )
     return read_covariances(folder, found)
 
@@ -162,6 +168,7 @@ def write_content(folder: Path, content: Content) -> None:
         "datum": {"kind": result.datum},
         "sigma0": None if content.sigma0 is None else or_none(content.sigma0),
         "sigma0_px": None if content.sigma0_px is None else or_none(content.sigma0_px),
+        "verdict": None if result.verdict is None else result.verdict.entry,
         "cameras": [
             {
                 "name": camera.name,
@@ -289,6 +296,52 @@ class _DatumEntry(Json):
     kind: Literal["free", "minimal", "control", ""]
 
 
+class _QuantityEntry(Json):
+    """A number of a remark; None if it is not finite."""
+
+    value: float | None = None
+    unit: str = ""
+
+
+class _RemarkEntry(Json):
+    """A remark, or a row of the table of tests."""
+
+    kind: str
+    severity: Literal["note", "warning", "error"] = "note"
+    subjects: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    numbers: dict[str, _QuantityEntry] = Field(default_factory=dict)
+
+    @property
+    def content(self) -> Remark:
+        """The remark; names that are not plain are replaced."""
+        return Remark(
+            self.kind,
+            {role: tuple(map(as_plain, names)) for role, names in self.subjects.items()},
+            {
+                name: Quantity(math.nan if one.value is None else one.value, as_plain(one.unit))
+                for name, one in self.numbers.items()
+            },
+            self.severity,
+        )
+
+
+class _VerdictEntry(Json):
+    """The verdict on a result."""
+
+    level: Literal["good", "fair", "bad"]
+    headline: str
+    remarks: tuple[_RemarkEntry, ...] = ()
+    tests: tuple[_RemarkEntry, ...] = ()
+
+    @property
+    def content(self) -> Verdict | None:
+        """The verdict; None if a remark has a kind or parts that this version does not know."""
+        remarks, tests = (tuple(one.content for one in kind) for kind in (self.remarks, self.tests))
+        if not all(one.is_known for one in (*remarks, *tests)):
+            return None
+        return Verdict(self.level, as_plain(self.headline), remarks, tests)
+
+
 class _Summary(Json):
     """The part of summary.json that is read."""
 
@@ -297,6 +350,7 @@ class _Summary(Json):
     datum: _DatumEntry | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
+    verdict: _VerdictEntry | None = None
 
 
 def _summary(path: Path) -> _Summary:

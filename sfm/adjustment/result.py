@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
-from sfm.distributions import LEVEL
+from sfm.distributions import FALSE_ALARM, LEVEL
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
@@ -141,6 +141,7 @@ class Adjustment:
     unknown_counts: tuple[int, int, int] = (0, 0, 0)  # exterior orientation, interior orientation, points
     # probability that the applied test rejects a good image coordinate; Baarda's usual value without a test
     test_alpha: float = LEVEL
+    false_alarm: float = FALSE_ALARM  # probability that the verdict calls a right result wrong
     start_sigma0: float = float("nan")  # sigma0 at the start values
     remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
@@ -151,6 +152,9 @@ class Adjustment:
     def verdict(self) -> Verdict | None:
         """Level, headline and all remarks; None if it was not judged."""
         return None if self.judge is None else self.judge(self)
+
+    def _judged(self) -> Verdict | None:
+        return self.verdict
 
     def __getstate__(self) -> dict[str, object]:
         """Return what is pickled: not the figures that are computed again when needed."""
@@ -177,7 +181,7 @@ class Adjustment:
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
             joint=JointOnDemand(self),
             sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
-            verdict=self.verdict,
+            judged=self._judged,
         )
 
     @property

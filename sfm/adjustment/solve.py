@@ -40,18 +40,19 @@ from sfm.adjustment.quality.gross_errors.robust import (
     tukey_slopes,
 )
 from sfm.adjustment.quality.rank import rank_defect, undetermined_of
-from sfm.adjustment.quality.statistics import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.statistics import (
+    level_of_single,
     residual_weights,
     residuals_of_observed,
     standardised_residuals,
 )
+from sfm.adjustment.quality.statistics import redundancy_numbers as numbers_of
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
-from sfm.distributions import LEVEL, normal_sf
+from sfm.distributions import FALSE_ALARM, LEVEL, normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
@@ -76,6 +77,7 @@ def adjust(
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
     alpha: float = LEVEL,
+    false_alarm: float | None = None,
     rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = 50,
@@ -100,6 +102,8 @@ def adjust(
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight starts
             from Huber's result and rejects image points with weight 0) or "none".
         alpha: probability that the test of one image coordinate rejects a good one.
+        false_alarm: probability that right image points are called wrong. It is divided among the tests of
+            their coordinates, in place of `alpha`, and is the level of the verdict; 0.05 if not given.
         rejected: image points that data snooping leaves out at the start, such as those rejected before,
             (k,). They return if they pass the test. The other options of `reject` start with all image
             points.
@@ -124,6 +128,9 @@ def adjust(
     check_network(network, estimate)
     check_number("sigma_px", sigma_px, 0.0)
     check_number("alpha", alpha, 0.0, 1.0)
+    if false_alarm is not None:
+        check_number("false_alarm", false_alarm, 0.0, 1.0)
+        alpha = level_of_single(false_alarm, 2 * len(network.image_points))
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")
     if method not in METHODS:
@@ -152,7 +159,12 @@ def adjust(
         if not optimum.converged or (covariance and not result.undetermined and _has_open_c(result)):
             result = _with_open_start(result, local, problem, state, weight)
         return local.back(
-            replace(result, image_sigma_factor=factor, test_alpha=_level_of(reject, alpha, result.test_alpha))
+            replace(
+                result,
+                image_sigma_factor=factor,
+                test_alpha=_level_of(reject, alpha, result.test_alpha),
+                false_alarm=FALSE_ALARM if false_alarm is None else false_alarm,
+            )
         )
 
 

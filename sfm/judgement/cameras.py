@@ -11,6 +11,7 @@ from sfm.adjustment.quality.consistency import FAMILY, Consistency, larger_than_
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
+from sfm.distributions import share_of
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.result import PhotographTargets, SurveyResult
@@ -153,7 +154,8 @@ def sharpness_remarks(
     a = result.adjustment
     m, n = len(a.network.images), len(a.network.points)
     unseen = n - np.bincount(a.network.image_points.image[~a.rejected], minlength=m)
-    few = np.flatnonzero(more_than_chance(unseen, np.full(m, n), FAMILY))
+    level = share_of(FAMILY, a.false_alarm)
+    few = np.flatnonzero(more_than_chance(unseen, np.full(m, n), level))
     suspected = {one.image for one in result.failed} | {a.network.images[i] for i in few}
     if consistency.uneven is not None:
         suspected.add(consistency.uneven.worst)
@@ -164,7 +166,7 @@ def sharpness_remarks(
     remarks = []
     for camera, names in cameras.items():
         blur = np.array([edges[name] for name in names])
-        large = larger_than_the_others(np.log(blur), level=FAMILY / len(cameras))
+        large = larger_than_the_others(np.log(blur), level=level / len(cameras))
         blurred = [name for name, one in zip(names, large, strict=True) if one and name in suspected]
         if blurred:
             remarks.append(

@@ -28,7 +28,7 @@ from sfm.adjustment.quality.variance_components import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
-from sfm.distributions import LEVEL, normal_ppf
+from sfm.distributions import LEVEL, normal_ppf, share_of
 from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
@@ -243,7 +243,7 @@ def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
 
 def gross_error_remarks(a: Adjustment, *, rejects: bool) -> tuple[Remark, ...]:
     """Return the test of the accepted image coordinates; as a remark if nothing was rejected."""
-    found = robust_test(a)
+    found = robust_test(a, alpha=share_of(LEVEL, a.false_alarm))
     numbers = {
         "beyond": found.beyond,
         "tested": found.tested,
@@ -264,7 +264,7 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     took_part = _took_part(a)
     lost = np.bincount(point[rejected & took_part], minlength=n)
     rays = np.bincount(point[took_part], minlength=n)
-    most = np.flatnonzero(more_than_chance(lost, rays, FAMILY))
+    most = np.flatnonzero(more_than_chance(lost, rays, share_of(FAMILY, a.false_alarm)))
     by_rays = np.ones(n, dtype=bool)
     if a.datum == "control":
         by_rays[network.control.complete.point] = False
@@ -346,10 +346,11 @@ def given_remarks(
         statistics: statistics of the adjustment.
         checks: coordinates that took no part.
     """
+    level = share_of(LEVEL, result.adjustment.false_alarm)
     return (
-        *_differing(given),
-        *_kinds(statistics, {test.what for test in result.given_tests}),
-        *_checks(checks, result.length_unit),
+        *_differing(given, level),
+        *_kinds(statistics, {test.what for test in result.given_tests}, level),
+        *_checks(checks, result.length_unit, level),
         *_scale(result),
         *(
             remark("given_tested", of=one.what, chi2=one.statistic, dof=one.dof, p=one.probability)
@@ -358,13 +359,13 @@ def given_remarks(
     )
 
 
-def _kinds(statistics: Statistics, judged: set[str]) -> tuple[Remark, ...]:
+def _kinds(statistics: Statistics, judged: set[str], level: float) -> tuple[Remark, ...]:
     """Return the remarks on kinds of given values with residuals that are too large by more than chance.
 
     Kinds that were judged against the free network already have a remark.
     """
     found = statistics.kinds
-    level = LEVEL / max(len(found.names) - 1, 1)
+    level /= max(len(found.names) - 1, 1)
     return tuple(
         remark("given_sigmas", of=test.of, factor=float(found.sigma0[g]))
         for g, test in enumerate(component_tests(found, alpha=2 * level))
@@ -375,27 +376,27 @@ def _kinds(statistics: Statistics, judged: set[str]) -> tuple[Remark, ...]:
     )
 
 
-def _differing(given: Given) -> Iterator[Remark]:
+def _differing(given: Given, level: float) -> Iterator[Remark]:
     """Yield the remark on the value with the largest w of each kind, if chance does not explain it.
 
     The shift is that of the adjusted value itself, |w| sqrt((1 - r) / r), for a coordinate or a length of the
     object. The orientation of a photograph is neither, so no shift is given for it.
     """
     for kind in (given.control, given.bars, *given.further):
-        worst = _beyond_chance(kind) if kind else None
+        worst = _beyond_chance(kind, level) if kind else None
         if kind and worst:
             shift = abs(worst.w) * np.sqrt((1 - worst.r) / worst.r)
             yield remark("given_differs", shift=shift, harm=shift, **_parts(worst, kind))
     for kind in given.exterior:
-        worst = _beyond_chance(kind)
+        worst = _beyond_chance(kind, level)
         if worst:
             yield remark("given_differs", harm=0.0, **_parts(worst, kind))
 
 
-def _beyond_chance(kind: GivenResiduals) -> GivenValue | None:
+def _beyond_chance(kind: GivenResiduals, level: float) -> GivenValue | None:
     """Return the value of a kind with the largest w, if w is larger than by chance."""
     tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r >= MIN_REDUNDANCY]
-    if not tested or not abs(tested[0].w) > -normal_ppf(LEVEL / (2 * len(tested))):
+    if not tested or not abs(tested[0].w) > -normal_ppf(level / (2 * len(tested))):
         return None
     return tested[0]
 
@@ -409,10 +410,10 @@ def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tup
     }
 
 
-def _checks(checks: Sequence[ControlCoordinate], unit: str) -> tuple[Remark, ...]:
+def _checks(checks: Sequence[ControlCoordinate], unit: str, level: float) -> tuple[Remark, ...]:
     """Return the remark on the coordinates that took no part and differ."""
     tested = [one for one in checks if np.isfinite(one.test)]
-    critical = -normal_ppf(LEVEL / (2 * max(len(tested), 1)))
+    critical = -normal_ppf(level / (2 * max(len(tested), 1)))
     beyond = [one for one in tested if abs(one.test) > critical]
     if not beyond:
         return ()

@@ -68,6 +68,14 @@ class Remark:
         return self._write(row.test), self._write(row.on), self._write(row.result)
 
     @property
+    def is_known(self) -> bool:
+        """Whether the catalogue has its kind, with texts that its parts fill."""
+        try:
+            return bool(self.text) and (self.test is not None or bool(self.cause and self.remedy))
+        except KeyError:
+            return False
+
+    @property
     def severity(self) -> Severity:
         """Severity, from the catalogue and from the remarks that it explains: note, warning or error."""
         if self.test is not None:

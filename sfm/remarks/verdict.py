@@ -57,6 +57,12 @@ class Verdict:
         listed = ", ".join(counted(counts[one], one) for one in SEVERITIES if counts[one])
         return f"{self.headline} {listed}".rstrip()
 
+    @property
+    def entry(self) -> dict[str, Any]:
+        """The entry `verdict` of summary.json."""
+        stated = self.as_dict()
+        return {"level": stated.pop("verdict"), **stated}
+
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
         remarks = [one.as_dict() for one in self.remarks]

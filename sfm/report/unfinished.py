@@ -58,20 +58,17 @@ def page(found: UnfinishedSurvey, *, overlays: Sequence[Overlay] = ()) -> Page:
 
 def verdict(found: UnfinishedSurvey) -> Verdict:
     """Return the verdict: bad, whatever the remarks of the stages that were reached."""
-    remarks = tuple(one for severity in SEVERITIES for one in found.remarks if one.severity == severity)
-    return Verdict("bad", found.reason, remarks)
+    remarks = [one for one in found.remarks if one.test is None]
+    tests = [one for one in found.remarks if one.test is not None]
+    remarks.sort(key=lambda one: SEVERITIES.index(one.severity))
+    return Verdict("bad", found.reason, tuple(remarks), tuple(tests))
 
 
 def summary(found: UnfinishedSurvey) -> dict[str, object]:
     """Return the content of summary.json, with the names that it has for a finished survey."""
-    judged = verdict(found)
     return {
         **values_of(found, "survey unit"),
-        "verdict": {
-            "level": judged.level,
-            "headline": judged.headline,
-            "remarks": [one.as_dict() for one in judged.remarks],
-        },
+        "verdict": verdict(found).entry,
         "stopped_in": found.stage,
         "images": {
             "used": 0,

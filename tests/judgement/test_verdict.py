@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import pickle
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import sfm
 from sfm.adjustment.result import Adjustment
-from sfm.errors import KolinearError
+from sfm.errors import GeometryError, KolinearError, SurveyFileError
+from sfm.judgement import verdict as verdicts
 from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import Verdict
 from sfm.result import FailedImage, SurveyResult
+from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
 
@@ -89,3 +96,93 @@ def test_files_that_cannot_be_read_are_no_missing_photographs(
     kinds = kinds_of(verdict.remarks)
     assert verdict.level == level and "photographs_missing" not in kinds
     assert ("photographs_unreadable" in kinds) == (unreadable > 0)
+
+
+def test_another_probability_of_a_false_alarm_rejects_and_judges_otherwise(
+    made: tuple[Network, Estimate],
+) -> None:
+    """Image points that are off by three to four standard deviations, and a point that is twice as rough."""
+    network, truth = make_network(seed_of("one rough point"), images=12, points=50, free=("c",))
+    seen = network.image_points
+    off = replace(seen, xy=seen.xy + 0.33 * (np.arange(len(seen)) % 15 == 0)[:, None])
+    often, seldom = (
+        sfm.adjust(replace(network, image_points=off), truth, false_alarm=level) for level in (0.5, 1e-6)
+    )
+    assert often.rejected.sum() > 5 and not seldom.rejected.any()
+    assert often.test_alpha > 1e-4 > seldom.test_alpha
+    rough = (seen.point == 7)[:, None] * 0.2 * seed_of("rough").standard_normal((len(seen), 2))
+    rough_one = replace(network, image_points=replace(seen, xy=seen.xy + rough))
+    kinds = {
+        level: kinds_of(verdict_of(sfm.adjust(rough_one, truth, reject="none", false_alarm=level)).remarks)
+        for level in (0.05, 1e-6)
+    }
+    assert kinds == {0.05: ("points_with_large_residuals",), 1e-6: ()}
+    for wrong in (0.0, 1.0):
+        with pytest.raises(GeometryError, match="false_alarm"):
+            sfm.adjust(*made, false_alarm=wrong)
+
+
+def test_the_key_of_a_survey_is_the_level_of_its_adjustment() -> None:
+    network, truth = make_network(seed_of("level of a survey"), images=6, points=30)
+    for level in (0.05, 1e-3):
+        adjust = {"reject": "tau"} if level == 0.05 else {"reject": "tau", "false_alarm": level}
+        a = run_survey(survey_of(network, truth, adjust=adjust)).adjustment
+        assert a.false_alarm == level
+        coordinates = 2 * len(network.image_points)
+        assert coordinates * a.test_alpha == pytest.approx(level, rel=0.1)
+
+
+def test_a_result_that_is_read_has_its_verdict(made: tuple[Network, Estimate], tmp_path: Path) -> None:
+    """With the remarks, their numbers and the tests; it was None."""
+    network, truth = made
+    adjustment = sfm.adjust(with_gross_errors(network), truth, reject="none")
+    survey = run_survey(survey_of(with_gross_errors(network), truth, adjust={"reject": "none"}))
+    for name, result in (("adjustment", adjustment), ("survey", survey)):
+        sfm.write_result(result, tmp_path / name)
+        found, verdict = sfm.read_result(tmp_path / name).verdict, result.verdict
+        assert found is not None and verdict is not None
+        assert found.as_dict() == verdict.as_dict() and found.level != "good" and found.tests
+        assert found.headline in repr(sfm.read_result(tmp_path / name))
+
+
+@pytest.mark.parametrize("unknown", ["kind", "part", "level"])
+def test_the_verdict_of_another_version_is_not_invented(
+    made: tuple[Network, Estimate], unknown: str, tmp_path: Path
+) -> None:
+    network, truth = made
+    sfm.write_result(sfm.adjust(with_gross_errors(network), truth, reject="none"), tmp_path / "out")
+    path = tmp_path / "out" / "summary.json"
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    if unknown == "kind":
+        stored["verdict"]["remarks"][0]["kind"] = "of_another_version"
+    if unknown == "part":
+        stored["verdict"]["remarks"][0]["numbers"] = {}
+    if unknown == "level":
+        stored["verdict"]["level"] = "excellent"
+    path.write_text(json.dumps(stored), encoding="utf-8")
+    if unknown == "level":
+        with pytest.raises(SurveyFileError, match="level"):
+            sfm.read_result(tmp_path / "out")
+    else:
+        assert sfm.read_result(tmp_path / "out").verdict is None
+
+
+def test_a_result_is_judged_once_and_when_it_is_asked(
+    made: tuple[Network, Estimate], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`.solution` judges nothing, and writing a survey does not judge it again."""
+    count = Counter[str]()
+    judge = verdicts.judge
+
+    def counting(*given: Any) -> Verdict:
+        count["judged"] += 1
+        return judge(*given)
+
+    monkeypatch.setattr(verdicts, "judge", counting)
+    solution = sfm.adjust(*made).solution
+    assert not count
+    assert solution.verdict is not None and solution.verdict is solution.verdict
+    assert count["judged"] == 1
+    survey = run_survey(survey_of(*made))
+    sfm.write_result(survey, tmp_path / "out")
+    assert count["judged"] == 2

@@ -45,8 +45,7 @@ UNCHECKED = {
     "calibrated_from_few",
     *("assumptions_untested", "photographs_untested", "too_many_to_test"),
 }
-ACCIDENTS = {"image_points_misnamed"}  # what gross errors are, and no cause of anything
-CAUSES = {row.name for row in hypotheses.ROWS} - ACCIDENTS - UNCHECKED | {"camera_per_photograph"}
+CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED | {"camera_per_photograph"}
 ALIKE = {  # kinds that say the same of a fault
     "object_deforming": "object_deformed",
     "two_places": "points_moved",
@@ -114,7 +113,7 @@ def outcome_of(kind: str, number: int) -> Outcome:
     return Outcome(
         *(kind, number, one.cause, verdict.level, _over_sigma(result, one), *_detectable(one)),
         *(named, serious[0] if serious else ""),
-        any(remark.kind in UNCHECKED for remark in verdict.remarks),
+        any(one.kind in UNCHECKED for one in (*verdict.remarks, *verdict.tests)),
         tuple(kind for one in verdict.remarks if one.kind in CAUSES for kind in one.names("instead")),
     )
 

@@ -134,7 +134,11 @@ def test_a_survey_is_frozen(tmp_path: Path) -> None:
             "sigmas = 0.010",
             r"line 26: unknown key 'sigmas' in \[scale_bar 1\], known are from, to, length, sigma$",
         ),
-        ("sigma_px =", "sigma =", r"unknown key 'sigma' in \[adjust\], known are sigma_px, reject, weights$"),
+        (
+            "sigma_px =",
+            "sigma =",
+            r"unknown key 'sigma' in \[adjust\], known are sigma_px, reject, weights, false_alarm$",
+        ),
         ('name = "camcal"\n', "", r"line 1: survey.name is missing"),
         ("[datum]", "[date]", r"line 18: unknown key 'date' in the file, known are survey, camera,"),
         ("c_mm = 7.3", 'c_mm = "7.3"', r"line 9: camera 1.c_mm: found '7.3', needed a number"),

@@ -121,7 +121,7 @@ def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
     network = replace(network, image_points=seen.select(keep))
     survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
     found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
-    reasons = {(one.reason.kind, one.reason.number("needed")) for one in found.left_out}
+    reasons = {(one.reason.kind, one.reason.number("least")) for one in found.left_out}
     assert reasons == {("point_not_determined", 3)}
 
 

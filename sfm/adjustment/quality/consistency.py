@@ -28,11 +28,11 @@ from sfm.adjustment.quality.variance_components import VarianceComponents, by_ph
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, chi2_isf, chi2_sf, normal_ppf, t_ppf
+from sfm.distributions import LEVEL, chi2_isf, chi2_sf, normal_ppf, share_of, t_ppf
 from sfm.network import Estimate, rows_of
 
 MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
-FAMILY = 0.01  # probability that a test reports anything in a survey without errors
+FAMILY = 0.01  # share of FALSE_ALARM of each of these tests
 # Ratio of the largest component of a photograph to the median below which a difference does not matter.
 MIN_UNEVEN_RATIO = 1.5
 
@@ -72,12 +72,13 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
     of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
     fixed = {name for name, covariance in of_point if not covariance.any()}
     doubtful = tuple(one for one in doubtful_points(adjustment, parts, rays) if one.point not in fixed)
-    large, outlying, tested = _large(adjustment, parts, rays)
-    return Consistency(large, _uneven(by_photograph(adjustment)), outlying, tested, doubtful)
+    level = share_of(FAMILY, adjustment.false_alarm)
+    large, outlying, tested = _large(adjustment, parts, rays, level)
+    return Consistency(large, _uneven(by_photograph(adjustment), level), outlying, tested, doubtful)
 
 
 def _large(
-    adjustment: Adjustment, parts: PointNormals, rays: list[IntArray]
+    adjustment: Adjustment, parts: PointNormals, rays: list[IntArray], level: float
 ) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """Return the points with jointly large residuals, those that stand out, and the number of tested points.
 
@@ -85,7 +86,7 @@ def _large(
     quality, so that many are. A point stands out if its normal score is beyond the spread of all scores.
     """
     network, n = adjustment.network, len(adjustment.network.points)
-    level = level_of_single(FAMILY, n)
+    single = level_of_single(level, n)
     probability = np.ones(n)
     for j, rows in enumerate(rays):
         accepted = rows[~adjustment.rejected[rows]]
@@ -93,10 +94,10 @@ def _large(
         if r > 1:
             probability[j] = float(chi2_sf(parts.q[accepted].sum(), r))
     tested = np.flatnonzero(probability < 1)
-    large = probability[tested] < level
+    large = probability[tested] < single
     smallest = np.finfo(float).tiny
     score = -normal_ppf(np.clip(probability[tested], smallest, 1 - np.finfo(float).eps))
-    outlying = large & larger_than_the_others(score)
+    outlying = large & larger_than_the_others(score, level=level)
     return (
         tuple(network.points[j] for j in tested[large]),
         tuple(network.points[j] for j in tested[outlying]),
@@ -132,7 +133,7 @@ def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> Bool
     return large
 
 
-def _uneven(photographs: VarianceComponents) -> Uneven | None:
+def _uneven(photographs: VarianceComponents, level: float = FAMILY) -> Uneven | None:
     """Test by Bartlett's test whether all photographs have the same variance component."""
     known = np.isfinite(photographs.sigma0) & (photographs.redundancy > 1)
     s2, r = photographs.sigma0[known] ** 2, photographs.redundancy[known]
@@ -145,7 +146,7 @@ def _uneven(photographs: VarianceComponents) -> Uneven | None:
     probability = float(chi2_sf(statistic, g - 1))
     sigma = np.sqrt(s2)
     worst, median = int(np.argmax(sigma)), float(np.median(sigma))
-    if probability > FAMILY or sigma[worst] < MIN_UNEVEN_RATIO * median:
+    if probability > level or sigma[worst] < MIN_UNEVEN_RATIO * median:
         return None
     name = photographs.names[int(np.flatnonzero(known)[worst])]
     return Uneven(probability, name, float(sigma[worst]), median)
@@ -173,7 +174,7 @@ def doubtful_points(
         rows_of: usable image points of each object point.
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
-    limit = float(chi2_isf(LEVEL, 1))
+    limit = float(chi2_isf(share_of(LEVEL, adjustment.false_alarm), 1))
     found = []
     for j in np.unique(seen.point[adjustment.rejected]).tolist():
         rows = rows_of[j]

@@ -82,7 +82,7 @@ class CoordinateTest:
         """Whether more than MIN_EXCESS_RATIO times as many are beyond it, which chance makes unlikely."""
         return bool(
             self.beyond > MIN_EXCESS_RATIO * self.expected
-            and poisson_sf(self.beyond - 1, self.expected) < LEVEL
+            and poisson_sf(self.beyond - 1, self.expected) < self.alpha
         )
 
 

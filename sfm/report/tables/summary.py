@@ -54,17 +54,12 @@ def _finite(value: Any, name: str, names: list[str]) -> Any:
 
 def _figures(findings: Findings) -> dict[str, Any]:
     """Return the figures of a result, some of which may not be finite."""
-    result, verdict, given = findings.result, findings.verdict, findings.given
+    result, given = findings.result, findings.given
     a = result.adjustment
     coded = int((result.code >= 0).sum())
     return {
         **values_of(result, "survey unit length_unit"),
-        "verdict": {
-            "level": verdict.level,
-            "headline": verdict.headline,
-            "remarks": [one.as_dict() for one in verdict.remarks],
-            "tests": [one.as_dict() for one in verdict.tests],
-        },
+        "verdict": findings.verdict.entry,
         **values_of(a, "converged iterations"),
         "sigma0_at_start": or_none(a.start_sigma0),
         "images": {

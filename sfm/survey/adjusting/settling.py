@@ -29,7 +29,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
-from sfm.distributions import FALSE_ALARM, chi2_isf
+from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
 from sfm.network import Estimate, Network
@@ -275,8 +275,7 @@ def _adjust_with_snooping(
     method: str = "levenberg-marquardt",
     max_iterations: int = MAX_ITERATIONS,
 ) -> Adjustment:
-    """Adjust with data snooping; the level of the single test is divided among all image coordinates."""
-    tests = 2 * len(network.image_points)
+    """Adjust with data snooping; the level of the survey is divided among all image coordinates."""
     return adjust(
         network,
         estimate,
@@ -284,7 +283,7 @@ def _adjust_with_snooping(
         sigma_px=task.survey.adjust.sigma_px,
         image_sigma_factor=task.factor if factor is None else factor,
         reject=task.survey.reject,
-        alpha=level_of_single(FALSE_ALARM, tests),
+        false_alarm=task.survey.adjust.false_alarm,
         rejected=rejected,
         method=method,
         max_iterations=max_iterations,
@@ -348,7 +347,7 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     P = np.linalg.inv(adjustment.image_covariance[used])
     vPv = np.bincount(seen.point, np.einsum("ka,kab,kb->k", v, P, v), minlength=n)
     redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # with cameras held: slightly too cautious
-    limit = chi2_isf(level_of_single(FALSE_ALARM, n), np.maximum(redundancy, 1))
+    limit = chi2_isf(level_of_single(adjustment.false_alarm, n), np.maximum(redundancy, 1))
     large = (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
     bars = network.scale_bars
     large[np.concatenate([network.control.point, bars.start, bars.end])] = False

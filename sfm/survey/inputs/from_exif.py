@@ -112,8 +112,14 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
             otherwise |= {name: taken - timedelta(seconds=second) for name, taken in times.items()}
             unsure = unsure or bool(others)
             if ahead or others:
-                clocks = {"camera": camera, "reference": rig.cameras[0], "ahead": (second, "s")}
-                remarks.append(remark("clock_differs", **clocks, unsure="as they are" if others else None))
+                differs = remark(
+                    "clock_differs",
+                    camera=camera,
+                    reference=rig.cameras[0],
+                    ahead=(second, "s"),
+                    unsure="as they are" if others else None,
+                )
+                remarks.append(differs)
         moments |= named_moments(corrected, rig.tolerance_s)
         other_moments |= named_moments(otherwise, rig.tolerance_s)
     if not moments:

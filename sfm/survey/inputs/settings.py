@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
+from sfm.distributions import FALSE_ALARM
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
 from sfm.observations.tables import TABLES
 
@@ -65,6 +66,7 @@ FREED_FIRST = ("c", "x0", "y0", "K1", "K2", "fx", "fy", "f", "cx", "cy", "k1", "
 MAX_GLOBS = 1000  # of the photographs of all cameras
 MAX_LENGTH_PER_SIGMA = 1e6  # no calibration of a scale bar is better than a millionth of its length
 Length = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
+Probability = Annotated[float, Field(ge=1e-9, le=0.5)]
 Temperature = Annotated[float, Field(ge=-100, le=200)]
 Name = Annotated[str, BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v)]
 Unit = Annotated[
@@ -309,6 +311,8 @@ class AdjustSettings(Section):
     sigma_px: Length = 0.1  # a priori standard deviation of an image coordinate, px
     reject: Literal["tau", "huber", "tukey", "none"] | None = None  # else tau; none with [observations]
     weights: Literal["components", "stated"] = "components"  # of image points beside other observations
+    # probability that a right survey is called wrong: its share is the level of each test
+    false_alarm: Probability = FALSE_ALARM
 
 
 class CompareSettings(Section):

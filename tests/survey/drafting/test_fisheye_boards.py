@@ -98,4 +98,4 @@ def test_nothing_is_said_on_codes_of_a_plate() -> None:
     assert one.kind == "plate_points_apart" and one.names("points") == ("3", "5")
     assert one.names("photographs") == ("a.jpg", "b.jpg", "c.jpg") and "ode" not in one.text.split("plate")[0]
     of_codes = remarks_on_contested(found, photographs, naming, {}, ring_family("ring14"))
-    assert kinds_of(of_codes) == ("codes_at_several_places", "codes_at_several_places")
+    assert kinds_of(of_codes) == ("codes_at_several_places",)
