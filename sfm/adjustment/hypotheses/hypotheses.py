@@ -28,10 +28,10 @@ from sfm.adjustment.hypotheses.alternatives import (
 )
 from sfm.adjustment.hypotheses.columns import columns_of
 from sfm.adjustment.hypotheses.families import GIVEN_SHAPE, HELD, Alternative, InteriorFamily
-from sfm.adjustment.hypotheses.moved import MIN_GROUP, price_of
+from sfm.adjustment.hypotheses.moved import MIN_GROUP
 from sfm.adjustment.hypotheses.refit import (
     Refit,
-    log_likelihood,
+    log_likelihood_of,
     precision_factor,
     refit,
     shifts_of,
@@ -51,6 +51,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import FALSE_ALARM, MIN_LEAD
 from sfm.errors import GeometryError
+from sfm.likelihood import price_of
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
@@ -336,9 +337,9 @@ def _with_free_shape(held: Adjustment) -> list[tuple[Alternative, Refit]]:
     except GeometryError:
         return []
     beta, q = away.ravel(), away.size - 7
-    gain = log_likelihood(free, q) - log_likelihood(held)
+    gain = log_likelihood_of(free, q) - log_likelihood_of(held)
     seen = np.isin(held.network.image_points.point, given.point)
-    price = price_of(q, int(seen.sum()) // len(given), 0.0)  # each moves its image points only
+    price = price_of(q, int(seen.sum()) // len(given))  # each moves its image points only
     one = Alternative(
         GIVEN_SHAPE,
         "all",

@@ -92,8 +92,8 @@ ROWS = (
         "The scale of [[{given:@bar}]][[{plate}]] [[differs by {off:+} from]][[is {times} times]] that of "
         "the other given values, {sigmas} standard deviations[[; nearly a factor of {unit_factor}, as "
         "between {finer} and {coarser}]]. It was left out.",
-        "a mistyped, nominal or wrongly named length, another unit or temperature, a tape that is too long, a "
-        "print that shrank, or points that moved",
+        "a mistyped, nominal or wrongly named length, another unit or temperature, a tape that is too long, "
+        "a print that shrank, or points that moved",
         "Correct these values or remove them; state plate_sigma for a plate.",
     ),
     Kind(

@@ -58,7 +58,8 @@ def _models_without_copies(found: SolvedSurvey) -> Iterator[SurveyModel]:
         matched = found.model.matched
         network, estimate = without_copies(matched.network, matched.estimate, copies)
         left_out = tuple(
-            (name, remark("copies", original=first, same="errors of the image points")) for name, (first, _) in copies.items()
+            (name, remark("copies", original=first, same="errors of the image points"))
+            for name, (first, _) in copies.items()
         )
         yield replace(
             found.model,

@@ -249,7 +249,7 @@ def _read_rings(family: str, reader: RingReader, *, as_seen: bool = True) -> Rin
     return reader.read(rings, as_seen=as_seen)
 
 
-def _repeated_rings(readers: Sequence[RingReader], families: Sequence[str]) -> dict[str, tuple[int, ...]]:
+def _repeated_rings(readers: Sequence[RingReader], families: Mapping[str, int]) -> dict[str, tuple[int, ...]]:
     """Return the repeated codes of families of rings that photographs show.
 
     Rings are first read with the radii of each family. With the radii that the photographs show they are read
@@ -269,7 +269,7 @@ def _repeated_rings(readers: Sequence[RingReader], families: Sequence[str]) -> d
         return most, unread
 
     counts: dict[str, tuple[int, ...]] = {}
-    cells = {**RINGS, **NECKLACES}.__getitem__
+    cells = families.__getitem__
     likely, groups = list[list[str]](), list[list[str]]()
     for number, members in groupby(sorted(families, key=cells), key=cells):
         groups.append(list(members))
