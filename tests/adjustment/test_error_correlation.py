@@ -217,6 +217,7 @@ def test_common_errors_are_no_cause(scene: tuple[Network, Estimate], length_px: 
     assert judge_alternatives(with_neighbours(a)).causes == ()
 
 
+@pytest.mark.slow
 def test_points_that_moved_are_named_beside_common_errors(scene: tuple[Network, Estimate]) -> None:
     network, truth = scene
     seen, some = network.image_points, (5, 10, 20, 30, 40, 50, 80, 120, 200, 300)
@@ -229,6 +230,7 @@ def test_points_that_moved_are_named_beside_common_errors(scene: tuple[Network, 
     assert judge_alternatives(a).causes[0].kind == "held_parameter"  # errors taken as independent
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "share"), [("scene", 0.6), ("unequal", 0.3)])
 def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
     request: pytest.FixtureRequest, name: str, share: float

@@ -66,6 +66,7 @@ def test_global_test_is_two_sided(plain: Adjustment) -> None:
     assert none.passed is None and none.untested == "redundancy"
 
 
+@pytest.mark.slow
 def test_the_component_of_a_kind_is_tested_against_what_is_stated_for_it() -> None:
     """Of right standard deviations each kind is refused as often as alpha says."""
     copies, alpha = 200, 0.1

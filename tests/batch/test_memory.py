@@ -38,6 +38,7 @@ def _own_objects() -> Counter[str]:
     )
 
 
+@pytest.mark.slow
 def test_surveys_leave_nothing_behind(tmp_path: Path, plots: None) -> None:
     """After the first, which fills the caches, every survey ends with the objects it began with."""
     held = []

@@ -272,6 +272,7 @@ def test_every_kind_is_written_as_the_table_that_it_is_read_from(tmp_path: Path)
             np.testing.assert_allclose(again.covariances(), one.covariances(), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_image_points_of_a_planned_rig_give_its_mounts_within_their_standard_deviations(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -429,7 +429,7 @@ def rendered(name: str, count: int) -> Iterator[str]:
     """Yield sentence, cause and remedy of a kind; what a noun or a verb agrees with is the count."""
     fields = [found for text in texts_of(name) for found in FIELD.findall(text)]
     agreed = {field for field, spec in fields if "|" in spec or spec[:1].isalpha()}
-    subjects = {field: ("A", "B")[:count] for field, spec in fields if spec.startswith("@")}
+    subjects = {field: ("A", "B")[:count] for field, spec in fields if spec.startswith(("@", "?"))}
     numbers = {
         field: Quantity(float(count) if field in agreed else MANY)
         for field, _ in fields

@@ -542,6 +542,7 @@ def with_tip(network: Network, truth: Estimate, local: FloatArray) -> tuple[Netw
     return replace(network, observations=(*others, tipped)), tipped.own_parameters(values_of(truth)).value
 
 
+@pytest.mark.slow
 def test_a_tip_that_no_photograph_shows_has_the_covariance_that_is_stated() -> None:
     """Chi-square of 100 draws, 0.3 m from the frame."""
     rng, sums = seed_of("tip"), []

@@ -242,6 +242,7 @@ def test_image_points_without_noise_do_not_hide_what_is_given() -> None:
     assert kinds_of(remarks_on_given(result)) == ("given_weakly_checked",)
 
 
+@pytest.mark.slow
 def test_the_level_of_the_test_against_the_free_network() -> None:
     low = 0
     for k in range(12):
