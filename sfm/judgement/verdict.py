@@ -41,6 +41,7 @@ from sfm.judgement.checks import (
     longest_residual,
     sigma0_of,
 )
+from sfm.judgement.stated_precision import stated_precision_remarks
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level, Verdict, judge
@@ -83,6 +84,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
         *consistency_remarks(consistency, int(a.rejected.sum()), named=not result.automatic_points),
+        *(() if result.photographs else stated_precision_remarks(a)),  # only given image points state theirs
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
         *given_remarks(result, given_of(a, result.length_unit), statistics, check_coordinates(result)),
@@ -123,6 +125,7 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
         *gross_error_remarks(a, rejects=rejects),
         *ray_remarks(a),
         *consistency_remarks(consistency_of(a), int(a.rejected.sum())),
+        *stated_precision_remarks(a),
     )
     photographs = f"{oriented} of {counted(total, 'photograph')}"
     return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))

@@ -8,7 +8,7 @@ Their texts have fields in braces. Each field shows one part of the remark:
     {change:+}              with its sign          {share:%}             in per cent
     {p:<}                   "p = 0.012", "p < 0.001"
     {of:@}                  nouns of NOUNS         {given:@bar}          other names as "bar 1 - 2"
-    {mistake:?}             nouns, of which any explains
+    {mistake:@?}            nouns, of which any explains
 
 Text in [[ ]] appears only if the remark has all parts that it contains.
 """
@@ -225,7 +225,7 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
         return agreeing(count, spec)
     if spec and spec[0].isalpha():
         return f"{count:,.0f} {plural(spec, count)}"
-    if spec == "?" and not isinstance(part, Quantity):
+    if spec == "@?" and not isinstance(part, Quantity):
         return listed(_nouns(part, ""), separator=", or if ")
     if not isinstance(part, Quantity):
         return listed(_nouns(part, spec[1:]) if spec else part)

@@ -141,6 +141,7 @@ LIMITS: dict[
     "given_differs": ("harm", 0.0, 5.0),
     "checks_differ": ("more", 0.0, 1.0),
     "rig_contradicted": ("share", 0.0, 0.5),
+    "image_sigmas": ("factor", 0.0, 2.0),
     "given_not_exact": ("shift", 3.0, 5.0),
     "given_scatter": ("share", 0.2, None),
     "photographs_missing": ("share", 0.0, 0.5),

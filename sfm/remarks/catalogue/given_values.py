@@ -66,7 +66,7 @@ ROWS = (
     Kind(
         "kind_wrong",
         Unless("mistake", "error", "warning"),  # what is explained and not used does no harm
-        "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:?}.]]",
+        "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:@?}.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
         "Check the table: signs, units, and the point or photograph of each row.",
     ),
@@ -74,7 +74,7 @@ ROWS = (
         "observations_wrong",
         "warning",
         "{observations:survey observation} contradicted all others and {observations:was|were} not used: "
-        "{observations}.[[ {observations:It agrees|They agree} if {mistake:?}.]]",
+        "{observations}.[[ {observations:It agrees|They agree} if {mistake:@?}.]]",
         "a misread or mistyped value, another point, or a standard deviation that is too small",
         "Correct {observations:this value|these values}, or state a larger standard deviation.",
     ),

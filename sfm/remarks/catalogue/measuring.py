@@ -47,6 +47,18 @@ POINTS = (
         "Add photographs of {points:this point|these points}.",
     ),
     Kind(
+        "image_sigmas",
+        Grade("factor", warning=0.0, error=2.0),  # see `sfm.judgement.stated_precision`
+        "Beside the others, {count:image point} of {points:point} {count:scatters|scatter} at least {factor} "
+        "times as much as stated ({stated}): {points}.",
+        "standard deviations that are those of the software alone, or in another unit",
+        "State standard deviations that the residuals confirm, or leave sx_px and sy_px out.",
+        explains=(
+            *("image_points_rejected", "rays_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
+            *("points_with_large_residuals", "photographs_uneven"),
+        ),
+    ),
+    Kind(
         "points_with_large_residuals",
         "warning",
         "Taken together, the residuals of {points:point} are larger than expected by chance: {points}.",

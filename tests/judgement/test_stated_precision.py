@@ -1,0 +1,58 @@
+"""Image points whose stated standard deviations are too small beside those of the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.adjustment.datum import Datum
+from sfm.network import Estimate, Network
+from sfm.pipeline import run_survey
+from tests.surveys import survey_of
+from tests.synthetic import make_network, observed_anew, seed_of
+
+
+def stated(name: str, factor: float, *, points: int = 12, gross: float = 0.0) -> tuple[Network, Estimate]:
+    """Return a network in which the standard deviations of some points are a factor too small."""
+    rng = seed_of(name)
+    network, truth = make_network(rng, images=8, points=32, free=("c",))
+    network = observed_anew(network, truth, 0.1, rng)
+    seen = network.image_points
+    xy = seen.xy.copy()
+    wrong = rng.random(len(xy)) < gross
+    xy[wrong] += rng.normal(0.0, 20.0, (int(wrong.sum()), 2))
+    sigma = np.where(seen.point < points, 0.1 / factor, 0.1)
+    covariance = sigma[:, None, None] ** 2 * np.eye(2)
+    return replace(network, image_points=replace(seen, xy=xy, covariance=covariance)), truth
+
+
+@pytest.mark.parametrize(("factor", "severity"), [(10.0, ("error",)), (2.0, ("warning", "error"))])
+@pytest.mark.parametrize("seed", range(2))
+def test_points_stated_too_precise_are_named(factor: float, severity: tuple[str, ...], seed: int) -> None:
+    network, truth = stated(f"too precise {factor} {seed}", factor)
+    a = sfm.adjust(network, truth, datum=Datum("free"), reject="tau")
+    result = run_survey(survey_of(network, truth, sigma=True, adjust={"reject": "tau"}))
+    for remarks in (a.verdict.remarks, result.verdict.remarks):
+        (said,) = [one for one in remarks if one.kind == "image_sigmas"]
+        assert said.severity in severity and set(said.names("points")) == set(network.points[:12])
+        assert 1.5 < said.number("factor") < factor
+        assert said.number("stated") == pytest.approx(0.1 / factor)
+
+
+@pytest.mark.parametrize("gross", [0.0, 0.05])
+@pytest.mark.parametrize("factor", [1.0, 1.02, 5.0])
+def test_right_standard_deviations_are_not(factor: float, gross: float) -> None:
+    """Also of points that are as much better as they are stated to be, and with gross errors among them."""
+    network, truth = stated(f"right {factor} {gross}", factor, gross=gross)
+    seen = network.image_points
+    rng = seed_of("better")
+    if factor == 5.0:
+        better = np.linalg.cholesky(seen.covariance)
+        exact = observed_anew(network, truth, 0.0, rng).image_points.xy
+        xy = exact + np.einsum("kab,kb->ka", better, rng.standard_normal(seen.xy.shape))
+        network = replace(network, image_points=replace(seen, xy=xy))
+    a = sfm.adjust(network, truth, datum=Datum("free"), reject="tau")
+    assert "image_sigmas" not in {one.kind for one in a.verdict.remarks}
