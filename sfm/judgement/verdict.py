@@ -28,7 +28,7 @@ from sfm.adjustment.quality.variance_components import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
-from sfm.distributions import LEVEL, normal_ppf, share_of
+from sfm.distributions import LEVEL, binomial_sf, normal_ppf, share_of
 from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
@@ -189,14 +189,26 @@ def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
 
 def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
-    """Return why mirrored photographs are not in the result, once for those mirrored together."""
-    remarks = []
-    for one in result.failed:
-        if one.reason.kind == "photograph_mirrored":
-            remarks.append(replace(one.reason, subjects={"photograph": (one.image,)}))
-        elif one.reason.kind == "photograph_of_mirror_image" and one.reason not in remarks:
-            remarks.append(one.reason)
-    return tuple(remarks)
+    """Return why mirrored photographs are not in the result, once for those mirrored together.
+
+    If nothing checks the handedness, only a much larger part shows that the other part is mirrored.
+    """
+    single = [one for one in result.failed if one.reason.kind == "photograph_mirrored"]
+    groups = {
+        one.reason.names("photographs"): one.reason
+        for one in result.failed
+        if one.reason.kind == "photograph_of_mirror_image"
+    }
+    right, mirrored = len(result.adjustment.network.images), len(single) + sum(map(len, groups))
+    decided: dict[str, tuple[str, ...]] = {}
+    if all(one.kind != "handedness_unchecked" for one in result.stage_remarks):
+        decided = {"decided_by": ("known handedness",)}
+    elif binomial_sf(right - 1, right + mirrored, 0.5) < FALSE_ALARM:  # a sign test
+        decided = {"decided_by": ("most photographs",)}
+    return (
+        *(replace(one.reason, subjects={"photograph": (one.image,)}) for one in single),
+        *(replace(reason, subjects={**reason.subjects, **decided}) for reason in groups.values()),
+    )
 
 
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:

@@ -39,6 +39,7 @@ PLACES = [(0, x, y) for x in (-165.0, -110.0, 110.0, 165.0) for y in (-115.0, -4
 PLACES += [(0, x, y) for x in (-40.0, 40.0) for y in (-120.0, 120.0)]
 PLACES += [(1, x, y) for x in (-35.0, 35.0) for y in (-25.0, 25.0)]
 FIRST_CODE = 10
+MIRRORED = ("photograph_mirrored", "photograph_of_mirror_image")
 
 
 def two_plates(place: dict[int, int]) -> Scene:
@@ -188,6 +189,29 @@ def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
     for one in result.failed:
         assert one.reason.kind == "photograph_of_mirror_image"
         assert one.reason.number("points") >= 30 and len(one.reason.names("photographs")) == 4
+
+
+@pytest.mark.parametrize(
+    ("mirrored", "control", "severity"),
+    [(9, 0, "error"), (8, 0, "error"), (3, 0, "warning"), (8, 8, "warning")],
+)
+def test_of_two_parts_of_equal_size_none_is_believed_unless_control_decides(
+    mirrored: int, control: int, severity: str
+) -> None:
+    """The larger part was the result, fair, also where it was the mirrored one."""
+    network, truth = make_network(seed_of(f"half mirrored {mirrored}"), images=17, points=40)
+    seen = network.image_points
+    xy = seen.xy.copy()
+    turned = seen.image < mirrored
+    xy[turned, 0] = OF_NETWORK[0] - 1 - xy[turned, 0]
+    names = [str(k + 1) for k in range(control)]
+    given: dict[str, Any] = {"datum": {"kind": "control"}} if control else {}
+    if control:
+        given["control"] = KnownPoints.from_arrays(names, truth.points[:control], 1e-4)
+    result = run_survey(survey_of(replace(network, image_points=replace(seen, xy=xy)), truth, **given))
+    said = [one for one in result.verdict.remarks if one.kind in MIRRORED]
+    assert said and {one.severity for one in said} == {severity}
+    assert (result.verdict.level == "bad") is (severity == "error")
 
 
 @pytest.mark.parametrize("control", [0, 8])

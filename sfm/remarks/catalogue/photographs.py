@@ -274,12 +274,12 @@ ROWS = (
     ),
     Kind(
         "photograph_of_mirror_image",
-        "warning",
+        Unless("decided_by", "error", "warning"),
         "{photographs} {photographs:shows|show} the mirror image of the others, judging by "
-        "{points:common point}.",
+        "{points:common point}.[[ {decided_by:@} shows that these are mirrored.]]",
         "{photographs:this photograph|these photographs} or the others were mirrored by a program, or x "
         "was reversed",
-        "Use the original photographs; check the handedness of the result.",
+        "Use the original photographs; control, or points of known handedness, show which are mirrored.",
     ),
     Kind(
         "photograph_of_second_object",
