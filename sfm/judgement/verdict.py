@@ -203,7 +203,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
     decided: dict[str, tuple[str, ...]] = {}
     if all(one.kind != "handedness_unchecked" for one in result.stage_remarks):
         decided = {"decided_by": ("known handedness",)}
-    elif binomial_sf(right - 1, right + mirrored, 0.5) < FALSE_ALARM:  # a sign test
+    elif binomial_sf(right - 1, right + mirrored, 0.5) < result.adjustment.false_alarm:  # a sign test
         decided = {"decided_by": ("most photographs",)}
     return (
         *(replace(one.reason, subjects={"photograph": (one.image,)}) for one in single),
