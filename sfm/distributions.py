@@ -14,8 +14,8 @@ import numpy as np
 from scipy import special
 
 # Probabilities of tests. A family of tests shares the first; one question has the second. The alternatives
-# of an adjustment, bumps of rigs, the tests of points and photographs, shared cameras of epochs and outlines
-# of targets still have a level of 0.01.
+# of an adjustment, the tests of points and photographs, shared cameras of epochs and outlines of targets
+# still have a level of 0.01.
 FALSE_ALARM = 0.05  # that the tests of one kind, together, report anything in a result without errors
 LEVEL = 0.001  # that one question is answered wrongly although nothing is wrong; Baarda (1968)
 POWER = 0.8  # that an error of the size that is called detectable is found; Baarda (1968)

@@ -67,9 +67,9 @@ def test_a_rig_that_most_photographs_contradict_while_they_share_its_pose_is_an_
 
 
 def test_rigs_that_kept_their_places_are_left_alone() -> None:
-    """30 of them at a level of 1 %: two alarms have a chance of 4 %, three of 0.3 %."""
+    """30 of them at a level of 0.1 %: one alarm has a chance of 3 %, two of 0.04 %."""
     alarms = sum(bool(find_bumps(adjust(*scene(k, 2), reject="none"))) for k in range(10, 40))
-    assert alarms <= 2
+    assert alarms <= 1
 
 
 def test_scores_are_those_of_an_adjustment_with_a_pose_of_its_own() -> None:

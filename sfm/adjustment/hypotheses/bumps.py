@@ -28,11 +28,10 @@ from sfm.adjustment.engine.correlated import linearise
 from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation, rotation_from_angles
-from sfm.distributions import chi2_sf
+from sfm.distributions import LEVEL, chi2_sf
 from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
 
-FALSE_ALARM = 0.01  # probability that a bump is reported for a rig without one
 MIN_REDUNDANCY = 1e-9  # redundancy of a separate pose below which nothing checks it
 STEP = 1e-6  # of a numerical derivative, as a share of the distance of two photographs, and in rad
 
@@ -57,22 +56,19 @@ def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...
     reference camera is named.
 
     Args:
-        a: adjustment with rigs and independent errors.
+        a: adjustment with rigs. With correlated errors only photographs free of their rig are tested.
         stated: moment of each photograph as the survey states it, (m,); a photograph with another moment in
             the network was adjusted free of its rig. The moments of the network if not given.
     """
     moment = a.network.moment
-    if moment is None or a.estimate.mounts is None or a.error_correlation is not None:
+    if moment is None or a.estimate.mounts is None:
         return ()
-    tested = _testable(a)
+    tested = _testable(a) if a.error_correlation is None else np.zeros(0, dtype=np.int64)
     stated = moment if stated is None else stated
     freed = np.flatnonzero(moment != stated)
-    critical = level_of_single(FALSE_ALARM, max(len(tested) + len(freed), 1))
+    critical = level_of_single(LEVEL, max(len(tested) + len(freed), 1))
     with own_threads():
-        every = [
-            *_of_freed(a, freed, moment if stated is None else stated),
-            *_of_mounted(a, tested, critical),
-        ]
+        every = [*_of_freed(a, freed, stated), *_of_mounted(a, tested, critical)]
     found = [bump for bump in every if bump.probability < critical]
     return tuple(sorted(found, key=lambda bump: -bump.sigmas))
 
@@ -99,7 +95,7 @@ def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tu
             distance=(max(bump.shift for bump in found), unit),
             angle=(float(np.degrees(max(bump.turn for bump in found))), "deg"),
             shift=max(bump.sigmas for bump in found),
-            bound=sum(not bump.free for bump in found),
+            bound=float(np.mean([not bump.free for bump in found])),
         ),
     )
 

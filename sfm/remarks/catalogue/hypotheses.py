@@ -209,8 +209,8 @@ ROWS = (
     ),
     Kind(
         "rig_contradicted",
-        # Of most photographs of these cameras, if some still share the pose of their rig, which bends it.
-        Grade("share", error=0.5, at_most=Grade("bound", error=1)),
+        # Of most photographs of these cameras, if half of them still share the pose of the rig, which bends it.
+        Grade("share", error=0.5, at_most=Grade("bound", error=0.5)),
         "{photographs:photograph} of {cameras} {photographs:contradicts|contradict} the rig, by up to "
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
         "the camera was moved on its rig, a wrong mount was given, or rig or object moved between cameras "

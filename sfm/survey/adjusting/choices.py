@@ -87,7 +87,7 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
     """
     network, estimate = found.model.matched.network, found.model.matched.estimate
     stated, oriented = network.moment, estimate.oriented
-    if stated is None or estimate.mounts is None:
+    if stated is None:
         return
     seen, m = network.image_points, len(network.images)
     known = np.isin(network.points, found.adjustment.network.points)[seen.point]
@@ -96,14 +96,17 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
     share = np.where(oriented, against / np.maximum(count, 1), np.inf)
     least = np.full(int(stated.max()) + 1, np.inf)
     np.minimum.at(least, stated, share)
-    named = [name for one in of_kind(found.remarks, "rig_contradicted") for name in one.names("photographs")]
-    free = more_than_chance(against, count, ALPHA) & (share > least[stated])
-    free = oriented & (free | np.isin(network.images, named))
+    names = [name for one in of_kind(found.remarks, "rig_contradicted") for name in one.names("photographs")]
+    named = np.isin(network.images, names)  # never all of a moment
+    free = oriented & (more_than_chance(against, count, ALPHA) & (share > least[stated]) | named)
+    left = np.bincount(stated[oriented & ~free], minlength=len(least))
+    free &= (left[stated] > 0) | named
     if not free.any():
         return
     report_step("adjusting photographs free of their rig")
     together = np.where(free, stated + len(least), stated)
-    of_reference = estimate.mounts.at_reference[network.camera]
+    references = [rig.cameras[0] for rig in found.model.survey.rigs]
+    of_reference = np.isin([camera.name for camera in estimate.cameras], references)[network.camera]
     # photographs of each moment, and half of one more with the reference camera
     size = np.bincount(together, oriented * (1 + of_reference / 2), minlength=2 * len(least))
     smaller = size[: -len(least)] < size[len(least) :]
@@ -130,19 +133,18 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     return replace(
         model,
         matched=replace(matched, network=network, estimate=estimate),
-        stated_moment=matched.network.moment,
+        stated_moment=matched.network.moment if model.stated_moment is None else model.stated_moment,
     )
 
 
 def _evidence_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return the gain of ln likelihood minus the price of each further pose."""
-    stated, matched = after.model.stated_moment, after.model.matched
-    if stated is None or not after.adjustment.converged or after.adjustment.undetermined:
+    moment, earlier = after.model.matched.network.moment, before.model.matched.network.moment
+    if moment is None or not after.adjustment.converged or after.adjustment.undetermined:
         return -float("inf")
-    moment, seen = matched.network.moment, matched.network.image_points
-    assert moment is not None
-    count = np.bincount(moment[seen.image], minlength=int(moment.max()) + 1)  # image points
-    further = np.setdiff1d(moment, stated)
+    of_point = moment[after.model.matched.network.image_points.image]
+    count = np.bincount(of_point, minlength=int(moment.max()) + 1)
+    further = np.setdiff1d(moment, moment if earlier is None else earlier)
     price = sum(price_of(POSE, int(count[k])) for k in further)
     return _log_likelihood(after, POSE * len(further)) - _log_likelihood(before) - price
 
@@ -187,8 +189,10 @@ def _c_per_photograph(solved: SolvedSurvey) -> Iterator[tuple[str, list[float], 
             yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]
 
 
+FREE_OF_RIGS = Choice(_models_free_of_rigs, _evidence_of_free_photographs)
 CHOICES = (
     Choice(_models_without_copies),
-    Choice(_models_free_of_rigs, _evidence_of_free_photographs),
+    FREE_OF_RIGS,
+    FREE_OF_RIGS,  # others, which those found first concealed
     Choice(_models_with_varying_c, _evidence_of_varying_c, _report_varying_c),
 )

@@ -318,6 +318,8 @@ def _confirmed_mounts(
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the given mounts that the image points confirm, and remarks on the others."""
     mounts = start.task.survey.given_mounts
+    if start.estimate.mounts is not None:  # of a camera that no moment pairs with others, nothing is used
+        mounts = mounts.select(np.array(start.estimate.mounts.rig)[mounts.camera] != "")
     if reference is None or not len(mounts):
         return mounts, ()
     report_step("testing the given mounts")
