@@ -91,6 +91,19 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
         "tests/survey/test_unchecked.py",
         "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
     ),
+    **{
+        f"sfm/judgement/given/{module}.py": (
+            "tests/survey/test_survey_observations.py",
+            "tests/survey/test_rigs.py",
+            "tests/judgement/test_given_model.py",
+        )
+        for module in ("tables", "mounts", "free_network")
+    },
+    "sfm/judgement/stated_precision.py": ("tests/judgement/test_stated_precision.py",),
+    "sfm/judgement/given/groups.py": (
+        "tests/judgement/test_given_thresholds.py",
+        "tests/survey/test_unchecked.py",
+    ),
     "sfm/judgement/given/judge.py": (
         "tests/judgement/test_given_thresholds.py",
         "tests/survey/test_unchecked.py",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import SWELLING
+from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import scales as given_scales
 from sfm.judgement.given.points import GivenPoints
@@ -290,12 +291,12 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
         found=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
         placed=SimpleNamespace(model=SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))),
     )
-    found = given_scales.Group._confirmed(group, stated, of["rescale"])
+    found = given_groups.Group._confirmed(group, stated, of["rescale"])
     np.testing.assert_allclose(found, np.where(np.isfinite(stated), factor**2 * stated, stated))
 
 
 def test_four_points_that_are_not_in_a_plane_are_in_space() -> None:
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    assert given_scales.are_in_space(corner)
-    assert not given_scales.are_in_space(corner[:3])
-    assert not given_scales.are_in_space(corner * [1, 1, 0.01])
+    assert given_groups.are_in_space(corner)
+    assert not given_groups.are_in_space(corner[:3])
+    assert not given_groups.are_in_space(corner * [1, 1, 0.01])

@@ -10,9 +10,9 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.groups import remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.points import GivenPoints
-from sfm.judgement.given.scales import remarks_on_unchecked
 from sfm.judgement.given.values import GivenModel
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey

@@ -2,5 +2,5 @@
 
 `judge` judges control, bars and projection centres, `mounts` the mounts of rigs, `tables` all other survey
 observations. `free_network` is the reference of each, and `values` are the statistics of all. `points`,
-`names` and `scales` are what points and lengths may have wrong.
+`names` and `scales` are what points and lengths may have wrong, `groups` the given points of a kind.
 """

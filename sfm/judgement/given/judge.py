@@ -18,16 +18,16 @@ from sfm.adjustment.datum import Datum
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import FreeNetwork
-from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
-from sfm.judgement.given.scales import (
+from sfm.judgement.given.groups import (
     Group,
     Places,
     Task,
     are_in_space,
     contradiction_of,
-    judge_scales,
     remarks_on_unchecked,
 )
+from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
+from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.values import NONCENTRALITY, GivenModel
 from sfm.network import ExteriorObservations, Network
 from sfm.remarks.remark import Remark, remark
