@@ -43,6 +43,7 @@ from sfm.judgement.checks import (
 )
 from sfm.judgement.stated_precision import stated_precision_remarks
 from sfm.network import rows_of
+from sfm.remarks.kind import Grade
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.result import SurveyResult
@@ -77,7 +78,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     remarks = (
         *convergence_remarks(a),
         *photograph_remarks(result),
-        *result.stage_remarks,
+        *slight_as_tests(result.stage_remarks),
         *other_solution_remarks(result),
         *sigma0_remarks(sigma0_of(a), a),
         *residual_remarks(longest_residual(a)),
@@ -129,6 +130,19 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
     )
     photographs = f"{oriented} of {counted(total, 'photograph')}"
     return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))
+
+
+def slight_as_tests(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+    """Return remarks with a test in place of each effect that shifts the result less than users expect."""
+
+    def is_slight(one: Remark) -> bool:
+        grade = None if one.test is not None else one.row.severity
+        return isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
+
+    return tuple(
+        remark("slight_effect", cause=one.kind, shift=one.number("shift")) if is_slight(one) else one
+        for one in remarks
+    )
 
 
 def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:

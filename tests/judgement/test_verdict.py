@@ -186,3 +186,14 @@ def test_a_result_is_judged_once_and_when_it_is_asked(
     survey = run_survey(survey_of(*made))
     sfm.write_result(survey, tmp_path / "out")
     assert count["judged"] == 2
+
+
+def test_an_effect_below_what_users_expect_is_a_row_of_the_table(made: tuple[Network, Estimate]) -> None:
+    result = run_survey(survey_of(*made))
+    for shift, kinds in ((2.9, ()), (3.1, ("other_camera",))):
+        cause = remark("other_camera", photographs=("a",), of="coordinates", shift=shift, wrong=shift)
+        verdict = judge_survey(replace(result, stage_remarks=(cause,))).verdict
+        assert tuple(one.kind for one in verdict.remarks if one.kind == "other_camera") == kinds
+        slight = [one for one in verdict.tests if one.kind == "slight_effect"]
+        assert [one.number("shift") for one in slight] == ([] if kinds else [shift])
+        assert all("a different camera" in one.tested[1] for one in slight)

@@ -194,6 +194,7 @@ ROWS = (
         "not include it.",
         "coordinates of a drawing or a print, or points that moved",
         "State the standard deviations of these coordinates.",
+        short="fixed coordinates that are not exact",
         explains=PULLED,
     ),
     Kind(

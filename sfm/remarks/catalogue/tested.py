@@ -200,4 +200,10 @@ ROWS = (
         "{measured:point}",
         "{points:point} left out, as too few rays meet",
     ),
+    Tested(
+        "slight_effect",
+        "other assumptions",
+        "{cause}",
+        "fits better, but shifts the result by up to {shift} standard deviations only",
+    ),
 )
