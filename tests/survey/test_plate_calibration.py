@@ -130,7 +130,9 @@ def test_photographs_without_the_plate_are_named(tmp_path: Path) -> None:
     path = write_plate_survey(tmp_path / "plate", GRID, seed_of("without"), count=2)
     text = path.read_text(encoding="utf-8").replace("[3, 3], [3, 5]", "[0, 1], [2, 2]")
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(GeometryError, match=r"In 2 photographs 94 dots do not fit the plate of 9 x 11"):
+    with pytest.raises(
+        GeometryError, match=r"plate of 9 x 11 was not found in 2 photographs, where 94 dots do not fit it"
+    ):
         run_survey(read_survey(path))
 
 
