@@ -209,7 +209,7 @@ ROWS = (
     ),
     Kind(
         "rig_contradicted",
-        # Of most photographs of these cameras, if half of them still share the pose of the rig, which bends it.
+        # Of most photographs of these cameras, if half of these still share the pose of the rig and bend it.
         Grade("share", error=0.5, at_most=Grade("bound", error=0.5)),
         "{photographs:photograph} of {cameras} {photographs:contradicts|contradict} the rig, by up to "
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
