@@ -101,6 +101,7 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
     free = oriented & (more_than_chance(against, count, ALPHA) & (share > least[stated]) | named)
     left = np.bincount(stated[oriented & ~free], minlength=len(least))
     free &= (left[stated] > 0) | named
+    free &= np.bincount(stated[oriented], minlength=len(least))[stated] > 1  # not free already
     if not free.any():
         return
     report_step("adjusting photographs free of their rig")
