@@ -54,6 +54,7 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "observations": "the survey observations",
     "covariance": "covariances",
     "sigmas": "standard deviations",
+    "steadily": "steadily through the sequence",
     "alike": "at the same values",
     "apart": "at different values or in one of them",
     "lengths": "the given lengths",

@@ -88,7 +88,7 @@ def alternative(
         ("format", "all", "distortion_not_described"),
         ("moved", "split", "points_moved"),
         ("shifted", "split", "points_moved"),
-        ("strain", "linear", "object_deforming"),
+        ("strain", "linear", "object_deformed"),
         ("bending", "split", "object_deformed"),
     ],
 )

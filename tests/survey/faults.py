@@ -209,7 +209,7 @@ def _growing(scene: _Scene) -> str:
     shape = np.zeros((3, 3))
     shape[0, 0] = _size(scene, 2e-3, 2e-2)
     _strained(scene, np.arange(scene.m), np.arange(scene.m) / (scene.m - 1), shape)
-    return "object_deforming"
+    return "object_deformed"
 
 
 def _bent(scene: _Scene) -> str:

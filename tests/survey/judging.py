@@ -47,7 +47,6 @@ UNCHECKED = {
 }
 CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED | {"camera_per_photograph"}
 ALIKE = {  # kinds that say the same of a fault
-    "object_deforming": "object_deformed",
     "two_places": "points_moved",
     "camera_drift": "other_camera",
     "camera_per_photograph": "other_camera",

@@ -223,5 +223,5 @@ def test_a_wrong_row_leaves_its_table_which_alone_gives_the_scale() -> None:
     value[3] += 0.05
     result = run_survey(survey_of(network, truth, tables=(replace(table, value=value),)))
     said = {one.kind: one.names("given") for one in remarks_on_given(result)}
-    assert said == {"bar_left_out": ("4 - 18",), "scale_unchecked": ("the table of distances",)}
+    assert said == {"scale_left_out": ("4 - 18",), "scale_unchecked": ("the table of distances",)}
     assert len(result.network.scale_bars) == 7

@@ -231,8 +231,7 @@ class ObjectFamily(OfPhotographs):
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""
-        kinds = {"linear": "object_deforming", "all": "shape_of_control"}
-        return kinds.get(pattern, "object_deformed")
+        return "shape_of_control" if pattern == "all" else "object_deformed"
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
@@ -249,8 +248,10 @@ class ObjectFamily(OfPhotographs):
         if one.pattern == "all":
             return _parts_of_shape(field_ @ beta, unit)
         away = np.linalg.norm(field_ @ beta, axis=1) / size
+        steadily = one.pattern == "linear"
         return {
-            "photographs": tuple(a.network.images[i] for i in one.photographs),
+            "photographs": None if steadily else tuple(a.network.images[i] for i in one.photographs),
+            "how": ("steadily",) if steadily else None,
             "deformation": (1000 * float(np.ptp(one.factor)) * float(np.nanmax(away)), "‰ of the object"),
         }
 

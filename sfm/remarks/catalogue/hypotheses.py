@@ -184,18 +184,12 @@ ROWS = (
     Kind(
         "object_deformed",
         SHIFT,
-        f"The object has a different shape in {{photographs}}, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
+        "The object has a different shape[[ in {photographs}]][[ each time, changing {how:@}]], "
+        f"by up to {{deformation}}. {SHIFTED}{INSTEAD}",
         "the object expanded, bent or settled during the survey",
-        "Adjust the two states as two surveys and compare them with epochs.",
+        "Adjust the states as separate surveys and compare them with epochs; photograph a steady change in a "
+        "shorter time.",
         short="an object that deformed",
-    ),
-    Kind(
-        "object_deforming",
-        SHIFT,
-        f"The object deforms steadily through the sequence, by up to {{deformation}}. {SHIFTED}{INSTEAD}",
-        "the object warmed up or was loaded during the survey",
-        "Photograph in a shorter time or at a constant temperature.",
-        short="an object that deforms steadily",
     ),
     Kind(
         "shape_of_control",

@@ -54,7 +54,7 @@ POINTS = (
         "standard deviations that are those of the software alone, or in another unit",
         "State standard deviations that the residuals confirm, or leave sx_px and sy_px out.",
         explains=(
-            *("image_points_rejected", "rays_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
+            *("image_points_rejected", "residual_kept", "sigma0_high", "points_doubtful"),
             *("points_with_large_residuals", "photographs_uneven"),
         ),
     ),
