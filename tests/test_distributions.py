@@ -64,7 +64,7 @@ def test_an_error_that_is_called_detectable_is_found_with_the_stated_power() -> 
 def test_levels_have_one_home() -> None:
     """Other modules import them; levels of families that are still their own are listed here."""
     theirs = [
-        ("adjustment/hypotheses/alternatives.py", "ALPHA"),
+        ("judgement/hypotheses/alternatives.py", "ALPHA"),
         ("adjustment/quality/consistency.py", "FAMILY"),
         ("distributions.py", "FALSE_ALARM"),
         ("distributions.py", "LEVEL"),

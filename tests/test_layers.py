@@ -30,6 +30,7 @@ LAYERS = (
         *("sfm.solution", "sfm.given_residuals", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
+    ("sfm.judgement.hypotheses",),  # of an adjustment; the rest of the room judges results
     (
         "sfm.textbook",
         "sfm.comparison",
@@ -181,7 +182,7 @@ def test_libraries_stay_in_their_rooms() -> None:
 
 def test_the_rules_would_notice() -> None:
     assert layer_of("sfm.targets.detect") == 1
-    assert layer_of("sfm.survey.inputs.start") == 5
+    assert layer_of("sfm.survey.inputs.start") == 6
     assert layer_of("sfm.surveying") is None
     assert "sfm.errors" in imported(MODULES["sfm.cli"])
 

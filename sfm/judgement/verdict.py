@@ -6,7 +6,7 @@ were rejected or remain, rays, and consistency.
 
 Given values are judged by the image points alone before they take part. The tests here judge those that took
 part, and those that only check the result. They do not test given interior orientation. Whether it is wrong
-is decided by an alternative hypothesis (`sfm.adjustment.hypotheses`), which states the shift of object
+is decided by an alternative hypothesis (`sfm.judgement.hypotheses`), which states the shift of object
 points.
 """
 

@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
+from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
 from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark

@@ -20,12 +20,12 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
-from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
+from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points

@@ -13,15 +13,18 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, columns, families, hypotheses, moved, refit, score
-from sfm.adjustment.hypotheses import moved as patterns
-from sfm.adjustment.hypotheses.alternatives import (
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray, IntArray
+from sfm.judgement.hypotheses import alternatives, columns, families, hypotheses, moved, refit, score
+from sfm.judgement.hypotheses import moved as patterns
+from sfm.judgement.hypotheses.alternatives import (
     alternatives_of,
     is_significant,
 )
-from sfm.adjustment.hypotheses.columns import Columns, columns_of, interior_columns
-from sfm.adjustment.hypotheses.families import Alternative
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.columns import Columns, columns_of, interior_columns
+from sfm.judgement.hypotheses.families import Alternative
+from sfm.judgement.hypotheses.score import (
     NONE,
     Gain,
     Reduced,
@@ -33,9 +36,6 @@ from sfm.adjustment.hypotheses.score import (
     log_probability,
     reduce_adjustment,
 )
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray, IntArray
 from sfm.network import ImagePoints, InteriorObservations
 from tests.survey.faults import planted
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import columns
-from sfm.adjustment.hypotheses.columns import columns_of, interior_columns, interior_step, object_fields
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import pixel_from_tangents, project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import Role
+from sfm.judgement.hypotheses import columns
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns, interior_step, object_fields
 from tests.synthetic import make_network, seed_of
 
 

@@ -11,14 +11,14 @@ from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
 from sfm.adjustment.engine.correlated import correlated_sum
-from sfm.adjustment.hypotheses.columns import columns_of
-from sfm.adjustment.hypotheses.families import MOVED
-from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
-from sfm.adjustment.hypotheses.score import Reduced, gain_of, reduce_adjustment
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
+from sfm.judgement.hypotheses.columns import columns_of
+from sfm.judgement.hypotheses.families import MOVED
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
+from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
 from sfm.network import Estimate, Network, rows_of
 from sfm.report.phrases import describe_neighbours, significant
 from sfm.survey.adjusting.choices import solve_survey

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import families, hypotheses
-from sfm.adjustment.hypotheses.columns import columns_of, interior_step, object_fields
-from sfm.adjustment.hypotheses.families import Alternative
-from sfm.adjustment.hypotheses.hypotheses import (
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
+from sfm.judgement.hypotheses import families, hypotheses
+from sfm.judgement.hypotheses.columns import columns_of, interior_step, object_fields
+from sfm.judgement.hypotheses.families import Alternative
+from sfm.judgement.hypotheses.hypotheses import (
     Cause,
     JudgedAssumptions,
     contradicted_parameters,
@@ -22,11 +25,8 @@ from sfm.adjustment.hypotheses.hypotheses import (
     judge_alternatives,
     remark_of,
 )
-from sfm.adjustment.hypotheses.refit import Refit, log_likelihood_of, shifts_of
-from sfm.adjustment.hypotheses.score import NONE, Gain, Spread, log_likelihood_gain
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
+from sfm.judgement.hypotheses.refit import Refit, log_likelihood_of, shifts_of
+from sfm.judgement.hypotheses.score import NONE, Gain, Spread, log_likelihood_gain
 from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark
 from sfm.similarity import fit_similarity

@@ -10,29 +10,29 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import hypotheses, score
-from sfm.adjustment.hypotheses import refit as refitting
-from sfm.adjustment.hypotheses.alternatives import explain_rejections, interiors
-from sfm.adjustment.hypotheses.columns import (
-    CAMERA,
-    columns_of,
-    interior_columns,
-    interior_step,
-    object_fields,
-)
-from sfm.adjustment.hypotheses.families import GIVEN, HELD
-from sfm.adjustment.hypotheses.hypotheses import (
-    JudgedAssumptions,
-    contradicted_parameters,
-    judge_alternatives,
-)
-from sfm.adjustment.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
+from sfm.judgement.hypotheses import hypotheses, score
+from sfm.judgement.hypotheses import refit as refitting
+from sfm.judgement.hypotheses.alternatives import explain_rejections, interiors
+from sfm.judgement.hypotheses.columns import (
+    CAMERA,
+    columns_of,
+    interior_columns,
+    interior_step,
+    object_fields,
+)
+from sfm.judgement.hypotheses.families import GIVEN, HELD
+from sfm.judgement.hypotheses.hypotheses import (
+    JudgedAssumptions,
+    contradicted_parameters,
+    judge_alternatives,
+)
+from sfm.judgement.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints
 from sfm.planning.stations import aim_camera
 from sfm.remarks.kind import WRONG_SIGMAS
@@ -289,7 +289,7 @@ def test_a_sample_of_a_large_network_names_the_same(monkeypatch: pytest.MonkeyPa
     one = planted("growth", 28)
     a = solved(one.network, one.start)
     whole = judge_alternatives(a).causes
-    monkeypatch.setattr("sfm.adjustment.hypotheses.hypotheses.MAX_IMAGE_POINTS", len(a.rejected) // 2)
+    monkeypatch.setattr("sfm.judgement.hypotheses.hypotheses.MAX_IMAGE_POINTS", len(a.rejected) // 2)
     assert kinds_of(judge_alternatives(a).causes)[:1] == kinds_of(whole)[:1]
 
 

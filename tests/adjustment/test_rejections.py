@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives as rejections
-from sfm.adjustment.hypotheses.alternatives import SecondPlace, explain_rejections
 from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import chi2_isf
+from sfm.judgement.hypotheses import alternatives as rejections
+from sfm.judgement.hypotheses.alternatives import SecondPlace, explain_rejections
 from sfm.network import ImagePoints
 from sfm.remarks.remark import Remark, kinds_of
 from tests.synthetic import make_network, seed_of

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.bumps import _gain, _scores, bump_remarks, find_bumps
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
+from sfm.judgement.hypotheses.bumps import _gain, _scores, bump_remarks, find_bumps
 from sfm.network import Estimate, Network
 from tests.rigs import make_rig
 from tests.synthetic import seed_of

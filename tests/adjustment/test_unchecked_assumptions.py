@@ -10,16 +10,16 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses import alternatives, families
-from sfm.adjustment.hypotheses import moved as patterns
-from sfm.adjustment.hypotheses import refit as unchecked
-from sfm.adjustment.hypotheses.alternatives import count_alternatives, interiors, needed_gain
-from sfm.adjustment.hypotheses.columns import columns_of, shared_columns
-from sfm.adjustment.hypotheses.refit import reach_of, unchecked_assumptions
-from sfm.adjustment.hypotheses.score import reduce_adjustment
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
+from sfm.judgement.hypotheses import alternatives, families
+from sfm.judgement.hypotheses import moved as patterns
+from sfm.judgement.hypotheses import refit as unchecked
+from sfm.judgement.hypotheses.alternatives import count_alternatives, interiors, needed_gain
+from sfm.judgement.hypotheses.columns import columns_of, shared_columns
+from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
+from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality import consistency
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind

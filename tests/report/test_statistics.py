@@ -13,7 +13,6 @@ from markupsafe import escape
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality.statistics import (
     component_tests,
     global_test,
@@ -39,6 +38,7 @@ from sfm.judgement.checks import (
     precision_of,
     sigma0_of,
 )
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import of_kind
 from sfm.report.figures.plots import all_plots, plan_axes

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.verdict import ray_remarks
 from sfm.network import Estimate, ObjectPoints
 from sfm.remarks.remark import Remark, kinds_of, of_kind

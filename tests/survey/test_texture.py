@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.adjustment.hypotheses.hypotheses import JudgedAssumptions
 from sfm.camera import project
+from sfm.judgement.hypotheses.hypotheses import JudgedAssumptions
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import of_kind, remark
 from sfm.similarity import fit_similarity

@@ -26,7 +26,6 @@ from typing import Literal, Protocol
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.hypotheses import contradicted_parameters
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
@@ -37,6 +36,7 @@ from sfm.display import counted, program_name
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
 from sfm.errors import GeometryError
+from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.runtime.progress import report_step

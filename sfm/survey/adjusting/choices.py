@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.camera import base_name
 from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
+from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Mounts
 from sfm.remarks.remark import of_kind, remark

@@ -12,9 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.hypotheses.alternatives import explain_rejections
-from sfm.adjustment.hypotheses.bumps import bump_remarks
-from sfm.adjustment.hypotheses.hypotheses import judge_alternatives
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -27,6 +24,9 @@ from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.tables import as_judged, judge_tables
+from sfm.judgement.hypotheses.alternatives import explain_rejections
+from sfm.judgement.hypotheses.bumps import bump_remarks
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations

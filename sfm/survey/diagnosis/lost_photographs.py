@@ -35,13 +35,13 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import ALPHA
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
+from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of

@@ -6,7 +6,7 @@ rest. Without this test, a photograph with only a few accepted points would coun
 
 Photographs that lose more points to the outlier test than chance explains are examined. Each is adjusted
 alone on the points of the others: with the camera that it shares, and with per-photograph parameters. The
-gain in likelihood must pay for these parameters and for the search, as in `sfm.adjustment.hypotheses`. It
+gain in likelihood must pay for these parameters and for the search, as in `sfm.judgement.hypotheses`. It
 must also exceed that of the alternatives there, because a wrong parameter that all photographs share makes
 some of them look zoomed. A photograph that loses more than half of its points with either camera is left out.
 
@@ -24,9 +24,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import ALPHA
-from sfm.adjustment.hypotheses.hypotheses import adjust_image_points, best_explanation
-from sfm.adjustment.hypotheses.refit import log_likelihood_of
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -35,6 +32,9 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
+from sfm.judgement.hypotheses.alternatives import ALPHA
+from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
+from sfm.judgement.hypotheses.refit import log_likelihood_of
 from sfm.likelihood import log_likelihood, price_of
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths

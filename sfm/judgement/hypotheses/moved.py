@@ -19,15 +19,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.adjustment.hypotheses.columns import Columns
-from sfm.adjustment.hypotheses.families import (
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.judgement.hypotheses.columns import Columns
+from sfm.judgement.hypotheses.families import (
     BODY,
     MOVED,
     SHIFTED,
     Alternative,
     Family,
 )
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.score import (
     NONE,
     Gain,
     Reduced,
@@ -39,8 +41,6 @@ from sfm.adjustment.hypotheses.score import (
     log_probability,
     points_by_cameras,
 )
-from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.likelihood import price_of
 from sfm.network import sum_rows
 

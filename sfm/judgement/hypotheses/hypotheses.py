@@ -19,17 +19,23 @@ import numpy as np
 
 from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import (
+from sfm.adjustment.quality.statistics import level_of_single
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import FALSE_ALARM, MIN_LEAD
+from sfm.errors import GeometryError
+from sfm.judgement.hypotheses.alternatives import (
     ALPHA,
     alternatives_of,
     cameras_of_photographs,
     interiors,
     is_significant,
 )
-from sfm.adjustment.hypotheses.columns import columns_of
-from sfm.adjustment.hypotheses.families import GIVEN_SHAPE, HELD, Alternative, InteriorFamily
-from sfm.adjustment.hypotheses.moved import MIN_GROUP
-from sfm.adjustment.hypotheses.refit import (
+from sfm.judgement.hypotheses.columns import columns_of
+from sfm.judgement.hypotheses.families import GIVEN_SHAPE, HELD, Alternative, InteriorFamily
+from sfm.judgement.hypotheses.moved import MIN_GROUP
+from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
     precision_factor,
@@ -37,7 +43,7 @@ from sfm.adjustment.hypotheses.refit import (
     shifts_of,
     unchecked_assumptions,
 )
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.score import (
     NONE,
     Gain,
     Reduced,
@@ -45,12 +51,6 @@ from sfm.adjustment.hypotheses.score import (
     reduce_adjustment,
     squares_gained,
 )
-from sfm.adjustment.quality.statistics import level_of_single
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM, MIN_LEAD
-from sfm.errors import GeometryError
 from sfm.likelihood import price_of
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.reduced_network import reduce_network

@@ -8,7 +8,7 @@ Rejected image points have common causes, such as exchanged names or points at a
 the adjustment has separated them from the good image points. Here they are explained on their own, with the
 adjusted photographs. They take no part in the tests of alternatives, because a few of them would dominate.
 
-Source: the score test of `sfm.adjustment.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level;
+Source: the score test of `sfm.judgement.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level;
 Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
 """
 
@@ -20,8 +20,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.hypotheses.columns import Columns, shared_columns
-from sfm.adjustment.hypotheses.families import (
+from sfm.adjustment.quality.consistency import intersect_rays
+from sfm.adjustment.result import Adjustment
+from sfm.camera import project
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distortion.models import Role
+from sfm.distributions import chi2_isf, chi2_sf
+from sfm.judgement.hypotheses.columns import Columns, shared_columns
+from sfm.judgement.hypotheses.families import (
     FORMAT,
     GIVEN,
     HELD,
@@ -36,7 +42,7 @@ from sfm.adjustment.hypotheses.families import (
     ObjectFamily,
     format_columns,
 )
-from sfm.adjustment.hypotheses.moved import (
+from sfm.judgement.hypotheses.moved import (
     MIN_GROUP,
     Part,
     Pattern,
@@ -47,7 +53,7 @@ from sfm.adjustment.hypotheses.moved import (
     score_alternative,
     too_many_cameras,
 )
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.score import (
     NONE,
     Gain,
     Reduced,
@@ -58,12 +64,6 @@ from sfm.adjustment.hypotheses.score import (
     log_likelihood_gain,
     log_probability,
 )
-from sfm.adjustment.quality.consistency import intersect_rays
-from sfm.adjustment.result import Adjustment
-from sfm.camera import project
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf, chi2_sf
 from sfm.likelihood import price_of
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark

@@ -26,10 +26,10 @@ from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.engine.correlated import correlated_sum
-from sfm.adjustment.hypotheses.columns import Columns, shared_columns
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.distributions import f_sf
+from sfm.judgement.hypotheses.columns import Columns, shared_columns
 from sfm.network import rows_of, sum_rows
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.

@@ -22,23 +22,28 @@ import numpy as np
 from scipy.special import chndtrinc
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.hypotheses.alternatives import (
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
+from sfm.distributions import POWER
+from sfm.errors import GeometryError
+from sfm.judgement.hypotheses.alternatives import (
     cameras_of_photographs,
     count_alternatives,
     interior_parameters,
     needed_gain,
     photographs_among,
 )
-from sfm.adjustment.hypotheses.columns import Columns, columns_of
-from sfm.adjustment.hypotheses.families import (
+from sfm.judgement.hypotheses.columns import Columns, columns_of
+from sfm.judgement.hypotheses.families import (
     CAMERA_FAMILIES,
     HELD,
     STRAIN,
     Alternative,
     InteriorFamily,
 )
-from sfm.adjustment.hypotheses.moved import MIN_GROUP, too_many_cameras
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.moved import MIN_GROUP, too_many_cameras
+from sfm.judgement.hypotheses.score import (
     MIN_DETERMINED_SHARE,
     NONE,
     Gain,
@@ -48,11 +53,6 @@ from sfm.adjustment.hypotheses.score import (
     least_share,
     reduce_adjustment,
 )
-from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
-from sfm.distributions import POWER
-from sfm.errors import GeometryError
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark

@@ -1,6 +1,6 @@
 """Families of alternatives: a class for each, with the columns that it frees, its remark and displacements.
 
-A new family needs a class here, and a line in `sfm.adjustment.hypotheses.alternatives` that tests it.
+A new family needs a class here, and a line in `sfm.judgement.hypotheses.alternatives` that tests it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from sfm.adjustment.hypotheses.columns import (
+from sfm.adjustment.result import Adjustment
+from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.judgement.hypotheses.columns import (
     BENDING_PLACES,
     CAMERA_PLACES,
     STRAIN_PLACES,
@@ -22,15 +24,13 @@ from sfm.adjustment.hypotheses.columns import (
     object_fields,
     shared_columns,
 )
-from sfm.adjustment.hypotheses.score import (
+from sfm.judgement.hypotheses.score import (
     Gain,
     Spread,
     log_likelihood_gain,
     log_probability,
     squares_gained,
 )
-from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.remarks.remark import Quantity
 from sfm.similarity import without_motions
 
