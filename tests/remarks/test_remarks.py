@@ -208,13 +208,15 @@ def test_alternatives_that_shift_coordinates_have_one_grade() -> None:
         assert severity == ["note", "warning", "warning", "error", "error"], kind
 
 
-def test_every_kind_is_made_somewhere() -> None:
+def test_every_kind_is_made_somewhere_and_only_kinds_are_made() -> None:
     source = "\n".join(
         path.read_text(encoding="utf-8")
         for path in (ROOT / "sfm").rglob("*.py")
         if path.parent.name != "catalogue"
     )
     assert [kind for kind in (*KINDS, *TESTS) if f'"{kind}"' not in source] == []
+    made = set(re.findall(r'\bremark\(\s*"(\w+)"', source))
+    assert made - KINDS.keys() - TESTS.keys() == set()
 
 
 def test_a_test_is_a_row_of_the_table_and_no_remark() -> None:

@@ -208,7 +208,7 @@ def test_given_mounts_give_the_scale(sigma: float, tmp_path: Path) -> None:
     assert found == pytest.approx(exact, rel=0.2)  # turned, so that its box is another
     (mount,) = findings_of(result).rigs[0].mounts
     assert mount.base == pytest.approx(np.linalg.norm(X), abs=1e-12 if sigma == 0 else 4 * sigma)
-    (said,) = [one for one in result.remarks if one.kind == "scale_unchecked"]
+    (said,) = of_kind(result.tests, "scale_unchecked")
     assert said.names("given") == ("the mount of camera 2",)
     kinds = [kind.kind for kind in findings_of(result).given.kinds]
     assert kinds == ([] if sigma == 0 else ["mount"])

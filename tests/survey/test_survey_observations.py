@@ -34,6 +34,7 @@ from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
+from sfm.remarks.remark import of_kind
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
 from sfm.result import SurveyResult
@@ -505,7 +506,7 @@ def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path)
     assert "additive constant" in (tmp_path / "out" / "report.html").read_text("utf-8")
     (kept,) = result.network.observations
     assert len(kept.value) == 6
-    (said,) = [one for one in result.remarks if one.kind == "scale_unchecked"]
+    (said,) = of_kind(result.tests, "scale_unchecked")
     assert said.names("given") == ("the distances with additive constant tape",)
     order = [network.points.index(name) for name in result.network.points]
     sizes = [np.linalg.norm(X - X.mean(axis=0)) for X in (result.estimate.points, truth.points[order])]

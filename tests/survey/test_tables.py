@@ -174,10 +174,13 @@ def test_repeated_image_points_do_not_refuse_a_survey() -> None:
     result = run_survey(survey_of(_repeated(network, [3, 20, 40], [0.0, 0.15, 5.0]), truth))
     rows, (image, point) = len(network.image_points), (network.image_points.image, network.image_points.point)
     assert len(result.adjustment.rejected) == rows - 1 and result.unused_image_points == 2
-    for k, kind in ((3, "identical"), (20, "averaged"), (40, "contradicting")):
-        name = f"{network.points[point[k]]} in {network.images[image[k]]}"
-        (found,) = of_kind(result.remarks, f"image_points_{kind}")
-        assert found.names("image_points") == (name,)
+    names = [f"{network.points[point[k]]} in {network.images[image[k]]}" for k in (3, 20, 40)]
+    (identical,) = of_kind(result.remarks, "rows_identical")
+    (averaged,) = of_kind(result.tests, "image_points_averaged")
+    (contradicting,) = of_kind(result.remarks, "image_points_contradicting")
+    assert names[0] in str(identical.names("rows"))
+    assert averaged.names("image_points") == (names[1],)
+    assert contradicting.names("image_points") == (names[2],)
     (left,) = result.left_out
     assert (
         left.point == f"{network.points[point[40]]} in {network.images[image[40]]}" and left.image_points == 2

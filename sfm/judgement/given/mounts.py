@@ -103,12 +103,15 @@ def judge_mount_scales(
     else:
         k = int(np.argmax(np.abs(model.v) / np.sqrt(np.diagonal(S))))
         off, sigma, contradicting = model.v[k], np.sqrt(S[k, k]), list(range(len(given)))
-        others = [
-            name for name, some in (("bars", network.scale_bars), ("control", network.control)) if len(some)
-        ]
+        sources = (
+            ("bars", network.scale_bars),
+            ("control", network.control),
+            ("centres", network.exterior),
+        )
+        others = [name for name, values in sources if len(values)]
         others += [one.name for one in network.observations]
     said = remark(
-        "mounts_scale_contradicted",
+        "scale_contradicted",
         cameras=[cameras[a].name for a in given.camera[contradicting]],
         others=others,
         **numbers_of_scale(float(off), float(sigma)),

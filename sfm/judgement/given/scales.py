@@ -224,7 +224,10 @@ def _contradicting_scales(
         agreeing = None
     by = numbers_of_scale(abs(off), sigma)
     if plates:
-        given = [one if one in plates else f"bar {one}" for one in (names[k] for k in which)]
+        given = [
+            one if one in plates or one.startswith(TABLE) else f"bar {one}"
+            for one in (names[k] for k in which)
+        ]
         others = [names[k] for k in every if k not in which] or None
         said = remark("plate_sizes_contradict", given=given, others=others, **by)
     else:

@@ -5,7 +5,7 @@ shows. The free network has the shape that the image points determine alone, wit
 differ from it by v, with the covariance network + stated. The parameters A, which only given values
 determine, are removed from v: a scale for bars, a similarity for points. In the remainder every error of a
 given value is tested, and explanations are compared. Either some values are wrong, or all standard deviations
-are too small, by at most an order of magnitude. `given_points` adds explanations by names and handedness.
+are too small, by at most an order of magnitude. `points` adds explanations by names and handedness.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (tests, external
 reliability); Schwarz (1978), Ann. Stat. 6(2) (the cost of a parameter); Patterson and Thompson (1971),

@@ -204,6 +204,6 @@ ROWS = (
         "slight_effect",
         "other assumptions",
         "{cause}",
-        "fits better, but shifts the result by up to {shift} standard deviations only",
+        "an error that shifts the result by up to {shift} standard deviations only",
     ),
 )

@@ -122,7 +122,7 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     matched = model.matched
     network, mounts = replace(matched.network, moment=moment), matched.estimate.mounts
     if mounts is not None:
-        together = np.bincount(moment[matched.estimate.oriented])
+        together = np.bincount(moment[matched.estimate.oriented], minlength=int(moment.max()) + 1)
         paired = np.isin(np.arange(len(mounts.rig)), network.camera[together[moment] > 1])
         mounts = Mounts(
             np.where(paired[:, None], mounts.position, 0.0),
@@ -147,7 +147,14 @@ def _evidence_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> 
     count = np.bincount(of_point, minlength=int(moment.max()) + 1)
     further = np.setdiff1d(moment, moment if earlier is None else earlier)
     price = sum(price_of(POSE, int(count[k])) for k in further)
-    return _log_likelihood(after, POSE * len(further)) - _log_likelihood(before) - price
+    freed = POSE * len(further) + _free_of_mounts(after) - _free_of_mounts(before)
+    return _log_likelihood(after, freed) - _log_likelihood(before) - price
+
+
+def _free_of_mounts(solved: SolvedSurvey) -> int:
+    """Return the number of free parameters of mounts."""
+    mounts = solved.adjustment.estimate.mounts
+    return 0 if mounts is None else int(mounts.free.sum())
 
 
 def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:

@@ -393,6 +393,8 @@ def _settle_with_given(
         estimate = _free_network_in_frame(estimate, free.whole, task, given)
     estimate = scale_to_bars(task.network, estimate, task.datum)
     gross: tuple[Remark, ...] = ()
+    if reference is None and (task.network.observations or len(mounts)):
+        gross = (remark("given_not_judged", of=("observations",)),)
     if free is not None and reference is not None and (task.network.observations or len(mounts)):
         task, mounts, gross = _with_confirmed_observations(task, free, reference, estimate, mounts)
         if gross and task.datum.kind != "control":

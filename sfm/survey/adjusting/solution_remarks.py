@@ -279,7 +279,7 @@ def remarks_on_held_c(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tupl
         held: names of the cameras whose c was held.
         causes: remarks on causes of the residuals.
     """
-    if not held or not causes:
+    if not held or all(one.severity == "note" for one in causes):
         return ()
     return (remark("c_held_contradicted", cameras=held),)
 
