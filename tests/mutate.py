@@ -47,7 +47,7 @@ COMPILING = 120.0  # s beside it, for kernels that a mutation makes compile agai
 Ended = Literal["killed", "survived", "timed out"]
 ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that check it
     **{
-        f"sfm/judgement/hypotheses/{module}.py": tuple(f"tests/adjustment/test_{name}.py" for name in names)
+        f"sfm/judgement/hypotheses/{module}.py": tuple(f"tests/judgement/test_{name}.py" for name in names)
         for module, names in (
             ("alternatives", ("alternatives", "unchecked_assumptions", "rejections", "hypotheses")),
             ("columns", ("columns", "alternatives", "hypotheses")),

@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from sfm.conventions import METRES, SWELLING, UNITS, find_unit, finer_unit, rotation_from_vector
+from sfm.conventions import METRES, UNITS, find_unit, finer_unit, rotation_from_vector
 from sfm.survey.inputs.settings import Unit
 from tests.synthetic import seed_of
 
@@ -43,10 +43,6 @@ def test_a_factor_is_that_of_a_unit_where_the_rest_is_no_contradiction(
 ) -> None:
     found = find_unit(lengths, rest)
     assert (found and found.factor) == (factor and pytest.approx(factor))
-
-
-def test_paper_swells_by_one_to_two_permille() -> None:
-    assert SWELLING == 0.002
 
 
 def test_nanometres_are_a_unit_of_surveys_and_plans() -> None:

@@ -215,7 +215,10 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
     }
     right, mirrored = len(result.adjustment.network.images), len(single) + sum(map(len, groups))
     decided: dict[str, tuple[str, ...]] = {}
-    if all(one.kind != "handedness_unchecked" for one in result.stage_remarks):
+    unknown = result.automatic_points or any(
+        one.kind == "handedness_unchecked" for one in result.stage_remarks
+    )
+    if not unknown:
         decided = {"decided_by": ("known handedness",)}
     elif binomial_sf(right - 1, right + mirrored, 0.5) < result.adjustment.false_alarm:  # a sign test
         decided = {"decided_by": ("most photographs",)}

@@ -33,11 +33,6 @@ def stub(**parts: Any) -> Any:
     return SimpleNamespace(**parts)
 
 
-def test_limits_of_what_is_reported() -> None:
-    assert statistics.MIN_REPORTED_CORRELATION == 0.9 and statistics.MIN_EXCESS_RATIO == 2.0
-    assert numbers.MIN_CHECKED_REDUNDANCY == 1e-6  # the rounding of normal equations is 1e-8
-
-
 def test_far_more_than_expected_is_twice_and_not_by_chance() -> None:
     def far(beyond: int, tested: int) -> bool:
         return CoordinateTest(0.001, 3.29, np.zeros((0, 2)), tested, beyond).far_more

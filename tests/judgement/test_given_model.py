@@ -22,16 +22,6 @@ from tests.synthetic import seed_of
 FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
 
 
-def test_thresholds_are_those_stated() -> None:
-    """Limits of effort and of rounding; the others decide tests in this folder."""
-    assert given_values.MAX_SETS == 2000 and given_points.MAX_TRIPLES == 300
-    assert given_points.MAX_STEPS == 20
-    assert given_names.TRIANGLES == 20 and given_names.MAX_SIMILAR == 60
-    assert given_names.MAX_ASSIGNMENTS == 8
-    assert given_values.RANK == 1e-9  # of double precision 2e-16, whose root is 1.5e-8
-    assert given_values.FACTORS[[0, -1]].tolist() == [1.0, 1e6] and len(given_values.FACTORS) == 241
-
-
 def bars(*v: float, stated: float = 1.0, network: float = 0.0, redundancy: int = 500) -> GivenModel:
     """Return the model of bars with these differences, of variances stated and network."""
     n = len(v)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sfm.conventions import SWELLING
+from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import scales as given_scales
@@ -184,11 +185,11 @@ def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:
 
 
 def test_the_joint_covariance_of_what_is_judged_takes_72_megabytes() -> None:
-    assert 50e6 < 8 * (3 * given.MAX_PLACES) ** 2 < 100e6
+    assert 50e6 < 8 * (3 * free_network.MAX_PLACES) ** 2 < 100e6
 
 
 def test_of_many_points_some_are_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(given, "MAX_PLACES", 10)
+    monkeypatch.setattr(free_network, "MAX_PLACES", 10)
     network, truth = make_network(seed_of("many given"), images=8, points=30)
     control = KnownPoints.from_arrays([str(k + 1) for k in range(30)], truth.points, 1e-3)
     result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))

@@ -18,7 +18,6 @@ from sfm.result import SurveyResult
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.checks.copies import (
     MIN_CORRELATION,
-    SAME_PLACE,
     find_copies,
     without_copies,
 )
@@ -231,7 +230,6 @@ def test_photographs_whose_errors_correlate(rho: float) -> None:
         assert [(one.image, *one.reason.names("original")) for one in result.failed] == [
             ("image 6", "image 3")
         ]
-    assert SAME_PLACE == 1e-3
 
 
 def test_photographs_of_one_place_are_named_as_such() -> None:

@@ -26,6 +26,8 @@ from sfm.network import Network, values_of
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
 from sfm.similarity import Similarity
 
+MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged
+
 
 @dataclass(frozen=True)
 class FreeNetwork:
@@ -137,8 +139,16 @@ class Reference:
 
 
 def confirmed(network: Network) -> tuple[Kind, ...]:
-    """Return the given values that are judged before all other observations."""
-    return network.control, network.exterior, network.scale_bars
+    """Return the given values that are judged before all others; of very many control points only some."""
+    return tuple(
+        kind.select(np.arange(len(kind))[:: every_of(len(kind))])
+        for kind in (network.control, network.exterior, network.scale_bars)
+    )
+
+
+def every_of(count: int) -> int:
+    """Return the step by which given values are thinned if there are more than MAX_PLACES."""
+    return max(1, -(-count // MAX_PLACES))
 
 
 def _columns(cofactor: FloatArray) -> FloatArray:

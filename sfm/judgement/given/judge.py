@@ -17,7 +17,7 @@ from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.free_network import FreeNetwork, every_of
 from sfm.judgement.given.groups import (
     Group,
     Places,
@@ -35,7 +35,6 @@ from sfm.result import GivenTest
 from sfm.similarity import Similarity
 
 TINY = float(np.finfo(float).tiny)
-MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged
 
 
 @dataclass(frozen=True)
@@ -98,10 +97,10 @@ def _places(network: Network, of_image_points: FreeNetwork, datum: Datum) -> Pla
     photograph = {name: i for i, name in enumerate(free.network.images)}
     ends = [network.points[j] for j in np.unique(np.concatenate([bars.start, bars.end]))]
     some = [network.points[j] for j in control.point]
-    step = max(1, -(-len(some) // MAX_PLACES))
+    step = every_of(len(some))
     names = [name for name in dict.fromkeys([*ends, *some[::step]]) if name in number]
     seen = network.exterior if datum.kind == "control" else ExteriorObservations()
-    step = max(1, -(-len(seen) // MAX_PLACES))
+    step = every_of(len(seen))
     images = [name for name in (network.images[i] for i in seen.image[::step]) if name in photograph]
     if not names and not images:
         return None

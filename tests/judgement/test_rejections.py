@@ -53,12 +53,6 @@ def with_rejected(a: Adjustment, xy: dict[int, FloatArray]) -> Adjustment:
     return replace(a, network=network, rejected=rejected, residuals=residuals)
 
 
-def test_thresholds_are_those_stated() -> None:
-    assert rejections.MIN_EXCHANGED == 2  # once is an accident
-    assert rejections.MIN_RAYS == 3  # two nearly meet along an epipolar line
-    assert rejections.MAX_PREDICTION_RATIO == 2.0  # as large as that of the measurement
-
-
 def test_nothing_is_explained_where_nothing_was_rejected_or_known(clean: Adjustment) -> None:
     assert explain_rejections(clean) == ()
     rows = [row_of(clean, 3, i) for i in (5, 6, 7)]

@@ -43,23 +43,6 @@ from tests.synthetic import make_network, observed_anew, seed_of
 NO_POINTS = np.zeros(0, dtype=np.int64)
 
 
-def test_thresholds_of_search_and_rounding() -> None:
-    """Limits of effort: a larger one finds the same or more at more cost."""
-    assert (moved.MAX_SPLITS, moved.MAX_MOVED, families.CELLS) == (12, 60, 5)
-    assert (patterns.MAX_RUNS, moved.MAX_PRODUCTS) == (60, 2e11)
-    assert (patterns.ROUNDS, patterns.STARTS, refit.ROUNDS) == (20, 8, 6)
-    assert score.MAX_TERMS == 10_000  # the series of the tail ends after a few hundred of usual redundancies
-    assert score.SMALLEST_LOG == -600.0  # a float ends at -745
-    assert columns.SMALL_MOVE_PX == 0.01  # where distortion of 40 px is linear to 1e-4 of it
-    assert refit.LAST_GAIN == 0.01  # of a gain of which 9 and more count
-    assert hypotheses.MAX_IMAGE_POINTS == 6_000 and hypotheses.MAX_PHOTOGRAPHS == 300  # tested in seconds
-    assert hypotheses.MAX_CAUSES == 2
-    assert pytest.approx(np.log(100)) == hypotheses.MIN_LEAD
-    assert hypotheses.MIN_NAMED_SIGMAS == 1.0  # standard deviation: less is what a user was promised
-    assert [one.places for one in families.CAMERA_FAMILIES] == [(0,), (0, 1, 2, 3), tuple(range(9))]
-    assert (columns.STRAIN, columns.BENDING) == (5, 18)  # 6 - 1 of a symmetric matrix, 3 times 6 products
-
-
 def test_a_gain_is_that_of_determined_parameters() -> None:
     found = gain_of(np.diag([4.0, 2.0]), np.array([2.0, 3.0]), np.array([8.0, 8.0]))
     assert (found.value, found.rank) == (pytest.approx(1.0 + 4.5), 2)
@@ -710,7 +693,6 @@ def test_cells_divide_the_format() -> None:
 def test_the_level_is_shared_by_rows_and_lowered_by_the_search() -> None:
     limit = np.log(0.01 / 20) - 0.7
     one = made(Gain(20.0, 2, np.zeros(2)))
-    assert alternatives.ALPHA == 0.01
     assert is_significant(replace(one, log_p=limit - 0.5), 20)
     assert not is_significant(replace(one, log_p=limit + 0.5), 20)
 
