@@ -554,14 +554,16 @@ def test_control_gives_a_model_its_frame_and_what_is_wrong_of_it_is_taken_out(
     survey = _survey(tmp_path, '[datum]\nkind = "control"\n[control]\nfile = "control.csv"\n')
     refine(tmp_path / "model", tmp_path, out=tmp_path / "out", fix="f,cx,cy,k1", survey=survey)
     told = capsys.readouterr().out
-    assert "warning: Control is not in the result: 99." in told
+    assert "warning: Of the control points, 99 is not in the result." in told
     assert "target 12" in told and "5 control points" in told
     found, sigma = _targets_of(tmp_path / "out")
     assert (np.abs(found - truth) < 4 * sigma).all() and sigma.max() < 0.5
     after = pycolmap.Reconstruction(str(tmp_path / "out"))
     points = frame.apply(_scene(True)[1].points)
     assert np.median([np.linalg.norm(after.point3D(AWAY + 2 * j).xyz - p) for j, p in enumerate(points)]) < 1
-    with pytest.raises(GeometryError, match="nothing gives the model its scale; Scale bars have an end"):
+    with pytest.raises(
+        GeometryError, match="nothing gives the model its scale; Of the scale bars, 3 - 98 is not"
+    ):
         bar = '[[scale_bar]]\nfrom = "3"\nto = "98"\nlength = 1.0\nsigma = 0.1\n'
         refine(tmp_path / "model", tmp_path, out=tmp_path / "again", survey=_survey(tmp_path, bar))
     assert not (tmp_path / "again").exists()
