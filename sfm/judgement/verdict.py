@@ -387,6 +387,7 @@ def given_remarks(
         *(
             remark("given_tested", of=one.what, chi2=one.statistic, dof=one.dof, p=one.probability)
             for one in result.given_tests
+            if one.dof  # else nothing was tested
         ),
     )
 

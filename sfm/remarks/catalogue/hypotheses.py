@@ -200,6 +200,7 @@ ROWS = (
         "Measure the points, or state {sigma} as standard deviation of their coordinates (plate_sigma of a "
         "plate).",
         short="control points of a different shape",
+        explains=("given_not_exact", "sigma0_high"),
     ),
     Kind(
         "rig_contradicted",
@@ -209,7 +210,7 @@ ROWS = (
         "{distance} and {angle}, {shift} standard deviations: {photographs}.",
         "the camera was moved on its rig, a wrong mount was given, or rig or object moved between cameras "
         "that were not triggered together",
-        "Check the mount that was given; list the photographs from each place of the camera as blocks of the "
+        "Check mounts that are given; list the photographs from each place of the camera as blocks of the "
         "rig, correct their moments, or leave single ones out.",
         short="a camera that is not where its rig places it",
     ),
