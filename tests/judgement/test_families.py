@@ -260,7 +260,7 @@ def choice(
     monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: SimpleNamespace(redundancy=200))
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
     monkeypatch.setattr(hypotheses, "refit", adjusted)
-    of_ten: Any = SimpleNamespace(network=SimpleNamespace(images=("photograph",) * 10), datum="free")
+    of_ten: Any = SimpleNamespace(network=SimpleNamespace(images=("photograph",) * 10))
     return hypotheses._best(of_ten, before)
 
 

@@ -379,7 +379,7 @@ def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hypotheses, "refit", lambda _, one, *__, most: tried.append((one, most)))
     monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda *_: SimpleNamespace(redundancy=1))
     for photographs, least, most in ((20, 24, np.inf), (300, 1, 4)):  # the work on many is bounded
-        plain = SimpleNamespace(network=SimpleNamespace(images=("a",) * photographs), datum="free")
+        plain = SimpleNamespace(network=SimpleNamespace(images=("a",) * photographs))
         tried.clear()
         assert hypotheses._best(plain, ()) is None  # type: ignore[arg-type]
         assert [one for one, _ in tried] == [*every[:2], *every[5:7]]
@@ -572,7 +572,7 @@ def test_a_parameter_of_all_photographs_is_tried_with_what_its_errors_in_common_
     monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
     monkeypatch.setattr(hypotheses, "is_significant", lambda one, count: True)
     monkeypatch.setattr(hypotheses, "reported", refitted)
-    plain = SimpleNamespace(network=SimpleNamespace(images=("a",)), datum="free")
+    plain = SimpleNamespace(network=SimpleNamespace(images=("a",)))
     with pytest.raises(StopIteration):
         hypotheses._best(plain, ())  # type: ignore[arg-type]
 

@@ -175,8 +175,9 @@ class _Judge:
         A unit also changes the standard deviations. It explains nothing if these alone do.
         """
         found = []
-        for mistake in dict.fromkeys(mistake for kind in kinds for mistake in kind.mistakes()):
-            mended = [kind.mistakes().get(mistake, kind) for kind in kinds]
+        corrected = [kind.mistakes() for kind in kinds]
+        for mistake in dict.fromkeys(mistake for mistakes in corrected for mistake in mistakes):
+            mended = [by.get(mistake, kind) for by, kind in zip(corrected, kinds, strict=True)]
             looser = [
                 kind.with_sigma(other.sigma)
                 for kind, other in zip(kinds, mended, strict=True)

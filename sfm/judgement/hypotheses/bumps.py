@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm.adjustment.covariance import JointOnDemand, marginal_of
 from sfm.adjustment.engine.collinearity import residuals
@@ -191,7 +192,7 @@ def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray
 
     def difference(x: FloatArray) -> FloatArray:
         (t, R), (t_usual, R_usual) = relative(x, 0), relative(x, 2)
-        return np.concatenate([t - t_usual, _vector(R @ R_usual.T)])
+        return np.concatenate([t - t_usual, Rotation.from_matrix(R @ R_usual.T).as_rotvec()])
 
     size = float(np.linalg.norm(start[:3] - start[6:9]))
     steps = STEP * np.tile(np.r_[np.full(3, size), np.ones(3)], 4)
@@ -199,14 +200,6 @@ def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray
         (difference(start + step) - difference(start - step)) / (2 * step.sum()) for step in np.diag(steps)
     ]
     return difference(start), np.array(rows).T
-
-
-def _vector(R: FloatArray) -> FloatArray:
-    """Return the rotation vector of a rotation, rad, (3,)."""
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, (np.trace(R) - 1) / 2))
-    return axis * (angle / sine if sine > 0 else 1.0)
 
 
 def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:

@@ -115,11 +115,12 @@ def judge_alternatives(
         return JudgedAssumptions(unchecked=(remark("too_many_to_test", photographs=photographs),))
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
-    found = _judge_free(free_network(final), unit, bodies, without)
+    free = free_network(final)
+    found = _judge_free(free, unit, bodies, without)
     if not calibration:
         return found
     try:
-        cause = cause_in_calibration(final)
+        cause = cause_in_calibration(final, free)
     except np.linalg.LinAlgError:
         return found
     if cause is not None:
@@ -176,7 +177,7 @@ def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
     )
 
 
-def cause_in_calibration(final: Adjustment) -> Cause | None:
+def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | None:
     """Return the cause that given points reveal: another camera in some photographs, or strained control.
 
     Image points alone reveal little about the cameras of a few photographs, or of many photographs of a
@@ -184,11 +185,12 @@ def cause_in_calibration(final: Adjustment) -> Cause | None:
 
     Args:
         final: finished adjustment in which most points are given.
+        free: adjustment of its image points alone, see `free_network`; None if they determine no network.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
-    cause = _best(final, ())
+    cause = _best(final, (), beside=() if free is None else _with_free_shape(final, free))
     if cause is None or (
         cause.refit.shift < MIN_NAMED_SIGMAS and cause.alternative.kind != "shape_of_control"
     ):
@@ -250,11 +252,17 @@ def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cau
     )  # an unknown shift (NaN) counts as large
 
 
-def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArray] = ()) -> Cause | None:
+def _best(
+    plain: Adjustment,
+    causes: tuple[Cause, ...],
+    bodies: Sequence[IntArray] = (),
+    *,
+    beside: Sequence[tuple[Alternative, Refit]] = (),
+) -> Cause | None:
     """Return the accepted alternative, in addition to known causes, that gives the best adjustment.
 
     The alternatives with most evidence are adjusted, because the score test is linear: for a large error it
-    favours the alternative with most parameters.
+    favours the alternative with most parameters. Those of `beside` are adjusted already.
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(one.alternative, one.refit.beta) for one in causes]
@@ -281,8 +289,6 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
         (one, refit(plain, one, current, before, most=int(MAX_WORK / work)))
         for one in reported("alternatives adjusted", to_try, len(to_try))
     ]
-    if plain.datum == "control":
-        tried += _with_free_shape(plain)
     holding = [
         (
             min(
@@ -293,7 +299,7 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
             one,
             found,
         )
-        for one, found in tried
+        for one, found in (*tried, *beside)
         if found is not None
     ]
     most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
@@ -315,20 +321,22 @@ def _best(plain: Adjustment, causes: tuple[Cause, ...], bodies: Sequence[IntArra
     return Cause(best, adjusted, near)
 
 
-def _with_free_shape(held: Adjustment) -> list[tuple[Alternative, Refit]]:
+def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternative, Refit]]:
     """Return the alternative that given points have another shape; none if they do not determine one.
 
     The image points alone state the shape. All its coordinates are parameters.
 
     held: adjustment with control.
+    free: adjustment of its image points alone, or of a sample of them.
     """
-    free = adjust_image_points(held.network, held.estimate, held.rejected, held.image_sigma_factor)
-    if free is not None and len(free.rejected) < len(held.rejected):
+    if len(free.rejected) < len(held.rejected):
         start, factor = held.estimate, held.image_sigma_factor
         sample = adjust_image_points(held.network, start, held.rejected, factor, datum="control")
-        free, held = (None, held) if sample is None else (free, sample)
+        if sample is None:
+            return []
+        held = sample
     given = held.network.control.complete
-    if free is None or len(given) < MIN_SHAPE:
+    if len(given) < MIN_SHAPE:
         return []
     number = {name: j for j, name in enumerate(free.network.points)}
     X = free.estimate.points[[number[held.network.points[j]] for j in given.point]]

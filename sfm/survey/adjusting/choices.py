@@ -17,11 +17,16 @@ from sfm.camera import base_name
 from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.alternatives import ALPHA
-from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
+from sfm.likelihood import price_of
 from sfm.network import Mounts
 from sfm.remarks.remark import of_kind, remark
 from sfm.runtime.progress import report_step
-from sfm.survey.adjusting.solution import SolvedSurvey, SurveyModel, solve_model
+from sfm.survey.adjusting.solution import (
+    SolvedSurvey,
+    SurveyModel,
+    log_likelihood_of_all,
+    solve_model,
+)
 from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
@@ -169,11 +174,9 @@ def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
 
 
 def _log_likelihood(solved: SolvedSurvey, freed: int = 0) -> float:
-    """Return ln of the likelihood of all image points of a survey, see `log_likelihood_of`."""
-    a, matched = solved.adjustment, solved.model.matched
-    areas = areas_of_photographs(matched.network, matched.estimate.cameras)
-    squares = a.sigma0_px**2 * a.redundancy
-    return log_likelihood(squares, solved.accepted, areas, redundancy=a.redundancy + freed)
+    """Return ln of the likelihood of all image points of a survey, see `log_likelihood_of_all`."""
+    matched = solved.model.matched
+    return log_likelihood_of_all(solved.adjustment, matched.network, matched.estimate, solved.accepted, freed)
 
 
 def _report_varying_c(_: SolvedSurvey, zoomed: SolvedSurvey) -> SolvedSurvey:

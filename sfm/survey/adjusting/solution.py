@@ -199,6 +199,23 @@ class _Prepared:
     remarks: tuple[Remark, ...]  # on observed exterior orientation and on freed parameters
 
 
+def log_likelihood_of_all(
+    a: Adjustment, network: Network, estimate: Estimate, accepted: BoolArray, freed: int = 0
+) -> float:
+    """Return ln of the likelihood of all image points of a survey; those outside the adjustment are misfits.
+
+    Args:
+        a: adjustment of a part of the network.
+        network: the whole network.
+        estimate: has the cameras of its photographs.
+        accepted: image points of the whole network that the adjustment accepted, (k,).
+        freed: number of unknowns that adjustments it is compared with lack.
+    """
+    areas = areas_of_photographs(network, estimate.cameras)
+    squares = a.sigma0_px**2 * a.redundancy
+    return log_likelihood(squares, accepted, areas, redundancy=a.redundancy + freed)
+
+
 @dataclass(frozen=True)
 class _Final:
     """A final adjustment, and the repeated adjustment before it."""
@@ -213,10 +230,10 @@ class _Final:
     @property
     def log_likelihood(self) -> float:
         """Ln of the likelihood of all image points, of which those outside the adjustment are misfits."""
-        a, network = self.adjustment, self.settled.task.network
-        areas = areas_of_photographs(network, self.settled.whole.cameras)
-        fits = accepted_image_points(network, a, self.settled.images, self.settled.points)
-        return log_likelihood(a.sigma0_px**2 * a.redundancy, fits, areas, redundancy=a.redundancy)
+        a, settled = self.adjustment, self.settled
+        network = settled.task.network
+        accepted = accepted_image_points(network, a, settled.images, settled.points)
+        return log_likelihood_of_all(a, network, settled.whole, accepted)
 
 
 def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) -> _Prepared:
