@@ -13,10 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.font_manager import findfont
+from matplotlib.ft2font import FT2Font
 
 import sfm.report.figures.plot_process as drawing
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.report.figures import plots
 from sfm.report.figures.plot_data import PlotData
 from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
 from sfm.report.output import plot_data
@@ -48,6 +51,14 @@ def process(capfd: pytest.CaptureFixture[str]) -> Iterator[PlotProcess]:
         yield found
     assert found._process.returncode is not None
     assert capfd.readouterr().err == ""
+
+
+def test_powers_of_ten_in_units_are_drawn_and_missing_characters_are_not() -> None:
+    """Before, an axis was labelled "sigma [× 10?? network units]"."""
+    glyphs = FT2Font(findfont("DejaVu Sans")).get_charmap()
+    unit = "× 10⁻⁶ network units, 10⁻¹²³⁴⁵⁷⁸⁹⁰"
+    assert plots._plain(unit) == unit and {ord(c) for c in unit} <= set(glyphs)
+    assert plots._plain("面 $x$") == r"? \$x\$"
 
 
 def test_plots_are_drawn_elsewhere_and_the_same(

@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import SUPERSCRIPTS, AnyArray, FloatArray, IntArray
 from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"
@@ -438,5 +438,7 @@ def _clipped(name: str) -> str:
 
 def _plain(text: str) -> str:
     """Return text that matplotlib draws literally: no mathematics, no characters missing in its font."""
-    shown = "".join(c if c.isprintable() and ord(c) < 0x250 else "?" for c in text)
+    powers = SUPERSCRIPTS.values()  # of ten, in units
+    drawn = (c.isprintable() and (ord(c) < 0x250 or ord(c) in powers) for c in text)
+    shown = "".join(c if on else "?" for c, on in zip(text, drawn, strict=True))
     return shown.replace("$", r"\$")
