@@ -2,34 +2,43 @@
 
     python -m tests.survey.judging [FIRST] [GROUP ...]
 
-runs surveys from scratch on the networks of `tests.survey.faults` from number FIRST on, groups right,
-ordinary, faults, rowless, and prints for each kind how often it is called bad or fair, and which is named.
-A result is wrong where a coordinate is more than 5 of its standard deviations from the truth. Its fault can
-be detected where a test that knew it would find it with 80 % probability at the level 0.001: where v'Pv of
-the same survey without noise, in which the fault is all that is left, exceeds Baarda's 17.07. It is found
-surely where a test of as many unknowns as it has, one among a thousand that share that level, finds it with
-99.9 %: below, chance decides whether anything is said.
+runs surveys from scratch on the networks of `tests.survey.faults` and `tests.survey.equipped` from number
+FIRST on, groups right, ordinary, faults, rowless, equipped, and prints for each kind how often it is called
+bad or fair, and which is named. A result is wrong where a coordinate is more than 5 of its standard
+deviations from the truth. Its fault can be detected where a test that knew it would find it with 80 %
+probability at the level 0.001: where v'Pv of the same survey without noise, in which the fault is all that
+is left, exceeds Baarda's 17.07. It is found surely where a test of as many unknowns as it has, one among a
+thousand that share that level, finds it with 99.9 %: below, chance decides whether anything is said. Mistakes
+of equipment are large: all count as found surely, and the right cause is a remark of the right kind that
+names what is wrong.
 """
 
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray
 from sfm.errors import KolinearError
+from sfm.network import Network
 from sfm.pipeline import run_survey
-from sfm.remarks.catalogue import hypotheses
+from sfm.remarks.catalogue import given_values, hypotheses
+from sfm.remarks.remark import of_kind
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
+from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
+from tests.survey.equipped import EQUIPPED, equipped
 from tests.survey.faults import FAULTS, RIGHT, ROWLESS, Planted, planted
 from tests.surveys import survey_of
 
@@ -45,6 +54,7 @@ UNCHECKED = {
     "calibrated_from_few",
     *("assumptions_untested", "photographs_untested", "too_many_to_test"),
 }
+OF_GIVEN = {row.name for row in given_values.ROWS}
 CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED | {"camera_per_photograph"}
 ALIKE = {  # kinds that say the same of a fault
     "two_places": "points_moved",
@@ -56,6 +66,7 @@ GROUPS = {
     "ordinary": (["nothing"], 200),
     "faults": (list(FAULTS), 15),
     "rowless": (list(ROWLESS), 10),
+    "equipped": (list(EQUIPPED), 20),
 }
 
 
@@ -110,20 +121,58 @@ def outcome_of(kind: str, number: int) -> Outcome:
     named = tuple(remark.kind for remark in verdict.remarks if remark.kind in CAUSES)
     serious = [remark.kind for remark in verdict.remarks if remark.severity != "note"]
     return Outcome(
-        *(kind, number, one.cause, verdict.level, _over_sigma(result, one), *_detectable(one)),
+        *(kind, number, one.cause, verdict.level),
+        *(_over_sigma(result, one.network, one.states), *_detectable(one)),
         *(named, serious[0] if serious else ""),
         any(one.kind in UNCHECKED for one in (*verdict.remarks, *verdict.tests)),
         tuple(kind for one in verdict.remarks if one.kind in CAUSES for kind in one.names("instead")),
     )
 
 
-def _over_sigma(result: SurveyResult, one: Planted) -> float:
-    """Return the largest error of a coordinate in its standard deviations, by the nearest state."""
+def equipped_outcome_of(kind: str, number: int) -> Outcome:
+    """Run the survey of equipment of a kind and a number from its files and compare it with the truth.
+
+    The cause counts as named if a remark of one of the right kinds names what is wrong.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path, scene = equipped(kind, number, Path(folder))
+        cause = next(iter(scene.causes), "")
+        try:
+            result = run_survey(read_survey(path))
+        except KolinearError as error:
+            return Outcome(kind, number, cause, "none", np.nan, True, True, (), str(error))
+    verdict = findings_of(result).verdict
+    serious = [one for one in verdict.remarks if one.severity != "note"]
+    named = []
+    for one in (one for one in verdict.remarks if one.kind in CAUSES | OF_GIVEN and one.severity != "note"):
+        right = one.kind in scene.causes and any(name in one.text for name in scene.names or ("",))
+        named.append(cause if right else one.kind)
+    network, scaled = scene.network, not of_kind(result.remarks, "scale_undefined")
+    over = _over_sigma(result, network, (scene.truth.points,), scaled=scaled)
+    first = serious[0].kind if serious else ""
+    return Outcome(kind, number, cause, verdict.level, over, True, True, tuple(named), first)
+
+
+def _over_sigma(
+    result: SurveyResult, network: Network, states: Iterable[FloatArray], *, scaled: bool = False
+) -> float:
+    """Return the largest error of a coordinate in its standard deviations, by the nearest state.
+
+    Args:
+        result: result of the survey.
+        network: has the names of the points.
+        states: true object points, (n, 3) each.
+        scaled: whether the survey gives the scale.
+    """
     a = result.adjustment
-    index = [one.network.point_index(name) for name in a.network.points]
+    index = [network.points.index(name) for name in a.network.points]
     worst = []
-    for state in one.states:
+    for state in states:
         placing = fit_similarity(a.estimate.points, state[index])
+        if scaled:
+            centre = a.estimate.points.mean(axis=0)
+            shift = state[index].mean(axis=0) - placing.rotation @ centre
+            placing = replace(placing, scale=1.0, translation=shift)
         error = placing.apply(a.estimate.points) - state[index]
         of_axes = placing.rotation @ a.covariance.points @ placing.rotation.T
         sigma = placing.scale * np.sqrt(np.diagonal(of_axes, axis1=1, axis2=2))
@@ -154,7 +203,8 @@ def study(names: Iterable[str], first: int, processes: int = 2) -> list[Outcome]
             found = []
             for kind in kinds:
                 numbers = range(first, first + count)
-                some = list(pool.map(outcome_of, [kind] * count, numbers))
+                of = equipped_outcome_of if kind in EQUIPPED else outcome_of
+                some = list(pool.map(of, [kind] * count, numbers))
                 found += some
                 print(f"  {kind:20} {_row(some)}", flush=True)
                 for one in some:
