@@ -49,12 +49,12 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     **{
         f"sfm/judgement/hypotheses/{module}.py": tuple(f"tests/judgement/test_{name}.py" for name in names)
         for module, names in (
-            ("alternatives", ("alternatives", "unchecked_assumptions", "rejections", "hypotheses")),
+            ("alternatives", ("alternatives", "unchecked_assumptions", "hypotheses")),
             ("columns", ("columns", "alternatives", "hypotheses")),
             ("families", ("families", "alternatives", "hypotheses")),
             ("hypotheses", ("families", "hypotheses", "alternatives")),
             ("bumps", ("rig_bumps",)),
-            ("moved", ("alternatives", "rejections", "unchecked_assumptions", "hypotheses")),
+            ("rejections", ("rejections", "hypotheses")),
             ("refit", ("families", "unchecked_assumptions", "alternatives", "hypotheses")),
             ("score", ("alternatives", "hypotheses")),
         )

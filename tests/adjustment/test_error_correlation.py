@@ -16,7 +16,7 @@ from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses.columns import columns_of
-from sfm.judgement.hypotheses.families import MOVED
+from sfm.judgement.hypotheses.families import MOVED, Alternative
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
 from sfm.network import Estimate, Network, rows_of
@@ -257,15 +257,15 @@ def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Esti
     """The gain of a set of points, each of which may move by itself, spreads as the design effect says."""
     network, truth = scene
     near = np.argsort(np.linalg.norm(truth.points - truth.points[7], axis=1))[:10]
-    after = (network.image_points.image >= 4)[:, None, None]
+    after = (np.arange(len(network.images)) >= 4).astype(float)
+    moved = Alternative(MOVED, "split", after, points=near)
     correlation = ErrorCorrelation(alone=0.05, common=0.95, length_px=300.0)
     rng, gains = seed_of("neighbours"), []
     for _ in range(60):
         a = adjusted(network, truth, in_common(network, 0.95, 300.0, rng))
         columns = columns_of(a)
         reduced = reduce_adjustment(replace(a, sigma0=1.0, error_correlation=correlation), columns)
-        field = MOVED.field(a.estimate.points, near)[network.image_points.point]
-        D = reduced.whiten(np.where(after, columns.point @ field, 0.0))
+        D = reduced.whiten(moved.columns(a, columns))
         gains.append(gain_of(*reduced.project(D)).value)
     effect = reduced.design_effect(D)
     assert effect > 1.4 * np.mean(gains) / D.shape[2]  # the mean alone says less

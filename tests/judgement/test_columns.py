@@ -15,7 +15,7 @@ from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import Role
 from sfm.judgement.hypotheses import columns
-from sfm.judgement.hypotheses.columns import columns_of, interior_columns, interior_step, object_fields
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields
 from tests.synthetic import make_network, seed_of
 
 
@@ -72,7 +72,7 @@ def test_columns_are_differences(a: Adjustment) -> None:
     for index in (0, 1):
         camera = estimate.cameras[index]
         for s in range(len(camera.names)):
-            step = interior_step(a, index, s)
+            own, _, (step,) = interior_columns(a, [(index, s)])
             cameras = list(estimate.cameras)
             p = camera.parameters.copy()
             p[s] += 0.01 * step
@@ -81,7 +81,7 @@ def test_columns_are_differences(a: Adjustment) -> None:
                 reprojection(a.network, replace(estimate, cameras=tuple(cameras)))
                 - reprojection(a.network, estimate)
             ) / 0.01
-            own = interior_columns(a, index, [s])[:, :, 0]
+            own = own[:, :, 0]
             np.testing.assert_allclose(own, right, rtol=5e-3, atol=5e-3)
             assert not own[unit == (-2.0 if index == 0 else 1.0)].any()
 
@@ -106,7 +106,7 @@ def test_a_step_moves_image_points_by_a_hundredth_of_a_pixel(a: Adjustment) -> N
         step = columns._step(camera, s, uv)
         away = pixel_from_tangents(columns._changed(camera, s, step), uv) - pixel_from_tangents(camera, uv)
         assert np.abs(away).max() == pytest.approx(0.01, rel=0.02), name
-        assert interior_step(a, 0, s) > 0
+        assert interior_columns(a, [(0, s)])[2][0] > 0
     idle = uv[:0]
     assert columns._step(camera, 0, idle) > 0
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses import families, hypotheses
-from sfm.judgement.hypotheses.columns import columns_of, interior_step, object_fields
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields
 from sfm.judgement.hypotheses.families import Alternative
 from sfm.judgement.hypotheses.hypotheses import (
     Cause,
@@ -26,7 +24,7 @@ from sfm.judgement.hypotheses.hypotheses import (
     remark_of,
 )
 from sfm.judgement.hypotheses.refit import Refit, log_likelihood_of, shifts_of
-from sfm.judgement.hypotheses.score import NONE, Gain, Spread, log_likelihood_gain
+from sfm.judgement.hypotheses.score import Gain
 from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark
 from sfm.similarity import fit_similarity
@@ -44,7 +42,7 @@ FAMILIES = {
     for one in (
         *families.OF_PHOTOGRAPHS,
         *families.OF_EACH,
-        *(families.HELD, families.GIVEN, families.FORMAT, families.MOVED, families.SHIFTED),
+        *(families.HELD, families.GIVEN, families.FORMAT, families.MOVED),
     )
 }
 
@@ -54,26 +52,16 @@ def alternative(
     pattern: str = "split",
     factor: tuple[float, ...] = (0, 0, 0, 0, 1, 1),
     *,
-    evidence: float = 20.0,
-    log_p: float = -50.0,
-    search: float = 1.0,
     points: tuple[int, ...] = (),
     parameters: tuple[tuple[int, int], ...] = (),
 ) -> Alternative:
     return Alternative(
-        *(
-            FAMILIES[family],
-            pattern,
-            np.array(factor, dtype=float),
-            Gain(9.0, 1, np.ones(1)),
-            NONE,
-            log_p,
-            5.0,
-            search,
-            evidence,
-        ),
-        np.array(points, dtype=np.int64),
-        parameters,
+        FAMILIES[family],
+        pattern,
+        np.array(factor, dtype=float),
+        Gain(9.0, 1, np.ones(1)),
+        points=np.array(points, dtype=np.int64),
+        parameters=parameters,
     )
 
 
@@ -87,7 +75,7 @@ def alternative(
         ("given", "all", "given_parameter"),
         ("format", "all", "distortion_not_described"),
         ("moved", "split", "points_moved"),
-        ("shifted", "split", "points_moved"),
+        ("moved", "all", "shape_of_control"),
         ("strain", "linear", "object_deformed"),
         ("bending", "split", "object_deformed"),
     ],
@@ -151,7 +139,7 @@ def test_the_remark_on_held_parameters(a: Adjustment) -> None:
     one = remark(a, alternative("held", "all", parameters=((0, x0),)), [7.0])
     assert one.names("camera") == ("camera 1",) and one.names("parameters") == ("x0",)
     assert one.number("value") == pytest.approx(0.03) and one.numbers["value"].unit == "mm"
-    assert one.number("instead_of") == pytest.approx(0.03 + 7 * interior_step(a, 0, x0))
+    assert one.number("instead_of") == pytest.approx(0.03 + 7 * interior_columns(a, [(0, x0)])[2][0])
     assert one.numbers["instead_of"].unit == "mm"
     both = remark(a, alternative("held", "all", parameters=((0, x0), (0, K1))), [7.0, 1.0])
     assert both.names("parameters") == ("x0", "K1") and "value" not in both.numbers
@@ -235,94 +223,12 @@ def test_a_deformation_counts_from_its_mean(a: Adjustment) -> None:
         np.testing.assert_allclose(one.family.displaced(one, X, beta), 1e6 * right, rtol=0.01, atol=0.02)
     one = alternative("c")
     assert not one.family.displaced(one, X, np.ones(1)).any()
-    one = alternative("shifted", points=(1, 3))
-    away = one.family.displaced(one, X, np.array([1.0, 2.0, 3.0]))
-    assert away[[1, 3]].tolist() == [[1, 2, 3]] * 2 and np.count_nonzero(away) == 6
+    one = alternative("moved", points=(1, 3))
+    away = one.family.displaced(one, X, np.arange(1.0, 7.0))
+    assert away[[1, 3]].tolist() == [[1, 2, 3], [4, 5, 6]] and np.count_nonzero(away) == 6
 
 
 # ---- the choice ----
-
-
-def choice(
-    monkeypatch: pytest.MonkeyPatch,
-    every: list[Alternative],
-    *,
-    gain: float = 50.0,
-    gains: dict[int, float] | None = None,
-    before: tuple[Cause, ...] = (),
-) -> Cause | None:
-    """Return the best of these alternatives, an adjustment with which gains so much."""
-
-    def adjusted(plain: Any, one: Alternative, *_: Any, **__: Any) -> Refit:
-        return Refit(SimpleNamespace(), np.ones(1), (gains or {}).get(id(one), gain), 4.0, 4.0)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
-    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: SimpleNamespace(redundancy=200))
-    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: tuple(every))
-    monkeypatch.setattr(hypotheses, "refit", adjusted)
-    of_ten: Any = SimpleNamespace(network=SimpleNamespace(images=("photograph",) * 10))
-    return hypotheses._best(of_ten, before)
-
-
-def test_an_alternative_holds_by_its_probability_its_evidence_and_its_refit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    limit = np.log(100)
-    for evidence, log_p, gain, holds in (
-        (limit + 0.3, -50.0, 5 + limit + 0.3, True),
-        (limit - 0.3, -50.0, 50.0, False),
-        (limit + 0.3, np.log(0.01) - 1 + 0.3, 50.0, False),
-        (limit + 0.3, np.log(0.01) - 1 - 0.3, 50.0, True),
-        (limit + 0.3, -50.0, 5 + limit - 0.3, False),
-    ):
-        found = choice(monkeypatch, [alternative(evidence=evidence, log_p=log_p)], gain=gain)
-        assert (found is not None) == holds
-
-
-def test_alternatives_of_about_the_same_gain_cannot_be_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    limit = np.log(100)
-    best, same = alternative(evidence=40.0), alternative("camera", evidence=39.0)
-    near = alternative("strain", evidence=30.0)
-    nearer = alternative("bending", evidence=39.0)
-    far = alternative("held", "all", evidence=40.0, parameters=((0, 1),))
-    gains = {id(best): 60.0, id(nearer): 60 - limit + 0.3, id(far): 60 - limit - 0.3}
-    found = choice(monkeypatch, [best, same, far, nearer, near], gains=gains)
-    assert found is not None and found.alternative is best and found.as_well == (nearer,)
-
-
-def test_the_alternative_that_adjusts_best_holds_not_that_of_most_evidence(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Two of each kind are tried; held parameters too where only another alternative is significant."""
-    one, two = alternative("c", evidence=40.0), alternative("c", factor=(0, 1, 0, 0, 0, 1), evidence=39.0)
-    three = alternative("c", factor=(0, 1, 1, 0, 0, 1), evidence=38.0)
-    held = alternative("held", "all", evidence=2.0, parameters=((0, 1),))
-    strong = replace(held, gain=Gain(2 * (5 + np.log(100)) + 1.5, 1, np.ones(1)))
-    weak = replace(held, gain=Gain(2 * (5 + np.log(100)) - 1.5, 1, np.ones(1)))
-    gains = {id(two): 70.0, id(three): 90.0, id(strong): 80.0, id(weak): 80.0}
-    for every, right in (([one, two, three, weak], two), ([one, two, strong], strong)):
-        found = choice(monkeypatch, every, gains=gains)
-        assert found is not None and found.alternative is right
-    assert choice(monkeypatch, [strong], gains=gains) is None
-
-
-def test_beside_a_first_cause_what_photographs_differ_by_anyhow_explains_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Not of the first one, a large error of which makes them differ, nor of a parameter of all of them."""
-    plain = replace(alternative("strain"), gain=Gain(80.0, 1, np.ones(1)))
-    plain = replace(plain, evidence=log_likelihood_gain(plain.gain.value, 200) - plain.price)
-    spread = Spread(1.3, 200, among=False)  # a gain of 45 is one of 32
-    differing = replace(plain, family=alternative("c").family, spread=spread)
-    held = replace(differing, family=alternative("held", "all").family, parameters=((0, 1),))
-    for second, holds in ((differing, False), (held, True)):
-        gains = {id(plain): 40.0, id(second): 45.0}
-        first: Any = SimpleNamespace(
-            alternative=second, refit=SimpleNamespace(adjustment=None, beta=np.ones(1))
-        )
-        for before, best in (((), second), ((first,), second if holds else plain)):
-            found = choice(monkeypatch, [plain, second], gains=gains, before=before)
-            assert found is not None and found.alternative is best
 
 
 def test_causes() -> None:
@@ -331,7 +237,7 @@ def test_causes() -> None:
 
     assert cause(alternative("c")) == cause(alternative("camera"))
     assert cause(alternative("c")) != cause(alternative("c", factor=(0, 0, 1, 1, 1, 1)))
-    assert cause(alternative("strain")) == cause(alternative("bending")) == cause(alternative("shifted"))
+    assert cause(alternative("strain")) == cause(alternative("bending")) == cause(alternative("moved"))
     assert cause(alternative("strain")) != cause(alternative("strain", "linear"))
     assert cause(alternative("held", parameters=((0, 1),))) == ("held", False)
     assert cause(alternative("held", parameters=((0, 1), (0, 2)))) == ("held", True)
@@ -347,7 +253,7 @@ def test_two_causes_at_most_of_a_standard_deviation_at_least(
     shifts: list[float] = []
     treated: list[str] = []
 
-    def best(plain: Adjustment, causes: tuple[Cause, ...], bodies: object) -> Cause:
+    def best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause:
         assert len(causes) == len(treated)
         treated.append("")
         return Cause(alternative(), Refit(replace(plain), np.ones(1), 1.0, shifts.pop(0), 1.0), ())

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
@@ -16,14 +15,13 @@ from sfm.camera import project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.judgement.hypotheses import hypotheses, score
 from sfm.judgement.hypotheses import refit as refitting
-from sfm.judgement.hypotheses.alternatives import explain_rejections, interiors
+from sfm.judgement.hypotheses import score
+from sfm.judgement.hypotheses.alternatives import interiors
 from sfm.judgement.hypotheses.columns import (
     CAMERA,
     columns_of,
     interior_columns,
-    interior_step,
     object_fields,
 )
 from sfm.judgement.hypotheses.families import GIVEN, HELD
@@ -32,7 +30,8 @@ from sfm.judgement.hypotheses.hypotheses import (
     contradicted_parameters,
     judge_alternatives,
 )
-from sfm.judgement.hypotheses.score import gain_of, log_f_sf, log_probability, reduce_adjustment
+from sfm.judgement.hypotheses.rejections import explain_rejections
+from sfm.judgement.hypotheses.score import gain_of, log_probability, reduce_adjustment
 from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints
 from sfm.planning.stations import aim_camera
 from sfm.remarks.kind import WRONG_SIGMAS
@@ -76,8 +75,8 @@ def test_the_columns_are_the_derivatives(clean: Adjustment) -> None:
         )
     camera = estimate.cameras[0]
     for s, name in enumerate(camera.names):
-        found = interior_columns(clean, 0, [s])[:, :, 0]
-        unit = interior_step(clean, 0, s)
+        columns, _, (unit,) = interior_columns(clean, [(0, s)])
+        found = columns[:, :, 0]
         p = camera.parameters.copy()
         p[s] += 0.1 * unit
         other = replace(estimate, cameras=(camera.with_parameters(p),))
@@ -105,14 +104,15 @@ def test_the_gain_is_what_freeing_a_parameter_takes_from_vPv() -> None:
     a = solved(network, truth, "none")
     reduced = reduce_adjustment(a, columns_of(a))
     s = truth.cameras[0].names.index("K1")
-    gain = gain_of(*reduced.project(reduced.whiten(interior_columns(a, 0, [s]))))
+    columns, _, (unit,) = interior_columns(a, [(0, s)])
+    gain = gain_of(*reduced.project(reduced.whiten(columns)))
     free = truth.cameras[0].free.copy()
     free[s] = True
     freed = solved(network, replace(a.estimate, cameras=(replace(a.estimate.cameras[0], free=free),)), "none")
     assert gain.rank == 1
     assert gain.value == pytest.approx((a.vPv - freed.vPv) / a.sigma0**2, rel=5e-3)
     change = freed.estimate.cameras[0].parameters[s] - a.estimate.cameras[0].parameters[s]
-    assert gain.beta[0] * interior_step(a, 0, s) == pytest.approx(change, rel=1e-2)
+    assert gain.beta[0] * unit == pytest.approx(change, rel=1e-2)
 
 
 def test_the_motions_of_the_network_have_no_gain() -> None:
@@ -129,21 +129,6 @@ def test_the_motions_of_the_network_have_no_gain() -> None:
     assert gain_of(*reduced.project(reduced.whiten(D))).rank == 0
 
 
-@pytest.mark.parametrize(("f", "q", "d"), [(3.0, 2, 40), (50.0, 5, 300), (1e4, 9, 2000), (30.0, 1, 11)])
-def test_the_tail_of_f_beyond_what_a_float_holds(f: float, q: int, d: int) -> None:
-    exact = stats.f.logsf(f, q, d)
-    if np.isfinite(exact) and exact > -700:
-        assert log_f_sf(f, q, d) == pytest.approx(exact, rel=1e-9)
-    else:  # I_x(a, b) is about x^a / (a B(a, b)) (1 - x)^b there
-        assert log_f_sf(f, q, d) < -700
-
-
-def test_the_tail_is_smooth_where_the_series_begins() -> None:
-    tail = np.array([log_f_sf(float(f), 9, 2000) for f in np.linspace(150, 260, 23)])
-    assert tail[0] > -600 > tail[-1]
-    assert (np.diff(tail) < 0).all() and np.abs(np.diff(tail, 2)).max() < 0.2
-
-
 def test_a_gain_of_all_that_is_left_is_no_chance() -> None:
     assert log_probability(100.0, 3, 100) == -np.inf
     assert log_probability(5.0, 0, 100) == 0.0
@@ -158,6 +143,8 @@ def causes_of(kind: str, number: int) -> tuple[str, ...]:
     return kinds_of(found)
 
 
+# A camera that varies has the remedy of photographs of another camera in no order.
+ALIKE = {"group zoomed": "camera_varies", "second body": "camera_varies"}
 # of each kind a number at which the fault is clear; the study runs over hundreds
 CLEAR = {
     "group zoomed": 28, "second body": 18, "drift": 18, "growth": 28, "sheared": 18, "bent": 18,
@@ -171,7 +158,7 @@ def test_a_planted_fault_is_named_first(kind: str) -> None:
         found = causes_of(kind, number)
         right = planted(kind, number).cause
         if found:
-            assert found[0] == right, (kind, number)
+            assert found[0] in (right, ALIKE.get(kind)), (kind, number)
             return
     pytest.fail(f"{kind} was not found in four networks")
 
@@ -332,58 +319,13 @@ def slipped_plates(*, noise_px: float = 0.05) -> tuple[Adjustment, tuple[tuple[s
 def test_a_plate_that_moved_is_named_and_not_the_camera() -> None:
     """Six parameters of one plate explain what nine of the camera in each photograph nearly take up."""
     a, plates = slipped_plates()
-    assert "plate_moved" not in kinds_of(judge_alternatives(a).causes)
-    (found,) = judge_alternatives(a, unit="m", bodies=plates).causes
-    assert found.kind == "plate_moved" and found.severity == "error"
-    assert found.names("points") == plates[1]
+    (found,) = judge_alternatives(a, unit="m").causes
+    assert found.kind == "points_moved" and found.severity == "error"
+    assert len(set(found.names("points")) ^ set(plates[1])) < 0.2 * len(plates[1])
     assert found.names("from") == ("image 4",)
     X = a.estimate.points[np.isin(a.network.points, plates[1])]
     reach = float(np.linalg.norm((X - X.mean(axis=0))[:, :2], axis=1).max())
     assert found.number("distance") == pytest.approx(np.hypot(1e-3, 5e-4) + 1e-3 * reach, rel=0.2)
-
-
-def test_of_two_bodies_the_motion_of_one_is_that_of_the_other() -> None:
-    a, (first, second) = slipped_plates()
-    names = np.array(a.network.points)
-
-    def tested(*bodies: tuple[str, ...]) -> list[list[str]]:
-        return [names[some].tolist() for some in hypotheses._moving_bodies(a, bodies)]
-
-    assert tested(first, second) == [list(second)]
-    three = first, second[:20], second[20:]
-    assert tested(*three) == [list(one) for one in three]
-    assert (
-        tested(tuple(names)) == tested(first[:2]) == tested(tuple(names[2:])) == []
-    )  # three points and more
-    assert tested(first[:3]) == [list(first[:3])] and hypotheses.MIN_OF_BODY == 3
-
-
-def test_of_each_kind_two_are_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of most evidence, which are listed first."""
-    every = [
-        SimpleNamespace(
-            kind=kind,
-            evidence=20.0,
-            design_effect=1.0,
-            gain=SimpleNamespace(value=0.0),
-            family=SimpleNamespace(cause=lambda one, k=k: (one.kind, k)),
-        )
-        for kind in ("object", "camera")
-        for k in range(5)
-    ]
-    tried: list[tuple[object, int]] = []
-    monkeypatch.setattr(hypotheses, "columns_of", lambda _: None)
-    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
-    monkeypatch.setattr(hypotheses, "is_significant", lambda *_: True)
-    monkeypatch.setattr(hypotheses, "log_likelihood_gain", lambda *_: 0.0)
-    monkeypatch.setattr(hypotheses, "refit", lambda _, one, *__, most: tried.append((one, most)))
-    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda *_: SimpleNamespace(redundancy=1))
-    for photographs, least, most in ((20, 24, np.inf), (300, 1, 4)):  # the work on many is bounded
-        plain = SimpleNamespace(network=SimpleNamespace(images=("a",) * photographs))
-        tried.clear()
-        assert hypotheses._best(plain, ()) is None  # type: ignore[arg-type]
-        assert [one for one, _ in tried] == [*every[:2], *every[5:7]]
-        assert all(least <= adjustments <= most for _, adjustments in tried)
 
 
 def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does() -> None:
@@ -400,7 +342,7 @@ def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does()
         found = refitting.refit(a, start, a)
         assert found is not None and found.adjustment.vPv == pytest.approx(freed.vPv, rel=1e-4)
         change = freed.estimate.cameras[0].parameters[s] - a.estimate.cameras[0].parameters[s]
-        assert found.beta[0] * interior_step(a, 0, s) == pytest.approx(change, rel=1e-2)
+        assert found.beta[0] * interior_columns(a, [(0, s)])[2][0] == pytest.approx(change, rel=1e-2)
 
 
 def test_a_step_is_halved_three_times(clean: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -460,22 +402,21 @@ def plate_seen_by_few(
 
 
 @pytest.mark.parametrize("sigma", [0.0, 5e-5])
-@pytest.mark.parametrize("photographs", [2, 3, 5])
+@pytest.mark.parametrize("photographs", [3, 5])
 def test_a_zoom_among_photographs_of_a_plate_is_named(photographs: int, sigma: float) -> None:
-    """Before, two and three were not tested, and of five the plate was strained or bent.
+    """Before, three were not tested, and of five the plate was strained or bent.
 
     One of three looks like a plate stretched in its direction, if it does not stand out by other rays.
     """
     named = []
     for seed in range(2):
         (cause,) = judge_alternatives(plate_seen_by_few(photographs, 1.02, sigma, seed)).causes
-        named += [{cause.kind, *cause.names("instead")} & {"two_cameras", "other_camera", "camera_varies"}]
-        if cause.kind in ("two_cameras", "other_camera"):
+        named += [{cause.kind, *cause.names("instead")} & {"other_camera", "camera_varies"}]
+        if cause.kind == "other_camera":
             assert "image 1" in cause.names("photographs")
             assert abs(cause.number("change")) == pytest.approx(2.0, abs=0.3)
         right = judge_alternatives(plate_seen_by_few(photographs, 1.0, sigma, seed))
-        few = "calibrated_from_few" in kinds_of(right.unchecked)
-        assert right.causes == () and few == (photographs == 2)
+        assert right.causes == () and "calibrated_from_few" not in kinds_of(right.unchecked)
     assert all(named)
 
 
@@ -541,40 +482,6 @@ def test_what_given_points_say_of_freedoms_is_what_an_adjustment_with_them_finds
         replace(network, camera=np.array([1, 0, 0, 0])), start, datum=Datum("control"), reject="none"
     )
     assert (a.vPv - apart.vPv) / a.sigma0**2 == pytest.approx(gain.value, rel=0.02)
-
-
-@pytest.mark.parametrize(("effect", "tried"), [(1.0, 2), (4.0, 1)])
-def test_a_parameter_of_all_photographs_is_tried_with_what_its_errors_in_common_leave(
-    effect: float, tried: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It gains 40 variances: 20 of ln likelihood, and 5 where image points count for a quarter."""
-
-    def alternative(name: str, family: object, evidence: float, effect: float) -> object:
-        gain = SimpleNamespace(value=40.0)
-        of = SimpleNamespace(cause=lambda one: (name,)) if family is None else family
-        return SimpleNamespace(family=of, gain=gain, evidence=evidence, price=6.0, design_effect=effect)
-
-    class Interior(hypotheses.InteriorFamily):
-        def __init__(self) -> None:
-            pass
-
-        def cause(self, one: object) -> tuple[object, ...]:
-            return ("interior",)
-
-    def refitted(_: object, to_try: list[object], count: int) -> list[object]:
-        assert count == tried
-        raise StopIteration
-
-    every = [alternative("clear", None, 30.0, 1.0), alternative("interior", Interior(), 0.0, effect)]
-    reduced = SimpleNamespace(redundancy=100_000)
-    monkeypatch.setattr(hypotheses, "columns_of", lambda a: None)
-    monkeypatch.setattr(hypotheses, "reduce_adjustment", lambda a, columns: reduced)
-    monkeypatch.setattr(hypotheses, "alternatives_of", lambda *_: every)
-    monkeypatch.setattr(hypotheses, "is_significant", lambda one, count: True)
-    monkeypatch.setattr(hypotheses, "reported", refitted)
-    plain = SimpleNamespace(network=SimpleNamespace(images=("a",)))
-    with pytest.raises(StopIteration):
-        hypotheses._best(plain, ())  # type: ignore[arg-type]
 
 
 def test_control_counts_by_its_variance_over_that_of_unit_weight() -> None:

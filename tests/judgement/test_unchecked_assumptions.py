@@ -14,10 +14,9 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses import alternatives, families
-from sfm.judgement.hypotheses import moved as patterns
 from sfm.judgement.hypotheses import refit as unchecked
 from sfm.judgement.hypotheses.alternatives import count_alternatives, interiors, needed_gain
-from sfm.judgement.hypotheses.columns import columns_of, shared_columns
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns
 from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.remarks.remark import kinds_of, of_kind
@@ -65,7 +64,7 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     s = a.estimate.cameras[0].names.index(name)
     one = next(one for one in interiors(a, reduced, families.HELD) if one.parameters == ((0, s),))
     reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
-    D = shared_columns(a, [(0, s)])[0][:, :, 0]
+    D = interior_columns(a, [(0, s)])[0][:, :, 0]
     H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
     needed = needed_gain(1, len(D), 0.0, count_alternatives(a))
     least = next(x for x in np.linspace(needed, 2 * needed, 2000) if stats.ncx2.sf(needed, 1, x) > 0.8)
@@ -129,7 +128,7 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
     H = reduced.project(reduced.whiten(one.columns(a, columns)))[0]
     blind = SimpleNamespace(
         whiten=reduced.whiten,
-        shifts=reduced.shifts,
+        absorb=reduced.absorb,
         design_effect=reduced.design_effect,
         project=lambda D: (1e-12 * H, np.zeros(1), reduced.project(D)[2]),
     )
@@ -142,9 +141,9 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
 
 
 def test_cameras_of_few_photographs_are_checked_too() -> None:
-    """Before, nothing was said of a camera with two or three photographs beside others."""
+    """Of two photographs or one, nothing shows that the camera changed between them."""
     network, truth = make_network(seed_of("few of a camera"), images=8, points=40, cameras=2, free=("c",))
-    for own, pattern in ((2, "pair"), (3, "single"), (1, "")):
+    for own, pattern in ((2, ""), (3, "single"), (1, "")):
         camera = (np.arange(8) >= 8 - own).astype(np.int64)
         a = adjust(replace(network, camera=camera), truth, datum=Datum("free"), reject="none")
         reduced = reduce_adjustment(a, columns_of(a))
@@ -159,7 +158,7 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
 
 def test_cameras_too_many_to_test_are_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, more than 60 cameras counted as one, of which some photographs might have another one."""
-    monkeypatch.setattr(patterns, "MAX_RUNS", 4)
+    monkeypatch.setattr(alternatives, "MAX_RUNS", 4)
     network, truth = make_network(seed_of("61"), images=10, points=30, cameras=5, free=("c",))
     for cameras, untested in ((5, True), (4, False)):
         camera = np.minimum(np.arange(10) % 5, cameras - 1)

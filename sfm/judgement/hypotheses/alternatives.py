@@ -1,57 +1,42 @@
-"""Alternative hypotheses, each with its gain, and common causes of rejected image points.
+"""Alternative hypotheses, each with its gain: one row of `alternatives_of` for each family.
 
-A family is a set of columns, and a pattern gives each photograph a factor on them, see `moved`. The level of
-the test is divided among all alternatives. It is also lowered by the search inside an alternative: the number
-of patterns, or of sets of points, from which the best was chosen.
-
-Rejected image points have common causes, such as exchanged names or points at a second position. The test of
-the adjustment has separated them from the good image points. Here they are explained on their own, with the
-adjusted photographs. They take no part in the tests of alternatives, because a few of them would dominate.
+A family is a set of columns, and a pattern gives each photograph, or run of photographs, a factor on them.
+Points move between two photographs of the sequence: each by itself, in the order of their single gains, or
+together, where they fit the motion of one of them. The level of the test is divided among all alternatives.
+It is also lowered by the search inside one: the number of patterns, or of sets of points, from which it was
+chosen.
 
 Source: the score test of `sfm.judgement.hypotheses.score`; Holm (1979), Scand. J. Statist. 6, for the level;
-Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.5 (alternative hypotheses).
+Baarda (1968), A testing procedure for use in geodetic networks; Foerstner and Wrobel (2016), Photogrammetric
+Computer Vision, sec. 4.6.4 (groups of parameters) and 4.6.5 (alternative hypotheses).
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammaln
 
-from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
-from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf, chi2_sf
-from sfm.judgement.hypotheses.columns import Columns, shared_columns
+from sfm.distributions import chi2_isf
+from sfm.judgement.hypotheses.columns import Columns, interior_columns, rigid_motions
 from sfm.judgement.hypotheses.families import (
+    BODY,
     FORMAT,
     GIVEN,
     HELD,
     MOVED,
     OF_EACH,
     OF_PHOTOGRAPHS,
-    SHIFTED,
+    STRAIN,
     Alternative,
     CameraFamily,
-    Family,
     InteriorFamily,
     ObjectFamily,
-    format_columns,
-)
-from sfm.judgement.hypotheses.moved import (
-    MIN_GROUP,
-    Part,
-    Pattern,
-    moved_bodies,
-    moved_points,
-    patterns_of,
-    runs_of,
-    score_alternative,
-    too_many_cameras,
 )
 from sfm.judgement.hypotheses.score import (
     NONE,
@@ -60,72 +45,62 @@ from sfm.judgement.hypotheses.score import (
     Spread,
     determined_inverse,
     gain_of,
+    gains_of,
     least_share,
-    log_likelihood_gain,
     log_probability,
+    points_by_cameras,
 )
 from sfm.likelihood import price_of
-from sfm.network import rows_of
-from sfm.remarks.remark import Remark, remark
+from sfm.network import sum_rows
 
-MIN_EXCHANGED = 2  # photographs with two names exchanged from which this is systematic, not accidental
-MIN_RAYS = 3  # rays that meet at a second position; two nearly meet anywhere along an epipolar line
-# Largest ratio of the variance of a prediction plus its measurement to that of the measurement.
-MAX_PREDICTION_RATIO = 2.0
 ALPHA = 0.01  # probability of naming any alternative if none is true
-OF_ONE = ("single", "pair")  # patterns of one photograph
+MIN_GROUP = 2  # photographs on each side of a split
+MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
+MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds
+MAX_SPLITS = 12  # positions in the sequence at which a movement is tested
+MAX_MOVED = 60  # points with different vectors that are tested together
+ROUNDS = 20  # iterations of set and motion
+STARTS = 8  # points whose motion others may share
+MIN_OF_BODY = 3  # points that determine the six motions of a body
 
 
-def alternatives_of(
-    a: Adjustment, reduced: Reduced, columns: Columns, bodies: Sequence[IntArray] = ()
-) -> tuple[Alternative, ...]:
+def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
     """Return all alternatives, best evidence first.
 
     Args:
         a: adjustment of the image points alone, or with control. With control, only changes of the camera and
-            of the object, and a wrong shape of the control, are tested.
+            of the object, and strained control, are tested.
         reduced: its normal equations.
         columns: its derivatives.
-        bodies: object points of each rigid body that may move relative to the others.
     """
-    if a.datum == "control":
-        found = [*_by_photographs(a, reduced, columns), *_shapes_of_control(reduced, columns)]
-        return _by_evidence(a, reduced, columns, found)
-    found = [
-        *interiors(a, reduced, HELD),
-        *interiors(a, reduced, GIVEN),
-        *_in_all(reduced, FORMAT, format_columns(a)),
-        *_by_photographs(a, reduced, columns),
-        *moved_points(reduced),
-        *moved_bodies(a, reduced, columns, bodies),
-    ]
-    return _by_evidence(a, reduced, columns, found)
-
-
-def _by_evidence(
-    a: Adjustment, reduced: Reduced, columns: Columns, found: Sequence[Alternative]
-) -> tuple[Alternative, ...]:
-    """Sort alternatives by evidence, after dividing their gains by the design effect of correlated errors."""
+    found = list(_by_photographs(a, reduced, columns))
+    in_all = Alternative(STRAIN if a.datum == "control" else FORMAT, "all", np.ones(reduced.photographs))
+    found += _in_all(reduced, in_all, reduced.whiten(in_all.columns(a, columns)))
+    if a.datum != "control":
+        found += [
+            *interiors(a, reduced, HELD),
+            *interiors(a, reduced, GIVEN),
+            *moved_points(a, reduced),
+        ]
 
     def tested(one: Alternative) -> Alternative:
-        grows = log_likelihood_gain(one.gain.value, reduced.redundancy) - one.price
-        if reduced.correlation is None or not grows > np.log(1 / ALPHA):
-            return one  # not significant in any case
+        priced = one.priced(reduced)
+        if reduced.correlation is None or not priced.evidence_beside_spread > np.log(1 / ALPHA):
+            return priced  # not significant in any case
         effect = reduced.design_effect(reduced.whiten(one.columns(a, columns)))
-        return one.with_design_effect(effect, reduced.redundancy)
+        return replace(priced, design_effect=effect)
 
     return tuple(sorted(map(tested, found), key=lambda one: -one.evidence))
 
 
-def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
+def count_alternatives(a: Adjustment) -> int:
     """Return the number of alternatives tested for an adjustment, including some that have no gain.
 
-    They are held and given parameters, families of photographs with their patterns, the format, moved points
-    and moved bodies.
+    They are held and given parameters, families of photographs with their patterns, the format and moved
+    points.
 
     Args:
         a: adjustment.
-        bodies: number of rigid bodies.
     """
     owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
     held = sum(len(one) + (len(one) > 1) for one in owners)
@@ -135,10 +110,8 @@ def count_alternatives(a: Adjustment, bodies: int = 0) -> int:
     run, patterns = runs_of(camera), 0
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
-            m = len(np.unique(run[among]))
-            names = [name for name, _, _ in patterns_of(m) if family.of_camera or name not in OF_ONE]
-            patterns += len(names) + (m > 2 * MIN_GROUP)
-    return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, SHIFTED)) + bodies
+            patterns += len(list(patterns_of(family, len(np.unique(run[among])))))
+    return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, BODY))
 
 
 def is_significant(one: Alternative, rows: int) -> bool:
@@ -196,48 +169,42 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
         reduced: its normal equations.
         family: family of held or of given parameters.
     """
-    everywhere = Pattern("all", np.ones(len(a.network.images)))
+    everywhere = np.ones(reduced.photographs)
     for sets in interior_parameters(a, family):
         whole = tuple(pair for one in sets for pair in one)
-        D = reduced.whiten(shared_columns(a, list(whole))[0])
+        D = reduced.whiten(interior_columns(a, whole)[0])
         every = gain_of(*reduced.project(D))
-        for parameters, columns in [
-            *((one, [k]) for k, one in enumerate(sets)),
-            *([(whole, list(range(len(sets))))] if len(sets) > 1 else []),
-        ]:
-            freed = D[:, :, columns]
-            H, g, squares = reduced.project(freed)
-            gain = gain_of(H, g, squares, least_share(len(H)))
-            if gain.rank:
-                # evidence of the photographs once this parameter, or all parameters of the camera, are free
-                variance = float(gain.beta @ H @ gain.beta)
-                spread = min(
-                    (
-                        _of_scores(reduced.scores(freed @ gain.beta, step), variance)
-                        for step in (freed @ gain.beta, D @ every.beta)
-                    ),
-                    key=lambda one: one.factor,
-                )
-                yield score_alternative(reduced, family, everywhere, gain, spread, parameters=parameters)
+        tested = [(one, [k]) for k, one in enumerate(sets)]
+        if len(sets) > 1:
+            tested.append((whole, list(range(len(sets)))))
+        for parameters, some in tested:
+            one = Alternative(family, "all", everywhere, parameters=parameters)
+            yield from _in_all(reduced, one, D[:, :, some], D @ every.beta)
 
 
-def _in_all(reduced: Reduced, family: Family, columns: FloatArray) -> Iterator[Alternative]:
-    """Yield the alternative of a family with the same columns, px, (k, 2, q), in all photographs."""
-    D = reduced.whiten(columns)
+def _in_all(
+    reduced: Reduced, one: Alternative, D: FloatArray, further: FloatArray | None = None
+) -> Iterator[Alternative]:
+    """Yield an alternative of whitened columns (k, 2, q) that all photographs share, if it has a gain.
+
+    Photographs differ by what remains after its step, or after a `further` step (k, 2) if that leaves less.
+    """
     H, g, squares = reduced.project(D)
-    gain = gain_of(H, g, squares)
+    gain = gain_of(H, g, squares, least_share(len(H)))
     if gain.rank:
-        step = D @ gain.beta
-        spread = _of_scores(reduced.scores(step, step), float(gain.beta @ H @ gain.beta))
-        yield score_alternative(reduced, family, Pattern("all", np.ones(reduced.photographs)), gain, spread)
+        step, variance = D @ gain.beta, float(gain.beta @ H @ gain.beta)
+        spreads = [
+            _spread_along(reduced, step, after, variance) for after in (step, further) if after is not None
+        ]
+        yield replace(one, gain=gain, spread=min(spreads, key=lambda spread: spread.factor))
 
 
-def _of_scores(scores: FloatArray, variance: float) -> Spread:
-    """Return the spread of the scores of photographs in one direction, (m,), over their expected variance.
+def _spread_along(reduced: Reduced, direction: FloatArray, step: FloatArray, variance: float) -> Spread:
+    """Return the spread of the scores of photographs in one direction over their expected variance.
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
-    m = len(scores)
+    m, scores = reduced.photographs, reduced.scores(direction, step)
     return Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False) if m > 1 else NONE
 
 
@@ -249,42 +216,58 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     """
     camera = cameras_of_photographs(a)
     run = runs_of(camera)
-    m = int(run.max()) + 1
-    H, g, squares = reduced.project_by_run(reduced.whiten(columns.freedoms), run)
-    if m >= 2 * MIN_GROUP and not too_many_cameras(camera):
-        yield from _each(reduced, H, g, squares, run)
+    whole = Part(*reduced.project_by_run(reduced.whiten(columns.freedoms), run))
+    if len(whole.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
+        yield from _of_each(reduced, whole, run)
     for family in OF_PHOTOGRAPHS:
-        some = np.array(family.places)
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
-            part = Part(H[np.ix_(runs, some, runs, some)], g[np.ix_(runs, some)], squares[np.ix_(runs, some)])
-            for pattern, factors, search in patterns_of(len(runs)):
-                if pattern in OF_ONE and not family.of_camera:
-                    continue  # if only one photograph shows another shape, the fault lies with the photograph
+            part = whole.of(runs, np.array(family.places))
+            for pattern, factors in patterns_of(family, len(runs)):
                 gains = [part.gain(factor) for factor in factors]
                 best = max(range(len(gains)), key=lambda k: gains[k].value)
-                spread = part.spread(factors[best], gains[best])
-                factor = _of_photographs(factors[best], runs, run, m)
-                if pattern in OF_ONE:
-                    alone = among if pattern == "pair" else factor > 0
-                    of_family = _variance_of(reduced, alone, gains[best])
-                    spread = replace(spread, factor=max(spread.factor, of_family))
-                yield score_alternative(
-                    reduced, family, Pattern(pattern, factor, search, among), gains[best], spread
-                )
-            if len(runs) > 2 * MIN_GROUP:
-                members, gain = part.group()
-                if MIN_GROUP <= members.sum() <= len(runs) - MIN_GROUP:
-                    factor, search = _of_photographs(members, runs, run, m), (len(runs) - 1) * np.log(2)
-                    grown = Pattern("group", factor, search, among)
-                    yield score_alternative(reduced, family, grown, gain, part.spread(members, gain))
+                gain, spread = gains[best], part.spread(factors[best], gains[best])
+                every = np.zeros(len(whole.g))
+                every[runs] = factors[best]
+                factor = every[run]
+                if pattern == "single":
+                    left = _variance_of(reduced, factor > 0, gain)
+                    spread = replace(spread, factor=max(spread.factor, left))
+                search = float(np.log(len(factors)))
+                yield Alternative(family, pattern, factor, gain, spread, search, among=among)
 
 
-def _shapes_of_control(reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
-    """Yield the alternatives of strained or bent control, which affects all photographs alike."""
-    for family in OF_PHOTOGRAPHS:
-        if not family.of_camera:
-            yield from _in_all(reduced, family, columns.freedoms[:, :, list(family.places)])
+def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
+    """Return the variance that remains in some photographs, (m,), relative to that of all photographs."""
+    v = reduced.v[some[reduced.image]]
+    expected = v.size * reduced.redundancy / reduced.count
+    return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
+
+
+def _of_each(reduced: Reduced, whole: Part, run: IntArray) -> Iterator[Alternative]:
+    """Yield the alternatives of a per-photograph camera.
+
+    Such a camera must exceed, by an F test, the effect of all other freedoms of the photographs once it is
+    included. Errors common to the image points of a photograph need not come from the camera.
+    """
+    m, f = whole.g.shape
+    for family in OF_EACH:
+        some = np.array(family.places)
+        rest = np.setdiff1d(np.arange(f), some)
+        q, p = m * len(some), m * len(rest)
+        H = whole.H[:, some][:, :, :, some].reshape(q, q)
+        squares = whole.squares[:, some].ravel()
+        gain = gain_of(H, whole.g[:, some].ravel(), squares)
+        if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
+            continue
+        cross = whole.H[:, rest][:, :, :, some].reshape(p, q)
+        others = gain_of(
+            whole.H[:, rest][:, :, :, rest].reshape(p, p) - cross @ determined_inverse(H, squares) @ cross.T,
+            whole.g[:, rest].ravel() + cross @ gain.beta,
+            whole.squares[:, rest].ravel(),
+        )
+        spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
+        yield Alternative(family, "each", run.astype(float), gain, spread)
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
@@ -312,201 +295,201 @@ def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> 
     return [] if too_many_cameras(camera) else [camera == k for k in range(int(camera.max()) + 1)]
 
 
-def _of_photographs(factor: FloatArray, runs: IntArray, run: IntArray, count: int) -> FloatArray:
-    """Return the factors of photographs, (m,), from the factors of some runs, with 0 in the others."""
-    every = np.zeros(count)
-    every[runs] = factor
-    return every[run]
+def patterns_of(family: CameraFamily | ObjectFamily, m: int) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the patterns of m photographs: name, and factors of the photographs, (p, m).
 
-
-def _each(
-    reduced: Reduced, H: FloatArray, g: FloatArray, squares: FloatArray, run: IntArray
-) -> Iterator[Alternative]:
-    """Yield the alternatives of a per-photograph camera.
-
-    Such a camera must exceed, by an F test, the effect of all other freedoms of the photographs once it is
-    included. Errors common to the image points of a photograph need not come from the camera.
+    If only one photograph shows another shape of the object, the fault lies with the photograph.
     """
-    m, f = g.shape
-    for family in OF_EACH:
-        some = np.array(family.places)
-        rest = np.setdiff1d(np.arange(f), some)
-        q, p = m * len(some), m * len(rest)
-        of_some = H[:, some][:, :, :, some].reshape(q, q)
-        gain = gain_of(of_some, g[:, some].ravel(), squares[:, some].ravel())
-        if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
-            continue
-        cross = H[:, rest][:, :, :, some].reshape(p, q)
-        inverse = determined_inverse(of_some, squares[:, some].ravel())
-        others = gain_of(
-            H[:, rest][:, :, :, rest].reshape(p, p) - cross @ inverse @ cross.T,
-            g[:, rest].ravel() + cross @ gain.beta,
-            squares[:, rest].ravel(),
-        )
-        spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
-        yield score_alternative(reduced, family, Pattern("each", run.astype(float), parts=m), gain, spread)
-
-
-def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
-    """Return the variance that remains in some photographs, (m,), relative to that of all photographs."""
-    v = reduced.v[some[reduced.image]]
-    expected = v.size * reduced.redundancy / reduced.count
-    return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
+    if m > MIN_GROUP and family.of_camera:
+        yield "single", np.eye(m)
+    if m >= 2 * MIN_GROUP:
+        yield "split", (np.arange(m) >= np.arange(MIN_GROUP, m - MIN_GROUP + 1)[:, None]).astype(float)
+        yield "linear", np.linspace(-1, 1, m)[None]
+        yield "alternating", (np.arange(m) % 2)[None].astype(float)
 
 
 @dataclass(frozen=True)
-class SecondPlace:
-    """A point that some photographs show at another position."""
+class Part:
+    """Normal equations of a family in each photograph."""
 
-    point: int
-    distance: float  # between both positions, object unit
-    over_sigma: float  # the same in standard deviations of the difference
-    images: IntArray  # photographs that show it there
+    H: FloatArray  # (m, f, m, f)
+    g: FloatArray  # (m, f)
+    squares: FloatArray  # (m, f)
+
+    def of(self, runs: IntArray, places: IntArray) -> Part:
+        """Return the normal equations of some freedoms in some of the photographs."""
+        H = self.H[np.ix_(runs, places, runs, places)]
+        return Part(H, self.g[np.ix_(runs, places)], self.squares[np.ix_(runs, places)])
+
+    def gain(self, factor: FloatArray) -> Gain:
+        """Return the gain if the photographs have the family with these factors, (m,)."""
+        return gain_of(
+            np.tensordot(np.tensordot(factor, self.H, (0, 0)), factor, (1, 0)),
+            factor @ self.g,
+            factor**2 @ self.squares,
+            least_share(self.g.shape[1]),
+        )
+
+    def spread(self, factor: FloatArray, gain: Gain) -> Spread:
+        """Return the spread of the photographs in the family beyond what a pattern explains.
+
+        Args:
+            factor: factors of the pattern, (m,).
+            gain: gain of the pattern.
+        """
+        m = len(self.g)
+        left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
+        some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
+        blocks = np.einsum("iaib->iab", self.H)[some]
+        values, ranks = gains_of(blocks, left[some], self.squares[some])
+        redundancy = int(ranks.sum()) - gain.rank
+        return NONE if redundancy < 1 else Spread(float(values.sum()) / redundancy, redundancy)
 
 
-def explain_rejections(
-    a: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
-) -> tuple[Remark, ...]:
-    """Return remarks that explain the rejected image points of an adjustment.
+def runs_of(camera: IntArray) -> IntArray:
+    """Return the run of each photograph, (m,): a run has successive photographs of one camera.
+
+    With too many cameras to test, a run includes photographs of several cameras.
 
     Args:
-        a: finished adjustment.
-        unit: object unit, for the remarks.
-        bodies: names of the points of each rigid body, such as a plate, that may move relative to the others.
+        camera: camera of each photograph, (m,).
     """
-    if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
-        return ()
-    misnamed = _other_points(a)
-    pairs, rest = _exchanged(a, misnamed)
-    remarks = [
-        remark(
-            "names_exchanged",
-            first=a.network.points[p],
-            second=a.network.points[q],
-            photographs=tuple(a.network.images[i] for i in images),
-        )
-        for (p, q), images in sorted(pairs.items())
-    ]
-    if rest:
-        seen = a.network.image_points
-        remarks.append(
-            remark(
-                "image_points_misnamed",
-                count=len(rest),
-                photographs=tuple(sorted({a.network.images[seen.image[row]] for row in rest})),
-            )
-        )
-    used = set(rest) | {row for row, q in misnamed.items() if _key(a, row, q) in pairs}
-    return (*remarks, *_of_places(a, _second_places(a, used), unit, bodies))
+    m = len(camera)
+    if m <= MAX_RUNS:
+        return np.arange(m)
+    if too_many_cameras(camera):
+        camera = np.zeros_like(camera)
+    piece = np.empty(m, dtype=np.int64)
+    piece[np.argsort(camera, kind="stable")] = np.arange(m) * MAX_RUNS // m
+    _, run = np.unique([camera, piece], axis=1, return_inverse=True)
+    middle = np.bincount(run, weights=np.arange(m)) / np.bincount(run)
+    return np.asarray(np.argsort(np.argsort(middle, kind="stable"))[run])
 
 
-def _other_points(a: Adjustment) -> dict[int, int]:
-    """Return the rejected image points that lie where another point is expected, with that point."""
-    network, estimate, seen = a.network, a.estimate, a.network.image_points
-    rejected = np.flatnonzero(a.rejected)
-    tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(ALPHA, 2))) * a.sigma0_px
-    found: dict[int, int] = {}
-    for i, rows in enumerate(rows_of(seen.image[rejected], len(network.images))):
-        if not len(rows):
-            continue
-        camera = estimate.cameras[network.camera[i]]
-        at = project(camera, estimate.position[i], estimate.rotation[i], estimate.points)
-        for row in rejected[rows].tolist():
-            away = np.linalg.norm(at - seen.xy[row], axis=1)
-            away[seen.point[row]] = np.inf
-            q = int(np.nanargmin(away)) if np.isfinite(away).any() else -1
-            if q >= 0 and away[q] < tolerance:
-                found[row] = q
-    return found
+def too_many_cameras(camera: IntArray) -> bool:
+    """Return whether there are too many cameras to test, given the camera of each photograph, (m,)."""
+    return int(camera.max()) >= MAX_RUNS
 
 
-def _key(a: Adjustment, row: int, q: int) -> tuple[int, int]:
-    p = int(a.network.image_points.point[row])
-    return min(p, q), max(p, q)
+def moved_points(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+    """Yield the best sets of points that moved, each by a vector or all as a body, at some photograph.
 
-
-def _exchanged(a: Adjustment, misnamed: dict[int, int]) -> tuple[dict[tuple[int, int], list[int]], list[int]]:
-    """Return the point pairs exchanged in several photographs, with these, and the remaining image points."""
-    seen = a.network.image_points
-    where: dict[tuple[int, int], dict[int, list[int]]] = defaultdict(lambda: defaultdict(list))
-    for row, q in misnamed.items():
-        where[_key(a, row, q)][int(seen.image[row])].append(row)
-    pairs, rest = {}, []
-    for key, images in where.items():
-        both = [i for i, rows in images.items() if len(rows) == 2]
-        if len(both) >= MIN_EXCHANGED:
-            pairs[key] = sorted(images)
-        else:
-            rest += [row for rows in images.values() for row in rows]
-    return pairs, rest
-
-
-def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
-    """Return the points with rejected rays that meet at another position."""
-    seen = a.network.image_points
-    left = np.array([row for row in np.flatnonzero(a.rejected).tolist() if row not in explained], dtype=int)
-    places = []
-    for j in np.unique(seen.point[left]).tolist():
-        out = left[seen.point[left] == j]
-        kept = np.flatnonzero((seen.point == j) & ~a.rejected)
-        if len(out) < MIN_RAYS or len(kept) < 2:
-            continue
-        X, Q, misfit = intersect_rays(a, out)
-        first, Q0, _ = intersect_rays(a, kept)
-        if not np.isfinite(misfit) or chi2_sf(misfit, 2 * len(out) - 3) < ALPHA:
-            continue
-        apart = X - first
-        over = float(np.sqrt(apart @ np.linalg.pinv(Q + Q0) @ apart))
-        if chi2_sf(over**2, 3) < ALPHA / len(left):
-            places.append(SecondPlace(j, float(np.linalg.norm(apart)), over, np.sort(seen.image[out])))
-    return places
-
-
-def _of_places(
-    a: Adjustment, places: list[SecondPlace], unit: str, bodies: Sequence[Collection[str]] = ()
-) -> list[Remark]:
-    """Return remarks on points that moved together at one photograph, and on each other point.
-
-    Points that are most of one of several bodies, and nothing else, are reported as that body.
+    Args:
+        a: adjustment.
+        reduced: its normal equations.
     """
-    names = a.network.images
-    together: dict[int, list[SecondPlace]] = defaultdict(list)
-    alone = []
-    for one in places:
-        others = _kept_images(a, one.point)
-        if one.images.min() > others.max() or one.images.max() < others.min():
-            together[int(max(one.images.min(), others.min()))].append(one)
-        else:
-            alone.append(one)
-    moved = {start: {a.network.points[one.point] for one in some} for start, some in together.items()}
-    of_body = {
-        start
-        for start, points in moved.items()
-        if len(bodies) > 1 and any(points <= set(one) and 2 * len(points) > len(one) for one in bodies)
-    }
-    remarks = [
-        remark(
-            "plate_moved" if start in of_body else "points_moved",
-            points=tuple(a.network.points[one.point] for one in some),
-            distance=(max(one.distance for one in some), unit),
-            shift=max(one.over_sigma for one in some),
-            wrong=0.0,  # rejected image points do not shift the others
-            **{"from": names[start]},
-        )
-        for start, some in sorted(together.items())
-    ]
-    return remarks + [
-        remark(
-            "two_places",
-            point=a.network.points[one.point],
-            distance=(one.distance, unit),
-            sigmas=one.over_sigma,
-            photographs=tuple(names[i] for i in one.images),
-        )
-        for one in alone
-    ]
+    m = reduced.photographs
+    splits = np.arange(MIN_GROUP, m - MIN_GROUP + 1)
+    products = 6 * len(reduced.L) * len(reduced.t) ** 2  # products of one split
+    affordable = max(1, min(MAX_SPLITS, int(MAX_PRODUCTS / products)))
+    splits = splits[:: max(-(-len(splits) // affordable), 1)]
+    best: dict[str, Alternative] = {}
+    for k in splits:
+        moves = _moves(reduced, (np.arange(m) >= k).astype(float))
+        for one in (*_each_by_itself(reduced, moves), *_as_one_body(a, reduced, moves)):
+            tested = replace(one, search=one.search + float(np.log(len(splits)))).priced(reduced)
+            if one.family.name not in best or tested.evidence > best[one.family.name].evidence:
+                best[one.family.name] = tested
+    yield from best.values()
 
 
-def _kept_images(a: Adjustment, point: int) -> IntArray:
-    seen = a.network.image_points
-    return np.asarray(seen.image[(seen.point == point) & ~a.rejected])
+@dataclass(frozen=True)
+class _Moves:
+    """Normal equations of the n points that can have moved between two sets of photographs."""
+
+    factor: FloatArray  # 1 in the photographs afterwards, (m,)
+    points: IntArray  # their indices, (n,)
+    alone: FloatArray  # normal equations of their motions, the point itself eliminated, (n, 3, 3)
+    K: FloatArray  # their coupling with photographs and cameras, (n, 3, a)
+    g: FloatArray  # right-hand sides, (n, 3)
+    squares: FloatArray  # normal equations before the elimination, (n, 3, 3)
+    blocks: FloatArray  # those of each point alone, with all unknowns eliminated, (n, 3, 3)
+
+    def log_sets(self, count: int) -> float:
+        """Return ln of the number of sets of so many points."""
+        return float(
+            gammaln(len(self.points) + 1) - gammaln(count + 1) - gammaln(len(self.points) - count + 1)
+        )
+
+
+def _moves(reduced: Reduced, factor: FloatArray) -> _Moves:
+    """Return the normal equations of motions before the photographs with factor 1."""
+    n, on = len(reduced.L), factor[reduced.image] > 0
+    before, after = (np.bincount(reduced.point[some], minlength=n) for some in (~on, on))
+    points = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
+    # the columns of a motion are those of the point in the photographs afterwards
+    point, B = reduced.point[on], reduced.B[on]
+    Bt = np.swapaxes(B, 1, 2)
+    V = sum_rows(point, Bt @ B, n)[points]
+    Ct = np.swapaxes(reduced.L[points] @ V, 1, 2)
+    K = points_by_cameras(Bt @ reduced.A[on], point, reduced.image[on], n, reduced.photographs)[points]
+    K = K - Ct @ reduced.W[points]
+    g = sum_rows(point, np.einsum("kab,kb->ka", Bt, reduced.v[on]), n)[points]
+    g = g - np.einsum("nab,nb->na", Ct, reduced.y[points]) - K @ (reduced.Sinv @ reduced.t)
+    alone = V - Ct @ np.swapaxes(Ct, 1, 2)
+    return _Moves(factor, points, alone, K, g, V, alone - K @ reduced.Sinv @ np.swapaxes(K, 1, 2))
+
+
+def _each_by_itself(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
+    """Yield the best set of points that moved by different vectors, in the order of their single gains."""
+    squares = np.einsum("nii->ni", moves.squares)
+    single, _ = gains_of(moves.blocks, moves.g, squares)
+    order = np.argsort(-single)
+    tried = order[: min(MAX_MOVED, max(len(order) // 2, 1))]
+    flat = moves.K[tried].reshape(-1, len(reduced.t))
+    H = -flat @ reduced.Sinv @ flat.T
+    for place, j in enumerate(tried):
+        block = slice(3 * place, 3 * place + 3)
+        H[block, block] += moves.alone[j]
+    best: Alternative | None = None
+    for count in range(1, len(tried) + 1):
+        part, others = slice(0, 3 * count), single[order[count:]]
+        gain = gain_of(H[part, part], moves.g[tried].ravel()[part], squares[tried].ravel()[part])
+        spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
+        search, points = moves.log_sets(count), moves.points[tried[:count]]
+        one = Alternative(MOVED, "split", moves.factor, gain, spread, search, points).priced(reduced)
+        if best is None or one.evidence > best.evidence:
+            best = one
+        elif count > 2 * len(best.points) + 4:
+            break
+    if best is not None:
+        yield best
+
+
+def _as_one_body(a: Adjustment, reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
+    """Yield sets of points that moved as a body: those that fit the motion of a point better than none.
+
+    The motion is then that of the set, in turn with the set, until it stays the same.
+    """
+    X, squares = a.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
+    single, _ = gains_of(moves.blocks, moves.g, squares)
+    for first in np.argsort(-single)[:STARTS]:
+        d = -np.linalg.lstsq(moves.blocks[first], moves.g[first], rcond=None)[0]
+        again = d @ moves.blocks @ d + 2 * moves.g @ d < 0
+        for _ in range(ROUNDS):
+            # if most points moved, the others moved in the opposite direction, which is equivalent
+            members = ~again if 2 * again.sum() > len(again) else again
+            if members.sum() < MIN_OF_BODY:
+                break
+            motions = rigid_motions(X, members)
+            M = motions[members]
+            Mt = np.swapaxes(M, 1, 2)
+            K = (Mt @ moves.K[members]).sum(axis=0)
+            H = (Mt @ moves.alone[members] @ M).sum(axis=0) - K @ reduced.Sinv @ K.T
+            g = np.einsum("nij,nj->i", Mt, moves.g[members])
+            gain = gain_of(H, g, np.einsum("nii->i", Mt @ moves.squares[members] @ M))
+            move = motions @ gain.beta
+            left = moves.g - moves.K @ (reduced.Sinv @ (K.T @ gain.beta))
+            left[members] += np.einsum("nij,nj->ni", moves.alone[members], move[members])
+            loss = np.einsum("na,nab,nb->n", move, moves.blocks, move)  # of v'Pv, by a point that changes
+            along = 2 * (left * move).sum(axis=1)
+            again = np.where(members, loss > along, loss + along < 0)
+            if (again == members).all():
+                break
+        if members.sum() < MIN_OF_BODY:
+            continue
+        values, ranks = gains_of(moves.blocks, left, squares)
+        redundancy = int(ranks.sum()) - gain.rank
+        spread = Spread(float(values.sum()) / redundancy, redundancy)
+        search, points = moves.log_sets(int(members.sum())), moves.points[members]
+        yield Alternative(BODY, "split", moves.factor, gain, spread, search, points)

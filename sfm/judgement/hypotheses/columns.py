@@ -12,6 +12,7 @@ Photogrammetric Computer Vision, sec. 4.6.4 (systematic errors), 12.2 (small rot
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,71 +140,27 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
     return size * np.concatenate([strain, bending], axis=2), size
 
 
-def body_motions(points: FloatArray, some: IntArray) -> FloatArray:
+def rigid_motions(points: FloatArray, body: IntArray | BoolArray) -> FloatArray:
     """Return the displacements of points by the six motions of a rigid body, (n, 3, 6).
 
     The motions are three shifts and three small rotations about its centre, which also move its points by 1.
 
     Args:
         points: object points, (n, 3).
-        some: indices of the points on the body.
+        body: those on the body.
     """
-    away = points[some] - points[some].mean(axis=0)
-    moved = np.zeros((len(points), 3, 6))
-    moved[some, :, :3] = np.eye(3)
-    moved[some, :, 3:] = np.swapaxes(np.cross(np.eye(3), away[:, None]), 1, 2) / mean_distance(points[some])
-    return moved
+    away = points - points[body].mean(axis=0)
+    turned = np.swapaxes(np.cross(np.eye(3), away[:, None]), 1, 2) / mean_distance(points[body])
+    return np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turned], axis=2)
 
 
-def interior_columns(a: Adjustment, index: int, parameters: list[int]) -> FloatArray:
-    """Return the derivatives of all image points by parameters of one camera, (k, 2, len(parameters)).
+def interior_columns(
+    a: Adjustment, parameters: Sequence[tuple[int, int]]
+) -> tuple[FloatArray, list[tuple[str, str]], list[float]]:
+    """Return the derivatives by interior parameters; cameras that share a parameter have one column for it.
 
     They are 0 in photographs of other cameras. The unit of a parameter is scaled so that its largest effect
     is 1 px. So parameters of all units have columns of similar size.
-
-    Args:
-        a: adjustment.
-        index: index of the camera.
-        parameters: indices of its parameters.
-    """
-    camera = a.estimate.cameras[index]
-    rows, uv = _tangents_of(a, index)
-    found = np.zeros((len(a.network.image_points), 2, len(parameters)))
-    at = pixel_from_tangents(camera, uv)
-    for column, s in enumerate(parameters):
-        step = _step(camera, s, uv)
-        moved = pixel_from_tangents(_changed(camera, s, step), uv)
-        back = pixel_from_tangents(_changed(camera, s, -step), uv)
-        found[rows, :, column] = np.nan_to_num((moved - back) / (2 * SMALL_MOVE_PX))
-    found[rows[~np.isfinite(at).all(axis=1)]] = 0.0
-    return found
-
-
-def interior_step(a: Adjustment, index: int, parameter: int) -> float:
-    """Return the change of a parameter for one unit of its column in `interior_columns`.
-
-    Args:
-        a: adjustment.
-        index: index of the camera.
-        parameter: index of the parameter.
-    """
-    return _step(a.estimate.cameras[index], parameter, _tangents_of(a, index)[1]) / SMALL_MOVE_PX
-
-
-def _tangents_of(a: Adjustment, index: int) -> tuple[IntArray, FloatArray]:
-    """Return the image points of one camera, (r,), and the tangents of their rays, (r, 2)."""
-    network, estimate = a.network, a.estimate
-    seen = network.image_points
-    rows = np.flatnonzero(network.camera[seen.image] == index)
-    R = estimate.rotation[seen.image[rows]]
-    UVW = np.einsum("kji,kj->ki", R, estimate.points[seen.point[rows]] - estimate.position[seen.image[rows]])
-    return rows, -UVW[:, :2] / UVW[:, 2:]
-
-
-def shared_columns(
-    a: Adjustment, parameters: list[tuple[int, int]]
-) -> tuple[FloatArray, list[tuple[str, str]], list[float]]:
-    """Return the columns of interior parameters; cameras that share a parameter have one column for it.
 
     Args:
         a: adjustment.
@@ -213,16 +170,24 @@ def shared_columns(
         Columns (k, 2, g), (camera or group, parameter name) of each, and the change of the parameter for one
         unit of the column.
     """
+    seen = a.network.image_points
     groups: dict[tuple[str, str], FloatArray] = {}
     units: dict[tuple[str, str], float] = {}
     for index, s in parameters:
         camera = a.estimate.cameras[index]
+        rows = np.flatnonzero(a.network.camera[seen.image] == index)
+        image, point = seen.image[rows], seen.point[rows]
+        away = a.estimate.points[point] - a.estimate.position[image]
+        UVW = np.einsum("kji,kj->ki", a.estimate.rotation[image], away)
+        uv = -UVW[:, :2] / UVW[:, 2:]
+        step = _step(camera, s, uv)
         key = (camera.owner_of(s), camera.names[s])
-        unit = interior_step(a, index, s)
-        found = interior_columns(a, index, [s])[:, :, 0] * (units.setdefault(key, unit) / unit)
-        groups[key] = groups[key] + found if key in groups else found
-    empty = np.zeros((len(a.network.image_points), 2, 0))
-    stacked = np.stack(list(groups.values()), axis=2) if groups else empty
+        unit = units.setdefault(key, step / SMALL_MOVE_PX)
+        difference = pixel_from_tangents(_changed(camera, s, step), uv)
+        difference -= pixel_from_tangents(_changed(camera, s, -step), uv)
+        column = groups.setdefault(key, np.zeros((len(seen), 2)))
+        column[rows] += np.nan_to_num(difference) * (unit / (2 * step))
+    stacked = np.stack(list(groups.values()), axis=2) if groups else np.zeros((len(seen), 2, 0))
     return stacked, list(groups), [units[key] for key in groups]
 
 

@@ -19,18 +19,22 @@ from sfm.judgement.hypotheses.columns import (
     CAMERA_PLACES,
     STRAIN_PLACES,
     Columns,
-    body_motions,
-    interior_step,
+    interior_columns,
     object_fields,
-    shared_columns,
+    rigid_motions,
 )
 from sfm.judgement.hypotheses.score import (
+    NO_GAIN,
+    NONE,
     Gain,
+    Reduced,
     Spread,
+    log_f_sf,
     log_likelihood_gain,
     log_probability,
     squares_gained,
 )
+from sfm.likelihood import price_of
 from sfm.remarks.remark import Quantity
 from sfm.similarity import without_motions
 
@@ -45,18 +49,51 @@ class Alternative:
     """One alternative and the result of its score test."""
 
     family: Family
-    pattern: str  # single | split | linear | alternating | group | each | all
-    factor: FloatArray  # factor of each photograph, (m,)
-    gain: Gain
-    spread: Spread  # spread of the photographs or cameras outside the family
-    log_p: float  # ln of the probability by chance
-    price: float  # q / 2 ln n, plus ln of the number of patterns and sets from which it was chosen
-    search: float  # ln of that number
-    evidence: float  # gain of ln likelihood minus the price
+    pattern: str  # single | split | linear | alternating | each | all
+    factor: FloatArray  # factor of each photograph, (m,); its run of photographs if `pattern` is each
+    gain: Gain = NO_GAIN
+    spread: Spread = NONE  # spread of the photographs or points outside the family
+    search: float = 0.0  # ln of the number of patterns and sets of points from which it was chosen
     points: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # moved points
     parameters: tuple[tuple[int, int], ...] = ()  # (camera, parameter) freed
     among: BoolArray | None = None  # photographs within which some differ, (m,); None: all
+    price: float = 0.0  # q / 2 ln n, plus the search
+    redundancy: int = 1  # redundancy of the adjustment
     design_effect: float = 1.0  # factor of correlated errors of neighbours on the gain expected by chance
+
+    def priced(self, reduced: Reduced) -> Alternative:
+        """Return the alternative with its price, by the image points that each part of it moves.
+
+        Args:
+            reduced: normal equations of the adjustment.
+        """
+        on, parts = self.factor[reduced.image] != 0, 1
+        if self.pattern == "each":
+            on, parts = np.ones_like(on), int(self.factor.max()) + 1
+        if len(self.points):
+            on &= np.isin(reduced.point, self.points)
+        price = price_of(self.gain.rank, int(on.sum()) // parts, self.search)
+        return replace(self, price=price, redundancy=reduced.redundancy)
+
+    @property
+    def log_p(self) -> float:
+        """Ln of the probability of its gain by chance."""
+        gain, q, r = self.gain.value, self.gain.rank, self.redundancy
+        log_p = log_probability(gain / self.design_effect, q, r)
+        if self.spread.factor > 1 and q:
+            log_p = max(log_p, log_f_sf(self.spread.ratio(gain, q, r), q, self.spread.redundancy))
+        return log_p
+
+    @property
+    def evidence(self) -> float:
+        """Gain of ln likelihood minus the price."""
+        grows = self.spread.evidence(self.gain.value, self.gain.rank, self.redundancy)
+        return min(grows - self.price, self.evidence_beside_spread)
+
+    @property
+    def evidence_beside_spread(self) -> float:
+        """Evidence whatever the photographs differ by."""
+        return log_likelihood_gain(self.gain.value / self.design_effect, self.redundancy) - self.price
 
     @property
     def photographs(self) -> IntArray:
@@ -79,21 +116,6 @@ class Alternative:
             columns: derivatives of its image points.
         """
         return self.family.columns(self, a, columns)
-
-    def with_design_effect(self, effect: float, redundancy: int) -> Alternative:
-        """Return the alternative tested with its gain divided by a design effect.
-
-        Args:
-            effect: design effect of correlated errors.
-            redundancy: redundancy of the adjustment.
-        """
-        gain = self.gain.value / effect
-        return replace(
-            self,
-            design_effect=effect,
-            log_p=max(self.log_p, log_probability(gain, self.gain.rank, redundancy)),
-            evidence=min(self.evidence, log_likelihood_gain(gain, redundancy) - self.price),
-        )
 
     def deflated(self, gain: float, redundancy: int) -> float:
         """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect.
@@ -173,8 +195,7 @@ class CameraFamily(OfPhotographs):
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""
-        kinds = {"linear": "camera_drift", "each": "camera_varies", "pair": "two_cameras"}
-        return kinds.get(pattern, "other_camera")
+        return {"linear": "camera_drift", "each": "camera_varies"}.get(pattern, "other_camera")
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: photographs of a camera."""
@@ -188,15 +209,10 @@ class CameraFamily(OfPhotographs):
         if one.pattern == "each":
             return self._of_each(beta.reshape(-1, len(self.places)), half)
         linear = one.pattern == "linear"
-        photographs = one.photographs
-        if one.pattern == "pair" and one.among is not None:  # it is unknown which of the two differs
-            photographs = np.flatnonzero(one.among)
         sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
         # a column of 1 moves an image point at the edge by 1 px
         largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
-        parts: Parts = {
-            "photographs": tuple(a.network.images[i] for i in photographs),
-        }
+        parts: Parts = {"photographs": tuple(a.network.images[i] for i in one.photographs)}
         if abs(largest * float(beta[0])) > SEEN_PX:
             parts["change"] = (100 * sign * largest * float(beta[0]) / half, "%")
         if one.among is not None and not one.among.all():
@@ -262,13 +278,11 @@ class ObjectFamily(OfPhotographs):
 
 @dataclass(frozen=True)
 class PointFamily(Family):
-    """Object points that moved: each on its own, all by one vector, or all as a body."""
-
-    remark: str = "points_moved"
+    """Object points that moved, or given ones that are not as given, each on its own."""
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""
-        return self.remark
+        return "shape_of_control" if pattern == "all" else "points_moved"
 
     def cause(self, one: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
@@ -276,53 +290,53 @@ class PointFamily(Family):
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        seen = a.network.image_points
-        field_ = self.field(a.estimate.points, one.points)[seen.point]
-        return np.asarray(one.factor[seen.image][:, None, None] * (columns.point @ field_))
+        seen, place = a.network.image_points, np.full(len(a.network.points), -1)
+        place[one.points] = np.arange(len(one.points))
+        rows = np.flatnonzero(place[seen.point] >= 0)
+        D = np.zeros((len(seen), 2, len(one.points), 3))
+        D[rows, :, place[seen.point[rows]]] = (
+            one.factor[seen.image[rows]][:, None, None] * columns.point[rows]
+        )
+        return D.reshape(len(seen), 2, -1)
 
     def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return the displacement of points in the photographs that differ most, (n, 3)."""
-        return np.asarray(self.field(points, one.points) @ beta)
+        away = np.zeros_like(points)
+        away[one.points] = beta.reshape(-1, 3)
+        return away
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return the points that moved, the largest displacement, and the first photograph afterwards."""
-        away = self.displaced(one, a.estimate.points, beta)[one.points]
+        """Return the points and their largest displacement.
+
+        Of points that moved also the first photograph afterwards; of given ones the standard deviation of
+        coordinates that covers all displacements.
+        """
+        shape = _parts_of_shape(self.displaced(one, a.estimate.points, beta)[one.points], unit)
+        if one.pattern == "all":
+            return shape
         return {
             "photographs": tuple(a.network.images[i] for i in one.photographs),
             "points": tuple(a.network.points[j] for j in one.points),
             "from": (a.network.images[int(np.flatnonzero(one.factor > 0)[0])],),
-            "distance": Quantity(float(np.linalg.norm(away, axis=1).max()), unit),
+            "distance": shape["distance"],
         }
-
-    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) if some of them move, (n, 3, q)."""
-        each = np.zeros((len(points), 3, len(some), 3))
-        each[some, :, np.arange(len(some))] = np.eye(3)
-        return each.reshape(len(points), 3, -1)
-
-
-@dataclass(frozen=True)
-class ShiftedFamily(PointFamily):
-    """Object points that moved by one vector."""
-
-    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) if some of them move, (n, 3, 3)."""
-        shift = np.zeros((len(points), 3, 3))
-        shift[some] = np.eye(3)
-        return shift
 
 
 @dataclass(frozen=True)
 class BodyFamily(PointFamily):
-    """Object points of a rigid body that moved, by a vector and a small rotation."""
+    """Object points that moved as a rigid body, by a vector and a small rotation."""
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
-        """Return a key for the cause: a body."""
-        return ("body", int(one.points[0]))
+    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
+        seen, motions = a.network.image_points, np.zeros((len(a.network.points), 3, 6))
+        motions[one.points] = rigid_motions(a.estimate.points, one.points)[one.points]
+        return one.factor[seen.image][:, None, None] * (columns.point @ motions[seen.point])
 
-    def field(self, points: FloatArray, some: IntArray) -> FloatArray:
-        """Return the displacements of points (n, 3) if some of them move, (n, 3, 6)."""
-        return body_motions(points, some)
+    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+        """Return the displacement of points in the photographs that differ most, (n, 3)."""
+        away = np.zeros_like(points)
+        away[one.points] = rigid_motions(points, one.points)[one.points] @ beta
+        return away
 
 
 @dataclass(frozen=True)
@@ -345,7 +359,7 @@ class InteriorFamily(Family):
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        return shared_columns(a, list(one.parameters))[0]
+        return interior_columns(a, one.parameters)[0]
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the parameters and, for a single one, the value that fits the image points."""
@@ -356,7 +370,7 @@ class InteriorFamily(Family):
         names = tuple(dict.fromkeys(a.estimate.cameras[i].names[p] for i, p in one.parameters))
         parts: Parts = {"camera": camera.owner_of(s), "parameters": names}
         if len(names) == 1:
-            found = value + float(beta[0]) * interior_step(a, index, s)
+            found = value + float(beta[0]) * interior_columns(a, one.parameters)[2][0]
             given = a.network.interior
             at = np.flatnonzero((given.camera == index) & (given.parameter == s))
             stated = float(given.value[at[0]]) if self.of_given else value
@@ -373,61 +387,29 @@ class FormatFamily(Family):
         return "distortion_not_described"
 
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        return format_columns(a)
+        """Return the columns of an alternative for all image points, px, (k, 2, q).
+
+        Photographs of all sizes have the same cells.
+        """
+        seen = a.network.image_points
+        size = np.array([camera.size_px for camera in a.estimate.cameras])[a.network.camera[seen.image]]
+        column, row = np.clip((CELLS * seen.xy / size).astype(np.int64), 0, CELLS - 1).T
+        D = np.zeros((len(seen), 2, CELLS**2, 2))
+        D[np.arange(len(seen)), :, CELLS * row + column] = np.eye(2)
+        return D.reshape(len(seen), 2, 2 * CELLS**2)
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the largest displacement of a cell."""
         return {"largest": (float(np.linalg.norm(beta.reshape(-1, 2), axis=1).max()), "px")}
 
 
-@dataclass(frozen=True)
-class GivenShapeFamily(Family):
-    """Given points at other places relative to one another; the parameters are their displacements."""
-
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "shape_of_control"
-
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        seen, place = a.network.image_points, np.full(len(a.network.points), -1)
-        place[one.points] = np.arange(len(one.points))
-        rows = np.flatnonzero(place[seen.point] >= 0)
-        D = np.zeros((len(seen), 2, len(one.points), 3))
-        D[rows, :, place[seen.point[rows]]] = columns.point[rows]
-        return D.reshape(len(seen), 2, -1)
-
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
-        """Return the largest displacement, and the standard deviation of coordinates that covers them all."""
-        return _parts_of_shape(beta.reshape(-1, 3), unit)
-
-
 def _parts_of_shape(away: FloatArray, unit: str) -> Parts:
-    """Return the largest displacement of given points (n, 3), and their root mean square."""
+    """Return the largest displacement of points (n, 3), and their root mean square."""
     away = away[np.isfinite(away).all(axis=1)]
     return {
         "distance": Quantity(float(np.linalg.norm(away, axis=1).max()), unit),
         "sigma": Quantity(float(np.sqrt((away**2).mean())), unit),
     }
-
-
-def format_columns(a: Adjustment) -> FloatArray:
-    """Return the columns of a displacement of each cell of the format, (k, 2, 2 cells).
-
-    Photographs of all sizes have the same cells.
-
-    Args:
-        a: adjustment.
-    """
-    network = a.network
-    seen = network.image_points
-    size = np.array([camera.size_px for camera in a.estimate.cameras])[network.camera[seen.image]]
-    column, row = np.clip((CELLS * seen.xy / size).astype(np.int64), 0, CELLS - 1).T
-    D = np.zeros((len(seen), 2, CELLS**2, 2))
-    D[np.arange(len(seen)), 0, CELLS * row + column, 0] = 1.0
-    D[np.arange(len(seen)), 1, CELLS * row + column, 1] = 1.0
-    return D.reshape(len(seen), 2, 2 * CELLS**2)
 
 
 CAMERA_FAMILIES = (
@@ -444,6 +426,4 @@ OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     ObjectFamily("bending", BENDING_PLACES),
 )
 HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)
-FORMAT, GIVEN_SHAPE = FormatFamily("format"), GivenShapeFamily("given shape")
-MOVED, SHIFTED = PointFamily("moved"), ShiftedFamily("shifted")
-BODY = BodyFamily("body", "plate_moved")
+FORMAT, MOVED, BODY = FormatFamily("format"), PointFamily("moved"), BodyFamily("body")

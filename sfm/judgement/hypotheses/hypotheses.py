@@ -11,7 +11,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,19 +22,19 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import FALSE_ALARM, MIN_LEAD
 from sfm.errors import GeometryError
 from sfm.judgement.hypotheses.alternatives import (
     ALPHA,
+    MIN_GROUP,
     alternatives_of,
     cameras_of_photographs,
     interiors,
     is_significant,
 )
 from sfm.judgement.hypotheses.columns import columns_of
-from sfm.judgement.hypotheses.families import GIVEN_SHAPE, HELD, Alternative, InteriorFamily
-from sfm.judgement.hypotheses.moved import MIN_GROUP
+from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily
 from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
@@ -44,10 +44,8 @@ from sfm.judgement.hypotheses.refit import (
     unchecked_assumptions,
 )
 from sfm.judgement.hypotheses.score import (
-    NONE,
     Gain,
     Reduced,
-    log_likelihood_gain,
     reduce_adjustment,
     squares_gained,
 )
@@ -66,7 +64,6 @@ MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points 
 MAX_WORK = 3e8
 MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
-MIN_OF_BODY = 3  # points that determine the six motions of a body
 OF_FREE_POINTS = (  # tests that do not apply to given points
     *("assumptions_tested", "assumptions_untested", "photographs_untested"),
     *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
@@ -98,15 +95,12 @@ class JudgedAssumptions:
     unchecked: tuple[Remark, ...] = ()  # assumptions that are not tested, or only weakly
 
 
-def judge_alternatives(
-    final: Adjustment, *, unit: str = "", bodies: Sequence[Collection[str]] = ()
-) -> JudgedAssumptions:
+def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumptions:
     """Return the evidence of the image points against the assumptions of an adjustment.
 
     Args:
         final: finished adjustment with its covariance.
         unit: object unit, for the remarks.
-        bodies: names of the points of each rigid body, such as a plate, that may move relative to the others.
     """
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
@@ -116,7 +110,7 @@ def judge_alternatives(
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     free = free_network(final)
-    found = _judge_free(free, unit, bodies, without)
+    found = _judge_free(free, unit, without)
     if not calibration:
         return found
     try:
@@ -130,17 +124,14 @@ def judge_alternatives(
     return replace(found, unchecked=(*few, *unchecked))
 
 
-def _judge_free(
-    plain: Adjustment | None, unit: str, bodies: Sequence[Collection[str]], without: str | None
-) -> JudgedAssumptions:
+def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:
     """Return the evidence of the image points alone; `plain` is None if they determine no network."""
     if plain is None:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     photographs = plain.network.images
     try:
-        moving = _moving_bodies(plain, bodies)
-        causes = find_causes(plain, moving)
-        unchecked = unchecked_assumptions(plain, len(moving), without)
+        causes = find_causes(plain)
+        unchecked = unchecked_assumptions(plain, without)
     except np.linalg.LinAlgError:
         return JudgedAssumptions(unchecked=(remark("assumptions_untested"),))
     tested = remark("assumptions_tested", photographs=photographs, causes=len(causes))
@@ -190,7 +181,7 @@ def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
-    cause = _best(final, (), beside=() if free is None else _with_free_shape(final, free))
+    cause = _best(final, beside=() if free is None else _with_free_shape(final, free))
     if cause is None or (
         cause.refit.shift < MIN_NAMED_SIGMAS and cause.alternative.kind != "shape_of_control"
     ):
@@ -221,29 +212,15 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     return remark(one.kind, of=of, **size, instead=instead or None, **parts)
 
 
-def _moving_bodies(plain: Adjustment, bodies: Sequence[Collection[str]]) -> tuple[IntArray, ...]:
-    """Return the points of each body that may move relative to others; of a pair only one body is kept."""
-    names, known = plain.network.points, np.isfinite(plain.estimate.points).all(axis=1)
-    members = [known & np.isin(names, list(one)) for one in bodies]
-    members = [one for one in members if one.sum() >= MIN_OF_BODY and (known & ~one).sum() >= MIN_OF_BODY]
-    members = [
-        one
-        for k, one in enumerate(members)
-        if not any((one == known & ~other).all() for other in members[k + 1 :])
-    ]
-    return tuple(np.flatnonzero(one) for one in members)
-
-
-def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cause, ...]:
+def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
     """Return the accepted alternatives, clearest first.
 
     Args:
         plain: adjustment of the image points alone, with gross errors rejected.
-        bodies: object points of each rigid body that may move relative to the others.
     """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        found = _best(plain, causes, bodies)
+        found = _best(plain, causes)
         if found is None:
             break
         causes = _still_needed(plain, causes, found)
@@ -254,8 +231,7 @@ def find_causes(plain: Adjustment, bodies: Sequence[IntArray] = ()) -> tuple[Cau
 
 def _best(
     plain: Adjustment,
-    causes: tuple[Cause, ...],
-    bodies: Sequence[IntArray] = (),
+    causes: tuple[Cause, ...] = (),
     *,
     beside: Sequence[tuple[Alternative, Refit]] = (),
 ) -> Cause | None:
@@ -268,15 +244,14 @@ def _best(
     before = [(one.alternative, one.refit.beta) for one in causes]
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
-    every = alternatives_of(current, reduced, columns, bodies)
+    every = alternatives_of(current, reduced, columns)
     once: dict[tuple[object, ...], Alternative] = {}
     for one in every:
         if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA):
             once.setdefault(one.family.cause(one), one)
     if once:  # if one parameter of all photographs explains the errors, no other cause is needed
         for one in every:
-            gained = log_likelihood_gain(one.gain.value / one.design_effect, reduced.redundancy)
-            if isinstance(one.family, InteriorFamily) and gained - one.price > np.log(1 / ALPHA):
+            if isinstance(one.family, InteriorFamily) and one.evidence_beside_spread > np.log(1 / ALPHA):
                 once.setdefault(one.family.cause(one), one)
     of_kind: Counter[object] = Counter()
     to_try = []
@@ -349,16 +324,13 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     seen = np.isin(held.network.image_points.point, given.point)
     price = price_of(q, int(seen.sum()) // len(given))  # each moves its image points only
     one = Alternative(
-        GIVEN_SHAPE,
+        MOVED,
         "all",
-        factor=np.ones(len(held.network.images)),
-        gain=Gain(squares_gained(gain, held.redundancy), q, beta),
-        spread=NONE,
-        log_p=0.0,
-        price=price,
-        search=0.0,
-        evidence=gain - price,
+        np.ones(len(held.network.images)),
+        Gain(squares_gained(gain, held.redundancy), q, beta),
         points=given.point,
+        price=price,
+        redundancy=held.redundancy,
     )
     return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
 
@@ -412,7 +384,8 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
         reduced = reduce_adjustment(plain, columns_of(plain))
     except np.linalg.LinAlgError:
         return ()
-    every = [one for one in interiors(plain, reduced, HELD) if len(one.gain.beta) == 1]
+    single = [one for one in interiors(plain, reduced, HELD) if len(one.gain.beta) == 1]
+    every = [one.priced(reduced) for one in single]
     found = sorted((one for one in every if is_significant(one, len(every))), key=lambda one: -one.gain.value)
     names = []
     for one in found:
@@ -484,7 +457,7 @@ def best_explanation(plain: Adjustment) -> Cause | None:
     if len(plain.network.images) > MAX_PHOTOGRAPHS:
         return None
     try:
-        return _best(plain, ())
+        return _best(plain)
     except np.linalg.LinAlgError:
         return None
 

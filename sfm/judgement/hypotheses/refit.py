@@ -28,11 +28,14 @@ from sfm.conventions import FloatArray
 from sfm.distributions import POWER
 from sfm.errors import GeometryError
 from sfm.judgement.hypotheses.alternatives import (
+    MIN_GROUP,
     cameras_of_photographs,
     count_alternatives,
     interior_parameters,
     needed_gain,
+    patterns_of,
     photographs_among,
+    too_many_cameras,
 )
 from sfm.judgement.hypotheses.columns import Columns, columns_of
 from sfm.judgement.hypotheses.families import (
@@ -42,11 +45,8 @@ from sfm.judgement.hypotheses.families import (
     Alternative,
     InteriorFamily,
 )
-from sfm.judgement.hypotheses.moved import MIN_GROUP, too_many_cameras
 from sfm.judgement.hypotheses.score import (
     MIN_DETERMINED_SHARE,
-    NONE,
-    Gain,
     Reduced,
     directions_of,
     gain_of,
@@ -245,12 +245,11 @@ def precision_factor(a: Adjustment) -> float:
     return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
 
 
-def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = None) -> tuple[Remark, ...]:
+def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Remark, ...]:
     """Return remarks on assumptions that the tests hardly check, with the shift of an undetected error.
 
     Args:
         a: adjustment of the image points alone, with its covariance.
-        bodies: number of bodies that are tested for movement.
         without: name of what fixes all coordinates of the result, so that only those of `a` shift; None if
             nothing does.
 
@@ -259,7 +258,7 @@ def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = 
     """
     columns = columns_of(a)
     reduced = reduce_adjustment(a, columns)
-    number, rows = cameras_of_photographs(a), count_alternatives(a, bodies)
+    number, rows = cameras_of_photographs(a), count_alternatives(a)
     untested: tuple[Remark, ...] = ()
     if too_many_cameras(number):
         untested = (remark("cameras_untested", cameras=int(number.max()) + 1),)
@@ -294,29 +293,23 @@ def unchecked_assumptions(a: Adjustment, bodies: int = 0, without: str | None = 
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """Yield alternatives for each held parameter, and for a change of camera or a strain halfway through.
 
-    If a camera has two or three photographs, the last one differs. Bending is left out, because the worst of
+    If a camera has three photographs, the last one differs. Bending is left out, because the worst of
     its 18 directions is not the shape of any real object.
     """
-    nothing = Gain(0.0, 0, np.zeros(0))
     for owner in interior_parameters(a, HELD):
         for some in owner:
-            yield Alternative(
-                *(HELD, "all", np.ones(reduced.photographs), nothing, NONE, 0.0, 0.0, 0.0, 0.0),
-                parameters=some,
-            )
+            yield Alternative(HELD, "all", np.ones(reduced.photographs), parameters=some)
     camera = cameras_of_photographs(a)
     for family in (*CAMERA_FAMILIES, STRAIN):
         for among in photographs_among(family, camera):
             m = int(among.sum())
-            if m < MIN_GROUP or (m < 2 * MIN_GROUP and not family.of_camera):
-                continue
             if m < 2 * MIN_GROUP:
-                pattern, first, tried = ("single", m - 1, m) if m > MIN_GROUP else ("pair", 1, 1)
+                pattern, first, tried = "single", m - 1, m
             else:
                 pattern, first, tried = "split", m // 2, m - 2 * MIN_GROUP + 1
-            after = (among & (np.cumsum(among) > first)).astype(float)
-            search = float(np.log(tried))
-            yield Alternative(*(family, pattern, after, nothing, NONE, 0.0, 0.0, search, 0.0), among=among)
+            if any(name == pattern for name, _ in patterns_of(family, m)):
+                after = (among & (np.cumsum(among) > first)).astype(float)
+                yield Alternative(family, pattern, after, search=float(np.log(tried)), among=among)
 
 
 def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int) -> float:
@@ -340,7 +333,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)
-    shifted = without_motions(X, reduced.shifts(D) @ longest)
+    shifted = without_motions(X, reduced.absorb(D)[0] @ longest)
     away = np.stack([one.family.displaced(one, X, b) for b in longest.T], axis=2)
     return max(
         float((np.linalg.norm(part[known], axis=2) / sigma[known]).max(initial=0.0))

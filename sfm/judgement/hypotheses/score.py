@@ -19,35 +19,20 @@ Foerstner and Wrobel (2016), sec. 4.6.4.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.distributions import f_sf
-from sfm.judgement.hypotheses.columns import Columns, shared_columns
+from sfm.judgement.hypotheses.columns import Columns, interior_columns
 from sfm.network import rows_of, sum_rows
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5
 ROUNDING = float(np.sqrt(np.finfo(float).eps))  # share of the squares of a single column left by rounding
-SMALLEST_LOG = -600.0  # ln of the smallest probability that `f_sf` is used for
-MAX_TERMS = 10_000  # most terms of the series for smaller probabilities
-
-
-class _Eliminated(NamedTuple):
-    """Whitened columns (k, 2, q) of which the unknowns are eliminated."""
-
-    H: FloatArray  # normal equations, (q, q)
-    g: FloatArray  # right-hand side, (q,)
-    squares: FloatArray  # of the columns before the elimination, (q,)
-    left: FloatArray  # columns after it, (k, 2, q)
-    by_cameras: FloatArray  # shifts of photographs and cameras by the columns, (a, q)
-    by_points: FloatArray  # shifts of object points by the columns, (n, 3, q)
 
 
 @dataclass(frozen=True)
@@ -94,32 +79,22 @@ class Reduced:
             D: whitened columns, (k, 2, f).
             run: run of each photograph, (m,).
         """
-        n, f, count = len(self.L), D.shape[2], int(run.max()) + 1
-        owner = run[self.image]
-        by_points = np.swapaxes(self.B, 1, 2) @ D
-        C = sum_rows(self.point * count + owner, by_points, n * count).reshape(n, count, 3, f)
-        flat_C = np.moveaxis(self.L[:, None] @ C, 1, 2).reshape(3 * n, count * f)
-        by = np.swapaxes(self.A, 1, 2) @ D
-        m = self.photographs
-        K = np.zeros((len(self.t), count, f))
+        count, f = int(run.max()) + 1, D.shape[2]
         H, g, squares = np.zeros((count, f, count, f)), np.zeros((count, f)), np.zeros((count, f))
-        for i, rows in enumerate(rows_of(self.image, m)):
-            K[6 * i : 6 * i + 6, run[i]] = by[rows, :6].sum(axis=0)
-        for u, rows in enumerate(rows_of(owner, count)):
+        for u, rows in enumerate(rows_of(run[self.image], count)):
             flat = D[rows].reshape(-1, f)
             H[u, :, u] = flat.T @ flat
             g[u] = flat.T @ self.v[rows].ravel()
             squares[u] = np.einsum("kq,kq->q", flat, flat)
-            K[6 * m :, u] = by[rows, 6:].sum(axis=0)
-        flat_K = K.reshape(len(self.t), count * f) - self.W.reshape(3 * n, -1).T @ flat_C
-        H -= (flat_C.T @ flat_C + flat_K.T @ (self.Sinv @ flat_K)).reshape(count, f, count, f)
-        g -= (flat_C.T @ self.y.ravel() + flat_K.T @ (self.Sinv @ self.t)).reshape(count, f)
+        C, K = self._eliminated(D, run)
+        H -= (C.T @ C + K.T @ (self.Sinv @ K)).reshape(count, f, count, f)
+        g -= (C.T @ self.y.ravel() + K.T @ (self.Sinv @ self.t)).reshape(count, f)
         return H, g, squares
 
     def project(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return H (q, q), g (q,) and the squares (q,) of whitened columns (k, 2, q)."""
-        found = self._eliminated(D)
-        return found.H, found.g, found.squares
+        H, g, squares = self.project_by_run(D, np.zeros(self.photographs, dtype=np.int64))
+        return H[0, :, 0], g[0], squares[0]
 
     def design_effect(self, D: FloatArray) -> float:
         """Return the factor by which correlated errors of neighbours multiply a gain by chance, at least 1.
@@ -131,22 +106,12 @@ class Reduced:
         """
         if self.correlation is None:
             return 1.0
-        found = self._eliminated(D)
-        relative = self.sigma0_px * self.F
-        variance = found.H + correlated_sum(self.image, self.xy, relative, found.left, self.correlation)
-        effects = determined_inverse(found.H, found.squares) @ variance
+        H, _, squares = self.project(D)
+        left = self.absorb(D)[2]
+        correlated = correlated_sum(self.image, self.xy, self.sigma0_px * self.F, left, self.correlation)
+        effects = determined_inverse(H, squares) @ (H + correlated)
         first = float(np.trace(effects))
         return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
-
-    def shifts(self, D: FloatArray) -> FloatArray:
-        """Return the shifts of object points if the effect of columns is in the image points, (n, 3, q).
-
-        The shifts are those of an adjustment without the columns.
-
-        Args:
-            D: whitened columns, (k, 2, q).
-        """
-        return self._eliminated(D).by_points
 
     def scores(self, direction: FloatArray, step: FloatArray) -> FloatArray:
         """Return the contribution of each photograph to the slope along a direction, after a step, (m,).
@@ -155,7 +120,7 @@ class Reduced:
             direction: whitened effect of the direction on the image points, (k, 2).
             step: whitened effect of the step on the image points, (k, 2).
         """
-        left = self._eliminated(np.stack([direction, step], axis=2)).left
+        left = self.absorb(np.stack([direction, step], axis=2))[2]
         slope = ((self.v + left[:, :, 1]) * left[:, :, 0]).sum(axis=1)
         return np.asarray(np.bincount(self.image, slope, minlength=self.photographs), dtype=float)
 
@@ -169,36 +134,40 @@ class Reduced:
         m = self.photographs
         D = np.zeros((len(self.used), 2, m))
         D[np.arange(len(self.used)), :, self.image] = self.v
-        found = self._eliminated(D)
+        by_points, by_cameras, _ = self.absorb(D)
         sigma = np.sqrt(np.diagonal(self.Sinv)[6 * m :])
-        return found.by_points, found.by_cameras[6 * m :] / sigma[:, None]
+        return by_points, by_cameras[6 * m :] / sigma[:, None]
 
-    def _eliminated(self, D: FloatArray) -> _Eliminated:
-        """Return whitened columns with the unknowns eliminated."""
-        n, q = len(self.L), D.shape[2]
-        C = sum_rows(self.point, np.swapaxes(self.B, 1, 2) @ D, n)
-        flat_C = (self.L @ C).reshape(3 * n, q)
-        flat = D.reshape(-1, q)
-        squares = np.einsum("kq,kq->q", flat, flat)
-        K = self._by_cameras(D) - self.W.reshape(3 * n, -1).T @ flat_C
-        g = flat.T @ self.v.ravel() - flat_C.T @ self.y.ravel() - K.T @ (self.Sinv @ self.t)
+    def absorb(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the unknowns absorb if the effect of columns is in the image points.
+
+        Args:
+            D: whitened columns, (k, 2, q).
+
+        Returns:
+            Shifts of object points (n, 3, q), those of photographs and cameras (a, q), and what is left of
+            the columns, (k, 2, q).
+        """
+        n, m, q = len(self.L), self.photographs, D.shape[2]
+        C, K = self._eliminated(D, np.zeros(m, dtype=np.int64))
         by_cameras = self.Sinv @ K
-        H = flat.T @ flat - flat_C.T @ flat_C - K.T @ by_cameras
-        m = self.photographs
-        by_points = np.swapaxes(self.L, 1, 2) @ (flat_C.reshape(n, 3, q) - self.W @ by_cameras)
+        by_points = np.swapaxes(self.L, 1, 2) @ (C.reshape(n, 3, q) - self.W @ by_cameras)
         left = D - self.B @ by_points[self.point]
         left -= self.A[:, :, :6] @ by_cameras[: 6 * m].reshape(m, 6, q)[self.image]
         left -= self.A[:, :, 6:] @ by_cameras[6 * m :]
-        return _Eliminated(H, g, squares, left, by_cameras, by_points)
+        return by_points, by_cameras, left
 
-    def _by_cameras(self, D: FloatArray) -> FloatArray:
-        """Return A'D, (a, q)."""
-        m, q = self.photographs, D.shape[2]
+    def _eliminated(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return L B'D (3 n, u f), and A'D (a, u f) reduced by the object points."""
+        n, m, f, count = len(self.L), self.photographs, D.shape[2], int(run.max()) + 1
+        owner = run[self.image]
+        by_points = sum_rows(self.point * count + owner, np.swapaxes(self.B, 1, 2) @ D, n * count)
+        C = np.moveaxis(self.L[:, None] @ by_points.reshape(n, count, 3, f), 1, 2).reshape(3 * n, count * f)
         by = np.swapaxes(self.A, 1, 2) @ D
-        K = np.zeros((len(self.t), q))
-        K[: 6 * m] = sum_rows(self.image, by[:, :6], m).reshape(6 * m, q)
-        K[6 * m :] = by[:, 6:].sum(axis=0)
-        return K
+        K = np.zeros((len(self.t), count, f))
+        K[: 6 * m].reshape(m, 6, count, f)[np.arange(m), :, run] = sum_rows(self.image, by[:, :6], m)
+        K[6 * m :] = np.moveaxis(sum_rows(owner, by[:, 6:], count), 0, 1)
+        return C, K.reshape(len(self.t), count * f) - self.W.reshape(3 * n, -1).T @ C
 
 
 def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
@@ -287,7 +256,7 @@ def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the columns of free interior parameters, (k, 2, i), and weight and slope of given values."""
     network, cameras = a.network, a.estimate.cameras
     used = np.unique(network.camera).tolist()
-    columns, keys, units = shared_columns(
+    columns, keys, units = interior_columns(
         a, [(index, int(s)) for index in used for s in np.flatnonzero(cameras[index].free)]
     )
     given = network.interior
@@ -348,6 +317,9 @@ class Gain:
     value: float
     rank: int  # number of its parameters that the image points determine
     beta: FloatArray  # step of its parameters, (q,)
+
+
+NO_GAIN = Gain(0.0, 0, np.zeros(0))
 
 
 def directions_of(H: FloatArray, squares: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -430,31 +402,12 @@ def log_probability(gain: float, q: int, redundancy: int) -> float:
     left = redundancy - gain
     if q < 1 or redundancy <= q:
         return 0.0
-    if left <= 0:
-        return -np.inf
-    return log_f_sf((gain / q) / (left / (redundancy - q)), q, redundancy - q)
+    return log_f_sf((gain / q) / (left / (redundancy - q)), q, redundancy - q) if left > 0 else -np.inf
 
 
 def log_f_sf(f: float, q: int, d: int) -> float:
-    """Return ln of the probability that F of redundancies q and d is larger than f.
-
-    Probabilities below the range of a float come from the series of the incomplete beta function.
-
-    Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.5.2 and 26.6.2.
-    """
-    p = float(f_sf(f, q, d))
-    if p > np.exp(SMALLEST_LOG):
-        return float(np.log(p))
-    half, x = d / 2, d / (d + q * f)
-    term, total = 1.0, 1.0
-    for i in range(MAX_TERMS):
-        term *= (half + q / 2 + i) / (half + 1 + i) * x
-        total += term
-        if term < np.finfo(float).eps * total:
-            break
-    return float(
-        half * np.log(x) + q / 2 * np.log1p(-x) - np.log(half) - special.betaln(half, q / 2) + np.log(total)
-    )
+    """Return ln of the probability that F of redundancies q and d is larger than f, at least -708."""
+    return float(np.log(max(float(f_sf(f, q, d)), np.finfo(float).tiny)))
 
 
 def log_likelihood_gain(gain: float, redundancy: int) -> float:

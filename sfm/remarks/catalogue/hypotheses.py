@@ -123,17 +123,6 @@ ROWS = (
         explains=OF_GIVEN,
     ),
     Kind(
-        "two_cameras",
-        SHIFT,
-        "{photographs} were assumed to share one camera[[ ({camera})]], but do not[[: c changes by "
-        "{change:+} from the first to the second]][[, the principal point by {away}]]. "
-        f"{SHIFTED}{INSTEAD}",
-        "zoom, focus or camera changed between the two, or one of them was cropped or resampled",
-        "Give each its camera in the survey file, or set per_photograph.",
-        short="a different camera in one of two photographs",
-        explains=OF_GIVEN,
-    ),
-    Kind(
         "camera_varies",
         SHIFT,
         "The camera changes between photographs[[, c by up to {change}]][[, principal point by up to "
@@ -231,17 +220,6 @@ ROWS = (
         "an edge in front of another surface, shine, shadows, or something that moved",
         "Do not use {points:this point|these points}; photographs at smaller steps produce fewer of them.",
         short="windows that show a different spot",
-    ),
-    Kind(
-        "plate_moved",
-        SHIFT,
-        "A plate moved relative to the others from {from} on, by up to {distance}, {shift} standard "
-        f"deviations: that of {{points:point}} {{points}}.{INSTEAD}",
-        "a plate slipped between the photographs, or the support of the plates bent",
-        "Fix the plates to one another and photograph them again, or adjust the photographs before "
-        "{from} and those from {from} on as two surveys.",
-        short="a plate that moved",
-        explains=OF_GIVEN,
     ),
     Kind(
         "calibrated_from_few",

@@ -24,9 +24,9 @@ from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.tables import as_judged, judge_tables
-from sfm.judgement.hypotheses.alternatives import explain_rejections
 from sfm.judgement.hypotheses.bumps import bump_remarks
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
+from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations
@@ -147,8 +147,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     unit = survey.unit if final.has_scale else NO_SCALE
     stated = None if model.stated_moment is None else model.stated_moment[settled.images]
     report_step("testing the assumptions")
-    plates = _points_of_plates(survey, matched.naming, final.network)
-    judged = judge_alternatives(final, unit=unit, bodies=plates)
+    judged = judge_alternatives(final, unit=unit)
     return SolvedSurvey(
         model,
         final,
@@ -170,7 +169,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
             *windows_elsewhere(survey, judged.causes),
             *judged.unchecked,
             *bump_remarks(final, unit, stated),
-            *windows_elsewhere(survey, explain_rejections(final, unit=unit, bodies=plates)),
+            *windows_elsewhere(survey, explain_rejections(final, unit=unit)),
             *remarks_on_held_c(found.c_held, judged.causes),
         ),
         left_out,

@@ -175,7 +175,7 @@ def _explained_otherwise(
     ]
     plain, separate = found
     other = None if plain is None else best_explanation(plain)
-    if plain is None or other is None or other.alternative.kind in ("other_camera", "two_cameras"):
+    if plain is None or other is None or other.alternative.kind == "other_camera":
         return False  # the rejected points show best which photographs these are
     if separate is None:
         return True

@@ -1,0 +1,166 @@
+"""Common causes of rejected image points: exchanged names, and points at a second position.
+
+The test of the adjustment has separated these image points from the good ones. They are explained on their
+own, with the adjusted photographs, and take no part in the tests of alternatives, which a few would dominate.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.quality.consistency import intersect_rays
+from sfm.adjustment.result import Adjustment
+from sfm.camera import project
+from sfm.conventions import IntArray
+from sfm.distributions import chi2_isf, chi2_sf
+from sfm.judgement.hypotheses.alternatives import ALPHA
+from sfm.network import rows_of
+from sfm.remarks.remark import Remark, remark
+
+MIN_EXCHANGED = 2  # photographs with two names exchanged from which this is systematic, not accidental
+MIN_RAYS = 3  # rays that meet at a second position; two nearly meet anywhere along an epipolar line
+# Largest ratio of the variance of a prediction plus its measurement to that of the measurement.
+MAX_PREDICTION_RATIO = 2.0
+
+
+@dataclass(frozen=True)
+class SecondPlace:
+    """A point that some photographs show at another position."""
+
+    point: int
+    distance: float  # between both positions, object unit
+    over_sigma: float  # the same in standard deviations of the difference
+    images: IntArray  # photographs that show it there
+
+
+def explain_rejections(a: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
+    """Return remarks that explain the rejected image points of an adjustment.
+
+    Args:
+        a: finished adjustment.
+        unit: object unit, for the remarks.
+    """
+    if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
+        return ()
+    misnamed = _other_points(a)
+    pairs, rest = _exchanged(a, misnamed)
+    remarks = [
+        remark(
+            "names_exchanged",
+            first=a.network.points[p],
+            second=a.network.points[q],
+            photographs=tuple(a.network.images[i] for i in images),
+        )
+        for (p, q), images in sorted(pairs.items())
+    ]
+    if rest:
+        seen = a.network.image_points
+        remarks.append(
+            remark(
+                "image_points_misnamed",
+                count=len(rest),
+                photographs=tuple(sorted({a.network.images[seen.image[row]] for row in rest})),
+            )
+        )
+    used = set(rest) | {row for row, q in misnamed.items() if _key(a, row, q) in pairs}
+    return (*remarks, *_of_places(a, _second_places(a, used), unit))
+
+
+def _other_points(a: Adjustment) -> dict[int, int]:
+    """Return the rejected image points that lie where another point is expected, with that point."""
+    network, estimate, seen = a.network, a.estimate, a.network.image_points
+    rejected = np.flatnonzero(a.rejected)
+    tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(ALPHA, 2))) * a.sigma0_px
+    found: dict[int, int] = {}
+    for i, rows in enumerate(rows_of(seen.image[rejected], len(network.images))):
+        if not len(rows):
+            continue
+        camera = estimate.cameras[network.camera[i]]
+        at = project(camera, estimate.position[i], estimate.rotation[i], estimate.points)
+        for row in rejected[rows].tolist():
+            away = np.linalg.norm(at - seen.xy[row], axis=1)
+            away[seen.point[row]] = np.inf
+            q = int(np.nanargmin(away)) if np.isfinite(away).any() else -1
+            if q >= 0 and away[q] < tolerance:
+                found[row] = q
+    return found
+
+
+def _key(a: Adjustment, row: int, q: int) -> tuple[int, int]:
+    p = int(a.network.image_points.point[row])
+    return min(p, q), max(p, q)
+
+
+def _exchanged(a: Adjustment, misnamed: dict[int, int]) -> tuple[dict[tuple[int, int], list[int]], list[int]]:
+    """Return the point pairs exchanged in several photographs, with these, and the remaining image points."""
+    seen = a.network.image_points
+    where: dict[tuple[int, int], dict[int, list[int]]] = defaultdict(lambda: defaultdict(list))
+    for row, q in misnamed.items():
+        where[_key(a, row, q)][int(seen.image[row])].append(row)
+    pairs, rest = {}, []
+    for key, images in where.items():
+        both = [i for i, rows in images.items() if len(rows) == 2]
+        if len(both) >= MIN_EXCHANGED:
+            pairs[key] = sorted(images)
+        else:
+            rest += [row for rows in images.values() for row in rows]
+    return pairs, rest
+
+
+def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
+    """Return the points with rejected rays that meet at another position."""
+    seen = a.network.image_points
+    left = np.array([row for row in np.flatnonzero(a.rejected).tolist() if row not in explained], dtype=int)
+    places = []
+    for j in np.unique(seen.point[left]).tolist():
+        out = left[seen.point[left] == j]
+        kept = np.flatnonzero((seen.point == j) & ~a.rejected)
+        if len(out) < MIN_RAYS or len(kept) < 2:
+            continue
+        X, Q, misfit = intersect_rays(a, out)
+        first, Q0, _ = intersect_rays(a, kept)
+        if not np.isfinite(misfit) or chi2_sf(misfit, 2 * len(out) - 3) < ALPHA:
+            continue
+        apart = X - first
+        over = float(np.sqrt(apart @ np.linalg.pinv(Q + Q0) @ apart))
+        if chi2_sf(over**2, 3) < ALPHA / len(left):
+            places.append(SecondPlace(j, float(np.linalg.norm(apart)), over, np.sort(seen.image[out])))
+    return places
+
+
+def _of_places(a: Adjustment, places: list[SecondPlace], unit: str) -> list[Remark]:
+    """Return remarks on points that moved together at one photograph, and on each other point."""
+    names, seen = a.network.images, a.network.image_points
+    together: dict[int, list[SecondPlace]] = defaultdict(list)
+    alone = []
+    for one in places:
+        others = seen.image[(seen.point == one.point) & ~a.rejected]
+        if one.images.min() > others.max() or one.images.max() < others.min():
+            together[int(max(one.images.min(), others.min()))].append(one)
+        else:
+            alone.append(one)
+    moved = [
+        remark(
+            "points_moved",
+            points=tuple(a.network.points[one.point] for one in some),
+            distance=(max(one.distance for one in some), unit),
+            shift=max(one.over_sigma for one in some),
+            wrong=0.0,  # rejected image points do not shift the others
+            **{"from": names[start]},
+        )
+        for start, some in sorted(together.items())
+    ]
+    elsewhere = [
+        remark(
+            "two_places",
+            point=a.network.points[one.point],
+            distance=(one.distance, unit),
+            sigmas=one.over_sigma,
+            photographs=tuple(names[i] for i in one.images),
+        )
+        for one in alone
+    ]
+    return moved + elsewhere
