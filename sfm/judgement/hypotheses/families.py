@@ -326,6 +326,10 @@ class PointFamily(Family):
 class BodyFamily(PointFamily):
     """Object points that moved as a rigid body, by a vector and a small rotation."""
 
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return a key for the cause: a body."""
+        return ("body",)
+
     def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         seen, motions = a.network.image_points, np.zeros((len(a.network.points), 3, 6))
