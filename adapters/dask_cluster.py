@@ -41,7 +41,6 @@ from threadpoolctl import threadpool_limits
 from sfm.errors import BackendError, KolinearError
 from sfm.files.user_cache import scratch_folder
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
-from sfm.runtime.installation import closed_current_folder
 
 # Worker deaths that Dask allows a call: one may be bad luck, and the call is tried on another worker.
 ALLOWED_FAILURES = 1
@@ -109,7 +108,7 @@ def local_engine(workers: int) -> Iterator[DaskEngine]:
         "distributed.comm.timeouts.connect": "60s",  # new workers compile and import on a busy computer
         "distributed.deploy.lost-worker-timeout": "1h",  # a worker that takes long to restart is kept, too
     }
-    with dask.config.set(settings), closed_current_folder(), ExitStack() as stack:
+    with dask.config.set(settings), ExitStack() as stack:
         scratch = stack.enter_context(scratch_folder())
         with _interrupt_held_back():  # a Ctrl-C is delivered when all of this has started and can be ended
             try:

@@ -40,7 +40,6 @@ from sfm.planning.designer import gains
 from sfm.planning.planned_object import box_tree, hidden_points
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring
-from sfm.runtime.installation import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.codes.rings import ring_family
@@ -149,10 +148,7 @@ def main(progress: Progress = SILENT) -> None:
         KolinearError: a process was ended by the system.
     """
     progress.stage("compiling", len(PARTS))
-    with (
-        closed_current_folder(),
-        ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool,
-    ):
+    with ProcessPoolExecutor(min(cores(), len(PARTS)), mp_context=get_context("spawn")) as pool:
         for done in as_completed([pool.submit(_compile, part) for part in PARTS]):
             try:
                 done.result()

@@ -14,12 +14,7 @@ from typing import Any
 
 from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, guard_streams, loading, stopped_once
 from sfm.errors import KolinearError
-from sfm.runtime.installation import (
-    closed_current_folder,
-    load_adapters,
-    refuse_folder_settings,
-    refuse_mixed_installation,
-)
+from sfm.runtime.installation import ignore_current_folder, load_adapters, refuse_mixed_installation
 from sfm.runtime.progress import share_freed_memory
 
 YOUNG_OBJECTS = 100_000  # new objects before Python collects cycles, far more than its default
@@ -36,8 +31,7 @@ def main() -> None:
         with stopped_once():
             try:
                 _prepare()
-                with closed_current_folder():
-                    _run()
+                _run()
             finally:
                 if sys.stdout is not None:
                     sys.stdout.flush()  # while a full disk can still be reported
@@ -63,7 +57,7 @@ def _prepare() -> None:
     gc.set_threshold(YOUNG_OBJECTS)
     atexit.register(gc.freeze)
     refuse_mixed_installation()  # checked here too: another project's sfm/__init__.py may have replaced ours
-    refuse_folder_settings()
+    ignore_current_folder()
     load_adapters()
 
 

@@ -1,9 +1,8 @@
-"""Safe access to folders: opening without following links, locks, and the list of written files.
+"""Safe access to folders: nothing is written through a link, locks, and the list of written files.
 
 A folder from somebody else may contain links at every path that is written. Therefore no part of such a path
-may be a link, except for links of the system in its root folder (such as /tmp of macOS). A folder is opened
-before anything is made, opened or moved in it, so that it cannot be replaced meanwhile. Windows cannot open
-files through such a handle, so there only the path is checked.
+may be a link, except for links of the system in its root folder (such as /tmp of macOS). The path is checked
+before it is written; that somebody changes it meanwhile is not prevented.
 
 A lock lets only one run at a time write into a folder, and shows everybody its owner. The operating system
 holds the lock, and releases it when the process ends for any reason. A lock file that is not locked is
@@ -13,8 +12,6 @@ other computers with the same disk see it.
 The list of the files that Kolinear wrote into a folder, manifest.json, has their hashes, and identifies them
 later. A folder or file that may be replaced has such a list. It is only replaced while it is unchanged. Files
 that a person added, edited or linked are reported and left alone.
-
-Source: POSIX.1-2008, openat() and O_NOFOLLOW.
 """
 
 from __future__ import annotations
@@ -43,11 +40,7 @@ LITTER = (".DS_Store", "Thumbs.db")  # systems leave these in every folder that 
 NAMED = 3  # files that an error message lists
 MAX_OWNER_BYTES = 10_000  # of the text in a lock file
 TEXT_AT = 1  # Windows does not let others read the locked byte, which is the first
-HAS_HANDLES = {os.open, os.mkdir, os.rename, os.stat} <= os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")
-# With O_PATH, Linux opens folders that one may traverse but not list.
-_FOLDER = getattr(os, "O_PATH", os.O_RDONLY) | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
-_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
-_PLAIN_FILE = _NO_LINK | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+_PLAIN_FILE = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 @contextmanager
@@ -66,90 +59,6 @@ def disk_errors(message: str) -> Iterator[None]:
         raise OutputError(f"{message}: {error.strerror or error}") from error
 
 
-@contextmanager
-def open_folder(path: Path, *, make: bool = False) -> Iterator[int | None]:
-    """Open a folder for use as `dir_fd`; its handle is None on systems without such handles.
-
-    Args:
-        path: the folder.
-        make: whether the folder, and the folders above it, are made if they do not exist.
-
-    Raises:
-        OutputError: the path contains a link.
-        OSError: the path is not a folder, or it cannot be opened or made.
-    """
-    refuse_links(path)
-    if not HAS_HANDLES:
-        if make:
-            path.mkdir(parents=True, exist_ok=True)
-        yield None
-        return
-    handle = _walk(Path.cwd() / path, make=make)
-    try:
-        yield handle
-    finally:
-        os.close(handle)
-
-
-def _walk(path: Path, *, make: bool) -> int:
-    """Open a folder from its absolute path, each part relative to the handle of the part before."""
-    handle = os.open(path.anchor, _FOLDER)
-    flags = _FOLDER  # links in the root folder belong to the system
-    for part in path.parts[1:]:
-        try:
-            if make and not _is_there(part, handle):
-                with suppress(FileExistsError):  # another run has just made it
-                    os.mkdir(part, dir_fd=handle)
-            inner = os.open(part, flags, dir_fd=handle)
-        finally:
-            os.close(handle)
-        handle, flags = inner, _FOLDER | _NO_LINK
-    return handle
-
-
-def _is_there(name: str, folder: int) -> bool:
-    try:
-        os.stat(name, dir_fd=folder, follow_symlinks=False)
-    except FileNotFoundError:
-        return False
-    return True
-
-
-def open_new_folder(path: Path, parent: int | None) -> int | None:
-    """Make and open a new folder that only this user can access.
-
-    Args:
-        path: the folder.
-        parent: handle of the containing folder.
-
-    Raises:
-        OSError: the folder exists already, or cannot be made.
-    """
-    if parent is None:
-        path.mkdir(0o700)
-        return None
-    os.mkdir(path.name, 0o700, dir_fd=parent)
-    return os.open(path.name, _FOLDER | _NO_LINK, dir_fd=parent)
-
-
-def move(source: Path, source_folder: int | None, target: Path, target_folder: int | None) -> None:
-    """Rename a file or folder; this replaces a file or an empty folder, and follows no link.
-
-    Args:
-        source: present path.
-        source_folder: handle of the folder that contains it.
-        target: new path.
-        target_folder: handle of the folder that contains the new path.
-
-    Raises:
-        OSError: it cannot be moved.
-    """
-    if source_folder is None or target_folder is None:
-        source.replace(target)
-    else:
-        os.rename(source.name, target.name, src_dir_fd=source_folder, dst_dir_fd=target_folder)
-
-
 def open_regular_file(path: Path, flags: int) -> int:
     """Open a regular file with only one name, without following links, and return its handle.
 
@@ -163,9 +72,7 @@ def open_regular_file(path: Path, flags: int) -> int:
         OSError: the file cannot be opened.
     """
     refuse_links(path)
-    with open_folder(path.parent) as folder:
-        name = path if folder is None else path.name
-        handle = os.open(name, flags | _PLAIN_FILE, 0o644, dir_fd=folder)
+    handle = os.open(path, flags | _PLAIN_FILE, 0o644)
     status = os.fstat(handle)
     if stat.S_ISREG(status.st_mode) and status.st_nlink <= 1:  # 0: its owner has just removed it
         return handle
@@ -180,8 +87,8 @@ def make_folder(path: Path) -> None:
         OutputError: the path contains a link.
         OSError: the folder cannot be made.
     """
-    with open_folder(path, make=True):
-        pass
+    refuse_links(path)
+    path.mkdir(parents=True, exist_ok=True)
 
 
 def refuse_links(path: Path) -> None:

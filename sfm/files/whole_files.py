@@ -13,19 +13,16 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sfm.errors import KolinearError, OutputError
 from sfm.files.open_folders import (
     MANIFEST,
     disk_errors,
+    make_folder,
     manifest_text,
-    move,
     names_below,
-    open_folder,
-    open_new_folder,
     read_manifest,
     refuse_foreign_files,
     refuse_foreign_folder,
@@ -55,13 +52,13 @@ def whole_folder(out: Path, what: str = "", *, replaceable: bool = False) -> Ite
         OutputError: the folder cannot be written; nothing of it remains.
     """
     refuse_foreign_folder(out)
-    with _new_folder(out, what) as part, _naming_disk_errors(out, part.path, what):
-        part.path.chmod(0o755)  # it was made readable for this user only
-        yield part.path
+    with _new_folder(out, what) as part, _naming_disk_errors(out, part, what):
+        part.chmod(0o755)  # it was made readable for this user only
+        yield part
         if replaceable:
-            write_manifest(part.path, {n: [sha256_of(part.path / n)] for n in names_below(part.path)})
-        _sync_all(list(part.path.rglob("*")))
-        _sync(part.path)
+            write_manifest(part, {name: [sha256_of(part / name)] for name in names_below(part)})
+        _sync_all(list(part.rglob("*")))
+        _sync(part)
         refuse_foreign_folder(out)  # it may have changed since the first check
         _put_in_place(part, out)
 
@@ -85,13 +82,12 @@ def whole_file(path: Path, what: str = "", *, replaces: bool = False) -> Iterato
     """
     if not replaces:
         refuse_existing(path)
-    with _new_folder(path, what) as part, _naming_disk_errors(path, part.path / path.name, what):
-        yield part.path / path.name
-        _sync(part.path / path.name)
+    with _new_folder(path, what) as part, _naming_disk_errors(path, part / path.name, what):
+        yield part / path.name
+        _sync(part / path.name)
         if not replaces:
             refuse_existing(path)  # it may have appeared since the first check
-        part.refuse_exchanged()
-        move(part.path / path.name, part.handle, path, part.parent)
+        (part / path.name).replace(path)
         _sync(path.parent)
 
 
@@ -109,22 +105,21 @@ def whole_files(folder: Path, what: str = "") -> Iterator[Path]:
     Raises:
         OutputError: the files cannot be written, or files of these names exist that Kolinear did not write.
     """
-    with _new_folder(folder / MANIFEST, what) as part, _naming_disk_errors(folder, part.path, what):
-        yield part.path
-        names = names_below(part.path)
+    with _new_folder(folder / MANIFEST, what) as part, _naming_disk_errors(folder, part, what):
+        yield part
+        names = names_below(part)
         refuse_foreign_files(folder, names)
         hashes = read_manifest(folder)
         hashes.pop(MANIFEST, None)
-        _sync_all([part.path / name for name in names])
+        _sync_all([part / name for name in names])
         for name in names:
             # New and existing hashes are listed before the files are moved, so both are known if the run
             # ends.
             there = [sha256_of(folder / name)] if name in hashes and (folder / name).exists() else []
-            hashes[name] = [*there, sha256_of(part.path / name)]
+            hashes[name] = [*there, sha256_of(part / name)]
         write_manifest(folder, hashes)
-        part.refuse_exchanged()
         for name in names:
-            move(part.path / name, part.handle, folder / name, part.parent)
+            (part / name).replace(folder / name)
         _sync(folder)
 
 
@@ -184,33 +179,18 @@ def refuse_full(folder: Path) -> None:
         os.fsync(file.fileno())
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A new folder with an unpredictable name, and the folder that contains it."""
-
-    path: Path
-    handle: int | None  # handle of this folder; None on systems without such handles
-    parent: int | None  # handle of the containing folder
-
-    def refuse_exchanged(self) -> None:
-        """Raise OutputError if another folder has taken the path, through which libraries wrote."""
-        if self.handle is not None and not os.path.samestat(os.fstat(self.handle), os.stat(self.path)):
-            raise OutputError(f"{self.path}: was replaced while it was written")
-
-
 @contextmanager
-def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[_Part]:
+def _new_folder(out: Path, what: str, ending: str = "part") -> Iterator[Path]:
     """Make a temporary empty folder beside the path to write, with all folders above it."""
-    refuse_links(out)
     path = out.parent / f".{out.name}.{secrets.token_hex(4)}.{ending}"
-    with ExitStack() as stack:
-        with disk_errors(f"{out}: {_subject(what)}cannot be written here"):
-            parent = stack.enter_context(open_folder(out.parent, make=True))
-            handle = open_new_folder(path, parent)
-        stack.callback(shutil.rmtree, path, ignore_errors=True)
-        if handle is not None:
-            stack.callback(os.close, handle)
-        yield _Part(path, handle, parent)
+    refuse_links(out)
+    with disk_errors(f"{out}: {_subject(what)}cannot be written here"):
+        make_folder(out.parent)
+        path.mkdir(0o700)
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager
@@ -248,18 +228,17 @@ def _sync_all(paths: Sequence[Path]) -> None:
             pass
 
 
-def _put_in_place(part: _Part, out: Path) -> None:
+def _put_in_place(part: Path, out: Path) -> None:
     """Rename the finished folder to its final path; an earlier folder is kept until then."""
-    part.refuse_exchanged()
     if not out.exists():
-        move(part.path, part.parent, out, part.parent)
+        part.replace(out)
         _sync(out.parent)
         return
     with _new_folder(out, "", "old") as old:
-        move(out, part.parent, old.path / "result", old.handle)
+        out.replace(old / "result")
         try:
-            move(part.path, part.parent, out, part.parent)
+            part.replace(out)
         except OSError:
-            move(old.path / "result", old.handle, out, part.parent)
+            (old / "result").replace(out)
             raise
         _sync(out.parent)

@@ -9,12 +9,11 @@ have a folder of such a name. Installers silently merge packages of one name int
 last `__init__.py` remains. Therefore Kolinear finds its packages by their path, and refuses to run if files
 of other projects are among them.
 
-The current folder may contain settings of libraries, or libraries, that came with a survey of a stranger.
-numba reads `.numba_config.yaml` there, which can name a folder of compiled functions. These are pickles, and
-thus programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. cv2 puts its
-libraries and a colon before LD_LIBRARY_PATH. If this is empty, nothing follows the colon, and the linker of
-every later process searches the current folder. Python searches it first for modules in processes of
-multiprocessing and Dask, which are started with `python -c`.
+The current folder may contain settings of libraries, or modules, that came with a survey of a stranger. numba
+reads `.numba_config.yaml` there, which can name a folder of compiled functions. These are pickles, and thus
+programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. Python searches it
+first for modules in processes of multiprocessing and Dask, which are started with `python -c`, unless
+PYTHONSAFEPATH is set.
 
 Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
 """
@@ -23,16 +22,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
 from sfm.errors import InstallationError, KolinearError
 
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
-LIBRARIES = "LD_LIBRARY_PATH"
-MODULES, SAFE_PATH = "PYTHONPATH", "PYTHONSAFEPATH"
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
 """a file of each of the other projects, PyPI's sfm and adapters, that Kolinear does not have"""
 Face = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
@@ -119,6 +115,16 @@ def load_adapters() -> None:
     spec.loader.exec_module(package)
 
 
+def ignore_current_folder() -> None:
+    """Keep new processes from importing modules of the current folder; call it before importing libraries.
+
+    Raises:
+        KolinearError: the folder has settings of a library.
+    """
+    refuse_folder_settings()
+    os.environ["PYTHONSAFEPATH"] = "1"
+
+
 def refuse_folder_settings() -> None:
     """Raise KolinearError if the current folder has settings of a library; call it before importing any."""
     for name in SETTINGS:
@@ -127,34 +133,3 @@ def refuse_folder_settings() -> None:
                 f"the current folder, {os.getcwd()}, contains '{name}', which would decide what is "
                 "computed or run; start Kolinear from another folder, or remove the file"
             )
-
-
-@contextmanager
-def closed_current_folder() -> Iterator[None]:
-    """Keep new processes from searching the current folder for modules and libraries.
-
-    Meanwhile the path of libraries is never empty, so that OpenCV can be imported before or after.
-    """
-    before = {name: os.environ.get(name) for name in (SAFE_PATH, MODULES, LIBRARIES)}
-    os.environ[SAFE_PATH] = "1"
-    if modules := _without_empty_folders(MODULES):
-        os.environ[MODULES] = modules
-    else:
-        os.environ.pop(MODULES, None)
-    if os.name != "nt":
-        os.environ[LIBRARIES] = _without_empty_folders(LIBRARIES) or os.path.dirname(
-            os.path.abspath(__file__)
-        )
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _without_empty_folders(variable: str) -> str:
-    """Return a path of folders without empty entries, which mean the current folder."""
-    return os.pathsep.join(folder for folder in os.environ.get(variable, "").split(os.pathsep) if folder)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import tempfile
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from sfm.errors import BackendError, OutputError
-from sfm.files import open_folders
 from sfm.files.whole_files import refuse_full, refuse_unwritable, whole_file, whole_files, whole_folder
 
 NOBODY = 65534  # a user of no rights
@@ -28,15 +26,7 @@ def test_a_folder_takes_the_place_of_an_earlier_one_when_it_is_finished(tmp_path
     assert list(out.parent.iterdir()) == [out]
 
 
-@pytest.fixture(params=[True, False], ids=["handles", "paths"])
-def handles(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether files are opened in open folders, or by their paths as on Windows."""
-    has = bool(request.param) and open_folders.HAS_HANDLES
-    monkeypatch.setattr(open_folders, "HAS_HANDLES", has)
-    return has
-
-
-def test_files_and_folders_are_written_with_and_without_handles(handles: bool, tmp_path: Path) -> None:
+def test_files_and_folders_are_written_and_never_through_a_link(tmp_path: Path) -> None:
     for text in ("old", "new"):
         with whole_folder(tmp_path / "a" / "out", replaceable=True) as folder:
             (folder / "file").write_text(text)
@@ -79,31 +69,6 @@ def test_a_folder_that_one_may_pass_but_not_list_is_passed() -> None:
         finally:
             os.seteuid(0)
         assert (Path(name) / "own" / "file").read_text() == "data"
-
-
-@pytest.mark.skipif(not open_folders.HAS_HANDLES, reason="the system opens no files in open folders")
-@pytest.mark.parametrize("whole", [whole_folder, whole_files, whole_file])
-def test_a_link_that_is_laid_meanwhile_is_not_followed(whole, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    """The folder is exchanged for a link to the user's own, after it was checked."""
-    home, out = tmp_path / "home", tmp_path / "given" / "sub" / "out"
-    home.mkdir()
-    with suppress(OutputError), whole(out) as part:
-        (part if part.is_dir() else part.parent).joinpath("out").write_text("data")
-        out.parent.rename(tmp_path / "given" / "old")
-        out.parent.symlink_to(home)
-    assert list(home.iterdir()) == []
-
-
-@pytest.mark.skipif(not open_folders.HAS_HANDLES, reason="the system opens no files in open folders")
-def test_a_part_that_is_exchanged_meanwhile_is_not_moved(tmp_path: Path) -> None:
-    out = tmp_path / "given" / "file"
-    (tmp_path / "home").mkdir()
-    (tmp_path / "home" / "file").write_text("of the user")
-    with pytest.raises(OutputError, match="was replaced while it was written"), whole_file(out) as part:
-        part.parent.rename(tmp_path / "given" / "other")
-        part.parent.symlink_to(tmp_path / "home")
-    assert (tmp_path / "home" / "file").read_text() == "of the user"
-    assert not out.exists()
 
 
 def test_a_file_leaves_nothing_beside_it(tmp_path: Path) -> None:

@@ -26,7 +26,6 @@ from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.display import bound
 from sfm.errors import GeometryError, OutputError
-from sfm.files.open_folders import move
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.pipeline import run_survey
@@ -133,18 +132,18 @@ def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
     page = write_page(validation, tmp_path / "out")
     before, renamed = page.read_text(), []
 
-    def rename(*given: Any) -> None:
-        renamed.append(given)
+    def rename(path: Path, target: Path, real: Any = Path.replace) -> None:
+        renamed.append(path)
         if len(renamed) == moment:
             raise KilledError
-        move(*given)
+        real(path, target)
 
     def rmtree(path: Path, real: Any = shutil.rmtree, **options: Any) -> None:
         if len(renamed) < moment:
             real(path, **options)
 
     with monkeypatch.context() as patch, pytest.raises(KilledError):
-        patch.setattr("sfm.files.whole_files.move", rename)
+        patch.setattr(Path, "replace", rename)
         patch.setattr(shutil, "rmtree", rmtree)
         write_page(validation, tmp_path / "out")
     remove_leftovers(tmp_path / "out")

@@ -295,28 +295,6 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
     assert "control" not in tomllib.loads(text) and "\x1b" not in text
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has another path of libraries")
-@pytest.mark.parametrize("given", [None, "", "/a::/b:"])
-def test_no_process_looks_for_libraries_in_the_current_folder(given: str | None, tmp_path: Path) -> None:
-    """What cv2 does to the path when it is imported would add it."""
-    script = (
-        "import os, sfm.cli.app; from sfm.cli import main\n"
-        "def app(**_):\n"
-        "    import cv2; print(os.environ['LD_LIBRARY_PATH'])\n"
-        "sfm.cli.app.commands = lambda: app\n"
-        "main(); print(os.environ.get('LD_LIBRARY_PATH'))"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
-    environment |= {"PYTHONPATH": str(ROOT)} | ({} if given is None else {"LD_LIBRARY_PATH": given})
-    command = [sys.executable, "-c", script]
-    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-    path, after = run.stdout.splitlines()
-    folders = path.split(":")
-    assert after == str(given)
-    assert "" not in folders and all(Path(folder).is_absolute() for folder in folders)
-    assert given != "/a::/b:" or folders[-2:] == ["/a", "/b"]
-
-
 def test_no_process_imports_modules_of_the_current_folder(tmp_path: Path) -> None:
     """Those of multiprocessing are started with `python -c`, which looks there first."""
     (tmp_path / "multiprocessing.py").write_text(f"open({str(tmp_path / 'owned')!r}, 'w').close()\n")

@@ -33,7 +33,6 @@ from sfm.display import program_name
 from sfm.errors import KolinearError
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
-from sfm.runtime.installation import closed_current_folder
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 
@@ -200,12 +199,9 @@ def _run(backend: ValidationBackend, seed: int, networks: int, jobs: int) -> Ite
             return
     # New processes: threads of compiled libraries do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with (
-        closed_current_folder(),
-        ProcessPoolExecutor(
-            jobs, mp_context=context, initializer=_prepare_worker, initargs=(backend,)
-        ) as pool,
-    ):
+    with ProcessPoolExecutor(
+        jobs, mp_context=context, initializer=_prepare_worker, initargs=(backend,)
+    ) as pool:
         try:
             yield from pool.map(make_trial, range(networks), [seed] * networks, [backend] * networks)
         except BaseException:
