@@ -78,17 +78,17 @@ class FileFormat:
     def held(self, content: Content) -> frozenset[str]:
         """Return the kinds of content that are unchanged when a survey is read again."""
         cameras = content.result.estimate.cameras
-        frees = all(set(_free(one)) in (set(), set(one.names) & set(self.frees)) for one in cameras)
+        frees = all(
+            {name for name, free in zip(one.names, one.free, strict=True) if free}
+            in (set(), set(one.names) & set(self.frees))
+            for one in cameras
+        )
         return self.keeps | {"free"} if frees else self.keeps
 
     @property
     def readable(self) -> bool:
         """Whether it has photographs and can be read."""
         return self.read is not None or self.read_all is not None
-
-
-def _free(camera: Camera) -> tuple[str, ...]:
-    return tuple(name for name, free in zip(camera.names, camera.free, strict=True) if free)
 
 
 def _read_database(path: Path) -> tuple[Network, Estimate]:
@@ -300,7 +300,9 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
     else:
         assert form.read is not None
         network, estimate = form.read(path)
-        points_named = _names_points(form, path)
+        points_named = (
+            (path / SIDE_FILE).is_file() if form.name in ("colmap", "colmap-text") else form.names[0]
+        )
         if not points_named:
             uncoded = tuple(f"u{name}" if name.isdecimal() else name for name in network.points)
             network = replace(network, points=uncoded)
@@ -310,11 +312,6 @@ def read_content(path: Path, name: str | None = None, *, control: Path | None = 
     seen = content.result.network.image_points
     stated = bool(len(seen) and np.isfinite(seen.stated_sigma).all())
     return replace(content, stated_weights=stated and form.adjusts)
-
-
-def _names_points(form: FileFormat, path: Path) -> bool:
-    """Return whether point names identify points; for a COLMAP model only if Kolinear's names are there."""
-    return (path / SIDE_FILE).is_file() if form.name in ("colmap", "colmap-text") else form.names[0]
 
 
 def read_comparable(path: Path, name: str | None = None) -> Solution:

@@ -44,7 +44,10 @@ def main() -> None:
         print(INTERRUPTED_TEXT, file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except Exception as error:
-        _report_fault(error)
+        from sfm.runtime.faults import ending_of
+
+        message, code = ending_of(error)
+        _refuse(message, code=code)
 
 
 def _prepare() -> None:
@@ -90,14 +93,6 @@ def _decimal_comma(error: Any, arguments: Sequence[str]) -> str:
             if re.fullmatch(r"[-+]?\d+,\d+", value):
                 return f"; use a decimal point, not a comma: {value.replace(',', '.')}"
     return ""
-
-
-def _report_fault(error: Exception) -> None:
-    """Exit with one line about an unforeseen error, or about a lack of memory, which the user can correct."""
-    from sfm.runtime.faults import ending_of
-
-    message, code = ending_of(error)
-    _refuse(message, code=code)
 
 
 def _refuse(message: str, *, code: int = BAD_INPUT) -> None:

@@ -161,7 +161,12 @@ def locked(path: Path, folder: Path | None = None) -> Iterator[Owner | None]:
             if before is None and os.fstat(handle).st_size:
                 raise OutputError(f"{path}: is not a lock of Kolinear, and is left alone; remove it")
             ours = True
-            _write_owner(handle)
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            text = json.dumps(asdict(Owner(os.getpid(), platform.node(), now)))
+            os.ftruncate(handle, 0)
+            os.lseek(handle, 0, os.SEEK_SET)
+            os.write(handle, b" " * TEXT_AT + text.encode())
+            os.fsync(handle)
         yield before
     finally:
         if ours:
@@ -197,15 +202,6 @@ def _open_and_lock(path: Path, folder: Path) -> int:
             if os.path.samestat(os.fstat(handle), os.stat(path)):
                 return handle
         os.close(handle)
-
-
-def _write_owner(handle: int) -> None:
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    text = json.dumps(asdict(Owner(os.getpid(), platform.node(), now)))
-    os.ftruncate(handle, 0)
-    os.lseek(handle, 0, os.SEEK_SET)
-    os.write(handle, b" " * TEXT_AT + text.encode())
-    os.fsync(handle)
 
 
 def _owner(handle: int) -> Owner | None:

@@ -119,27 +119,6 @@ def odd_window(what: str, side_px: int) -> int:
     return int(side_px)
 
 
-def patch_around(photograph: AnyArray, centre: tuple[int, int], side_px: int) -> AnyArray:
-    """Return the square patch around a pixel, as a view of the photograph.
-
-    Args:
-        photograph: shape (H, W) or (H, W, 3).
-        centre: column and row of the central pixel.
-        side_px: odd side.
-
-    Raises:
-        GeometryError: even side, or a window that reaches beyond the photograph.
-    """
-    half = odd_window("patch", side_px) // 2
-    (col, row), (height, width) = centre, photograph.shape[:2]
-    if not (half <= col <= width - 1 - half and half <= row <= height - 1 - half):
-        raise GeometryError(
-            f"patch: a window of {side_px} px around column {col}, row {row} reaches beyond the photograph "
-            f"of {width} x {height} px"
-        )
-    return photograph[row - half : row + half + 1, col - half : col + half + 1]
-
-
 @checked_arguments()
 def radiometry_of(patch: AnyArray) -> Radiometry:
     """Return mean, standard deviation and extremes of a patch or photograph.

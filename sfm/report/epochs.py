@@ -239,7 +239,7 @@ def describe_stable(found: Displacements) -> str:
         return f"All {counted(count, 'reference point')} agree."
     by = (
         " by removing one point after another"
-        if found.congruency.robust is None or _same(found)
+        if found.congruency.robust is None or bool((found.stable == found.congruency.search.stable).all())
         else " by a robust start"
     )
     undecided = list(compress(found.differences.points, found.undecided))
@@ -309,11 +309,6 @@ def _picture(found: Displacements, number: int) -> Plot | None:
 def _typical(found: Displacements) -> float:
     lengths: FloatArray = np.linalg.norm(found.displacement, axis=1)
     return float(max(np.median(found.detectable), lengths.max()))
-
-
-def _same(found: Displacements) -> bool:
-    """Return whether the proposed set equals that of the search through all points."""
-    return bool((found.stable == found.congruency.search.stable).all())
 
 
 def _names(names: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """Entries of a bundle protocol that users know from other programs.
 
-The entries are: residuals by photograph and by point, rejected rays by point, control before and after,
-points by kind and rays, distortion and field of view of the cameras, cumulative tests of radial distortion.
+The entries are: residuals by photograph and by point, control before and after, distortion and field of view
+of the cameras, cumulative tests of radial distortion.
 
 Source: the protocols of DBAT (Boerlin and Grussenmeyer 2013, Photogramm. Record 28(144)) and of AICON 3D
 Studio.
@@ -56,10 +56,8 @@ class Protocol:
     """All entries of a bundle protocol."""
 
     residuals: tuple[tuple[Any, ...], ...]  # rows of residuals.csv
-    rejected: tuple[tuple[str, tuple[str, ...], int], ...]  # point, photographs of rejected rays, its rays
     limits: str  # limits of rejection, in words
     control: tuple[ControlCoordinate, ...]
-    rays_by_kind: tuple[tuple[str, int, float, int], ...]  # kind of point, points, mean and fewest rays
     lenses: tuple[Lens, ...]
     cumulative: tuple[CumulativeTest, ...]
 
@@ -73,10 +71,8 @@ def protocol_of(result: SurveyResult, given: Given) -> Protocol:
             *_groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points),
             *_groups(a, "point", seen.point, a.network.points, seen.image, a.network.images),
         ),
-        rejected=_rejected(a),
         limits=_limits(result),
         control=(*_control(a, given), *_checked(a, result.control_check), *check_coordinates(result)),
-        rays_by_kind=_rays_by_kind(result),
         lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
         cumulative=_cumulative(a),
     )
@@ -103,15 +99,6 @@ def _groups(
             at = [others[other[k]] for k in kept[v.argmax(axis=0)]]
         out.append((kind, name, len(kept), len(rows) - len(kept), *rms, *largest, *at))
     return out
-
-
-def _rejected(a: Adjustment) -> tuple[tuple[str, tuple[str, ...], int], ...]:
-    seen, rays = a.network.image_points, a.network.rays()
-    found: dict[int, list[str]] = {}
-    for k in np.flatnonzero(a.rejected):
-        found.setdefault(int(seen.point[k]), []).append(a.network.images[seen.image[k]])
-    most_first = sorted(found.items(), key=lambda one: -len(one[1]))
-    return tuple((a.network.points[j], tuple(images), int(rays[j])) for j, images in most_first)
 
 
 def _limits(result: SurveyResult) -> str:
@@ -159,26 +146,6 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
         for name, k, d in placed
         for c, given in enumerate(control.xyz[k])
     ]
-
-
-def _rays_by_kind(result: SurveyResult) -> tuple[tuple[str, int, float, int], ...]:
-    a = result.adjustment
-    seen = a.network.image_points
-    n = len(a.network.points)
-    rays = np.bincount(seen.point[~a.rejected], minlength=n)
-    control = np.zeros(n, dtype=bool)
-    control[a.network.control.point] = True
-    coded = result.code >= 0
-    kinds = (
-        ("control points", control),
-        ("coded points", coded & ~control),
-        ("other points", ~coded & ~control),
-    )
-    return tuple(
-        (name, int(some.sum()), float(rays[some].mean()), int(rays[some].min()))
-        for name, some in kinds
-        if some.any()
-    )
 
 
 def _lens(camera: Camera) -> Lens:

@@ -119,10 +119,6 @@ def geometry_parts(f: Findings) -> Iterator[Part]:
     known = found.angle_deg[np.isfinite(found.angle_deg)]
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {words}" if len(known) else ""
     low, high = int(found.rays.min()), int(found.rays.max())
-    kinds = (
-        f"{count} {kind}: mean {rays:.1f}, fewest {fewest}"
-        for kind, count, rays, fewest in f.protocol.rays_by_kind
-    )
     yield Heading("Geometry of the network")
     yield facts(
         [
@@ -130,7 +126,6 @@ def geometry_parts(f: Findings) -> Iterator[Part]:
                 "rays of a point",
                 f"{low} each" if low == high else f"{low} to {high}, mean {found.rays.mean():.1f}",
             ),
-            ("rays by kind", "; ".join(kinds)),
             ("points by rays", ", ".join(f"{rays}: {count}" for rays, count in points_by_rays(found))),
             ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
             ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),

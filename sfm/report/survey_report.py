@@ -269,7 +269,7 @@ def rejected(report: Report) -> Section:
                 f"too large for their standard deviations do not contribute to the result. {limits}"
             )
         )
-        parts += [_rejected_points(a), FoldedParts("Rejected rays by point", _rejected_rays(f), in_text=True)]
+        parts.append(_rejected_points(a))
     else:
         words = f"None of the {len(a.rejected)} image points was rejected in the adjustment."
         parts.append(Paragraph(f"{words} {limits}"))
@@ -309,13 +309,6 @@ def _rejected_points(a: Adjustment) -> Table:
         *(*axes("v", "px", "+.3f", parts="xy"), Column("length", "", "px", ".3f")),
     )
     return Table(heads, shown, most=MAX_LISTED, all_in="image_points.csv")
-
-
-def _rejected_rays(f: Findings) -> Table:
-    rows = [
-        (name, f"{len(images)} of {rays}", ", ".join(images)) for name, images, rays in f.protocol.rejected
-    ]
-    return Table(columns("point", "rays", "photographs"), rows, all_in="image_points.csv")
 
 
 def _candidates(f: Findings) -> FoldedParts:

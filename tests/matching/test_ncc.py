@@ -21,7 +21,6 @@ from sfm.matching.radiometry import (
     grey_of,
     histogram,
     match_brightness,
-    patch_around,
     radiometry_of,
 )
 from sfm.textbook.matching import match_along_line, match_pyramid
@@ -322,14 +321,6 @@ def test_linear_radiometry() -> None:
 def test_brightness_and_contrast_of_another_photograph() -> None:
     matched = match_brightness(PHOTOGRAPH, 30 + 0.5 * PHOTOGRAPH[::-1].astype(float))
     assert matched == pytest.approx(30 + 0.5 * PHOTOGRAPH.astype(float), abs=1e-4)
-
-
-def test_patches() -> None:
-    assert (patch_around(PHOTOGRAPH, (10, 20), 5) == PHOTOGRAPH[18:23, 8:13]).all()
-    with pytest.raises(GeometryError, match="reaches beyond the photograph of 50 x 40 px"):
-        patch_around(PHOTOGRAPH, (1, 20), 5)
-    with pytest.raises(GeometryError, match="odd number"):
-        patch_around(PHOTOGRAPH, (10, 20), 4)
 
 
 def test_colour_becomes_luminance() -> None:

@@ -52,14 +52,11 @@ def test_residuals_by_photograph_and_point_are_those_of_the_image_points(found: 
     assert sum(row[3] for row in found.protocol.residuals) == 2 * a.rejected.sum()
 
 
-def test_rejected_rays_stand_in_the_text_report_by_point(found: Findings) -> None:
-    a = found.result.adjustment
-    assert {point for point, *_ in found.protocol.rejected} == {
-        a.network.points[j] for j in a.network.image_points.point[a.rejected]
-    }
-    text = text_report(found)
-    point, images, rays = found.protocol.rejected[0]
-    assert re.search(rf"\n  {point} +1 of {rays} +{images[0]}\n", text)
+def test_rejected_rays_stand_in_the_text_report(found: Findings) -> None:
+    a, text = found.result.adjustment, text_report(found)
+    seen = a.network.image_points
+    for k in np.flatnonzero(a.rejected)[:3]:
+        assert re.search(rf"\n  {a.network.images[seen.image[k]]} +{a.network.points[seen.point[k]]} ", text)
     assert "where |tau| exceeds" in " ".join(text.split())
 
 

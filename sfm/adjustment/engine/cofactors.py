@@ -62,8 +62,9 @@ def cofactors(optimum: Optimum, layout: Unknowns, *, cross: bool = True) -> Cofa
     b = optimum.equations.blocks
     q = optimum.factor.inverse(b, cross=cross)
     first = 6 * len(b.U)
-    limiting = _inverse_of_squares(b.L)
-    points = limiting + _solve_both_sides(b.L, q.core)
+    Li = solve_lower(b.L, np.broadcast_to(np.eye(3), b.L.shape))
+    limiting = np.asarray(np.swapaxes(Li, 1, 2) @ Li)
+    points = limiting + solve_transposed(b.L, np.swapaxes(solve_transposed(b.L, q.core), 1, 2))
     for s, j in enumerate(layout.kept):
         at = slice(layout.kept_start - first + 3 * s, layout.kept_start - first + 3 * s + 3)
         points[j] = q.border[at, at]
@@ -268,17 +269,6 @@ def _cross(layout: Unknowns, q: Inverse, L: FloatArray, mask: FloatArray) -> tup
         rays[seen] = np.swapaxes(mixed[layout.observations.pose[seen], :, at], 1, 2)
         inner[j] = q.border[at]
     return rays, inner
-
-
-def _solve_both_sides(L: FloatArray, core: FloatArray) -> FloatArray:
-    """Return L^-T core L^-1 of every point, (n, 3, 3)."""
-    return solve_transposed(L, np.swapaxes(solve_transposed(L, core), 1, 2))
-
-
-def _inverse_of_squares(L: FloatArray) -> FloatArray:
-    """Return (L L')^-1 of every point, (n, 3, 3)."""
-    Li = solve_lower(L, np.broadcast_to(np.eye(3), L.shape))
-    return np.asarray(np.swapaxes(Li, 1, 2) @ Li)
 
 
 @kernel

@@ -30,6 +30,7 @@ from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation, rotation_from_angles
 from sfm.distributions import LEVEL, chi2_sf
+from sfm.judgement.hypotheses.score import gain_of
 from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
 
@@ -233,8 +234,5 @@ def _gain(s: FloatArray, G: FloatArray, k: int, taken: list[int]) -> tuple[float
         others = G[taken][:, :, taken].reshape(6 * len(taken), -1)
         solved = np.linalg.lstsq(others, np.column_stack([across.T, s[taken].ravel()]), rcond=None)[0]
         M, t = M - across @ solved[:, :6], t - across @ solved[:, 6]
-    scale = np.sqrt(np.maximum(np.diagonal(G[k][:, k]), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
-    on = values > MIN_REDUNDANCY
-    part = vectors[:, on].T @ (t / scale)
-    return float((part**2 / values[on]).sum()), -(vectors[:, on] @ (part / values[on])) / scale
+    gain = gain_of(M, t, np.diagonal(G[k][:, k]), MIN_REDUNDANCY)
+    return gain.value, gain.beta

@@ -160,7 +160,7 @@ def _keep_apart(
 
 def project_points(estimate: Estimate, camera: IntArray, image: IntArray, points: FloatArray) -> FloatArray:
     """Return the image of one object point per row, px, NaN behind the photograph, (k, 2)."""
-    UVW = _in_image_axes(estimate, image, points)
+    UVW = np.asarray(np.einsum("ki,kij->kj", points - estimate.position[image], estimate.rotation[image]))
     out = np.full((len(image), 2), np.nan)
     for lens, rows in _rows_by_camera(estimate, camera, image):
         out[rows] = pixel_from_tangents(lens, _tangents_in_front(UVW[rows]))
@@ -212,11 +212,6 @@ def plane_warps(
         warps[:, :2, a] = linear
         warps[:, 2, a] = -np.einsum("kc,kc->k", bent, linear) / np.einsum("kc,kc->k", linear, linear)
     return warps
-
-
-def _in_image_axes(estimate: Estimate, image: IntArray, points: FloatArray) -> FloatArray:
-    """Return the point of each row in the axes of its photograph, (k, 3)."""
-    return np.asarray(np.einsum("ki,kij->kj", points - estimate.position[image], estimate.rotation[image]))
 
 
 def _tangents_in_front(UVW: FloatArray) -> FloatArray:

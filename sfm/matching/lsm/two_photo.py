@@ -14,7 +14,6 @@ gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -183,7 +182,7 @@ def match_lsm(
 
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, _chunks(k)))
+            list(pool.map(work, (slice(first, first + CHUNK) for first in range(0, k, CHUNK))))
     else:
         work(slice(0, k))
     flag = out[:, FLAG].astype(np.int64)
@@ -195,10 +194,6 @@ def match_lsm(
     return LsmMatches(
         xy, covariance, warp, out[:, GAIN], out[:, OFFSET], out[:, R], out[:, SIGMA0], steps, flag
     )
-
-
-def _chunks(k: int) -> Iterator[slice]:
-    return (slice(first, first + CHUNK) for first in range(0, k, CHUNK))
 
 
 @compiled

@@ -144,7 +144,8 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
     network = adjustment.network
     a, found = adjustment, statistics.reliability
     tests = (a.residuals, a.redundancy_numbers, a.standardised, a.tau, found.minimal_bias, found.external)
-    error = _gross_error(a.residuals, a.redundancy_numbers)
+    checked = a.redundancy_numbers > MIN_CHECKED_REDUNDANCY
+    error = np.where(checked, a.residuals / np.where(checked, a.redundancy_numbers, 1.0), np.nan)
     for names, values, rejected in zip(
         _names(network), _listed((*tests, a.weights, error)), a.rejected.tolist(), strict=True
     ):
@@ -156,12 +157,6 @@ def _names(network: Network) -> Iterator[tuple[str, str]]:
     seen = network.image_points
     for image, point in zip(seen.image.tolist(), seen.point.tolist(), strict=True):
         yield network.images[image], network.points[point]
-
-
-def _gross_error(v: FloatArray, r: FloatArray) -> FloatArray:
-    """Return the estimated gross error v / r, NaN if nothing checks it, px, (k, 2)."""
-    checked = r > MIN_CHECKED_REDUNDANCY
-    return np.where(checked, v / np.where(checked, r, 1.0), np.nan)
 
 
 def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:

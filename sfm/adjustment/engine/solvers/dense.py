@@ -103,7 +103,8 @@ class DenseSolver:
         weak = info != 0 or float(np.diagonal(cholesky).min()) ** 2 < WEAK_PIVOT
         if weak and not damped:
             del cholesky  # its memory is needed
-            further = _null_vectors(S)
+            values, vectors = eigh(S, lower=False)
+            further = np.asfortranarray(vectors[:, values < NULL])
             if further.shape[1]:
                 S = dsyrk(1.0, further, beta=1.0, c=S, overwrite_c=1)
             cholesky, info = dpotrf(S, overwrite_a=1)
@@ -203,12 +204,6 @@ def schur_complement(
         S[:first, :first] += of_poses.astype(dtype)
     _add_blocks(b.U, parts.border, parts.corner, parts.scale, 1 + equations.damping, S.T)
     return S.T
-
-
-def _null_vectors(S: FloatArray) -> FloatArray:
-    """Return the eigenvectors with eigenvalue 0, (reduced, e); S contains the upper triangle."""
-    values, vectors = eigh(S, lower=False)
-    return np.asfortranarray(vectors[:, values < NULL])
 
 
 @compiled
