@@ -143,8 +143,6 @@ def causes_of(kind: str, number: int) -> tuple[str, ...]:
     return kinds_of(found)
 
 
-# A camera that varies has the remedy of photographs of another camera in no order.
-ALIKE = {"group zoomed": "camera_varies", "second body": "camera_varies"}
 # of each kind a number at which the fault is clear; the study runs over hundreds
 CLEAR = {
     "group zoomed": 28, "second body": 18, "drift": 18, "growth": 28, "sheared": 18, "bent": 18,
@@ -158,7 +156,7 @@ def test_a_planted_fault_is_named_first(kind: str) -> None:
         found = causes_of(kind, number)
         right = planted(kind, number).cause
         if found:
-            assert found[0] in (right, ALIKE.get(kind)), (kind, number)
+            assert found[0] == right, (kind, number)
             return
     pytest.fail(f"{kind} was not found in four networks")
 

@@ -59,8 +59,8 @@ MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
 MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds
 MAX_SPLITS = 12  # positions in the sequence at which a movement is tested
 MAX_MOVED = 60  # points with different vectors that are tested together
-ROUNDS = 20  # iterations of set and motion
-STARTS = 8  # points whose motion others may share
+ROUNDS = 20  # iterations of a set and its parameters
+STARTS = 8  # points or photographs from which a set is grown
 MIN_OF_BODY = 3  # points that determine the six motions of a body
 
 
@@ -224,6 +224,10 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
             runs = np.unique(run[among])
             part = whole.of(runs, np.array(family.places))
             for pattern, factors in patterns_of(family, len(runs)):
+                if pattern == "group":
+                    factors = part.groups()
+                if not len(factors):
+                    continue
                 gains = [part.gain(factor) for factor in factors]
                 best = max(range(len(gains)), key=lambda k: gains[k].value)
                 gain, spread = gains[best], part.spread(factors[best], gains[best])
@@ -233,7 +237,8 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                 if pattern == "single":
                     left = _variance_of(reduced, factor > 0, gain)
                     spread = replace(spread, factor=max(spread.factor, left))
-                search = float(np.log(len(factors)))
+                count = 2.0 ** (len(runs) - 1) if pattern == "group" else len(factors)
+                search = float(np.log(count))
                 yield Alternative(family, pattern, factor, gain, spread, search, among=among)
 
 
@@ -306,6 +311,8 @@ def patterns_of(family: CameraFamily | ObjectFamily, m: int) -> Iterator[tuple[s
         yield "split", (np.arange(m) >= np.arange(MIN_GROUP, m - MIN_GROUP + 1)[:, None]).astype(float)
         yield "linear", np.linspace(-1, 1, m)[None]
         yield "alternating", (np.arange(m) % 2)[None].astype(float)
+    if m > 2 * MIN_GROUP and family.of_camera:
+        yield "group", np.zeros((0, m))  # grown, see `Part.groups`
 
 
 @dataclass(frozen=True)
@@ -329,6 +336,27 @@ class Part:
             factor**2 @ self.squares,
             least_share(self.g.shape[1]),
         )
+
+    def groups(self) -> FloatArray:
+        """Return groups of photographs in no order, grown by two-means, as factors 0 and 1, (p, m)."""
+        m = len(self.g)
+        single, _ = gains_of(np.einsum("iaib->iab", self.H), self.g, self.squares)
+        found = []
+        for first in np.argsort(-single)[:STARTS]:
+            factor = (np.arange(m) == first).astype(float)
+            for _ in range(ROUNDS):
+                beta = self.gain(factor).beta
+                # v'Pv as a function of the factors s, with beta held: s'Qs + 2 l's, minimised one by one
+                Q, linear, again = np.tensordot(beta, self.H, (0, 1)) @ beta, self.g @ beta, factor.copy()
+                for i in range(m):
+                    others = Q[i] @ again - Q[i, i] * again[i]
+                    again[i] = float(Q[i, i] + 2 * (linear[i] + others) < 0)
+                if (again == factor).all() or not again.any():
+                    break
+                factor = again
+            if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
+                found.append(factor)
+        return np.array(found).reshape(-1, m)
 
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:
         """Return the spread of the photographs in the family beyond what a pattern explains.

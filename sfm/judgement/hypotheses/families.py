@@ -49,7 +49,7 @@ class Alternative:
     """One alternative and the result of its score test."""
 
     family: Family
-    pattern: str  # single | split | linear | alternating | each | all
+    pattern: str  # single | split | linear | alternating | group | each | all
     factor: FloatArray  # factor of each photograph, (m,); its run of photographs if `pattern` is each
     gain: Gain = NO_GAIN
     spread: Spread = NONE  # spread of the photographs or points outside the family
