@@ -1,8 +1,8 @@
 """Free network: observations of any kind as differences from the network of the image points alone.
 
 Every kind of observation linearises itself. With its derivatives J by the unknowns, the covariance C of the
-free network and the motions H that the image points leave open, the differences v have the covariance
-J C J' + stated, and the parameters A = J H. The parameters of a group, such as a plane, are further ones.
+free network and the motions H of a similarity, which the image points leave open, the differences v have the
+covariance J C J' + stated, and the parameters A = J H. Those of a group, such as a plane, are further ones.
 
 Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2 (propagation, elimination of
 groups of parameters).
@@ -13,18 +13,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.sparse import csr_matrix
 
 from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.judgement.given.values import RANK, GivenModel
-from sfm.network import Network, values_of
+from sfm.network import AdjustedValues, Estimate, Network, values_of
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
-from sfm.similarity import Similarity
+from sfm.similarity import Similarity, similarity_motions
 
 MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged
 
@@ -65,12 +67,22 @@ class FreeNetwork:
             C = m.joint(reduced, point)
         except (GeometryError, np.linalg.LinAlgError):
             return None
-        if not np.isfinite(C).all():
-            return None
-        motions = m.optimum.motions
-        of_points = motions.points[point].reshape(3 * len(point), motions.reduced.shape[1])
-        H = np.concatenate([motions.reduced[reduced], of_points])
-        return Reference(m, reduced, point, (C + C.T) / 2, H)
+        return Reference(m, reduced, point, (C + C.T) / 2) if np.isfinite(C).all() else None
+
+
+class Differences(NamedTuple):
+    """Differences of observations from the free network in the object frame, and what they depend on.
+
+    The first parameters are `similarity_motions` about the centre. The parameters of groups follow.
+    """
+
+    v: FloatArray  # observed minus predicted, (m,)
+    J: csr_matrix  # derivatives of the prediction by the unknowns of the reference, (m, u)
+    stated: FloatArray  # stated covariance, (m, m)
+    A: FloatArray  # derivatives by the parameters that only given values determine, (m, 7 + h)
+    item: IntArray  # given value of each row, (m,)
+    kind: IntArray  # kind of each given value, (items,)
+    size: float  # length by which rotations and scale are divided, object unit
 
 
 @dataclass(frozen=True)
@@ -81,45 +93,68 @@ class Reference:
     reduced: IntArray  # columns of reduced unknowns, (r,)
     points: IntArray  # object points, (p,)
     C: FloatArray  # joint covariance, (r + 3 p, r + 3 p)
-    motions: FloatArray  # derivatives by the motions that the image points leave open, (r + 3 p, d)
 
-    def differences(self, kinds: Sequence[Kind], placing: Similarity) -> tuple[GivenModel, IntArray]:
-        """Return the differences of observations from the free network, and the kind of each value.
+    def places(self, kind: Kind, placing: Similarity | None = None) -> FloatArray:
+        """Return the points and projection centres that observations depend on, in the free or object frame.
 
-        Each part of a kind is a value, see `Kind.part_of`.
+        Args:
+            kind: observations.
+            placing: object frame from the frame of the free network; the latter frame if None.
+        """
+        free = self.marginal.adjustment.estimate
+        by_type = {POINT: free.points, PHOTOGRAPH: free.position}
+        X = [np.zeros((0, 3)), *(by_type[of][at] for of, at in kind.blocks() if of in by_type)]
+        return np.concatenate(X) if placing is None else placing.apply(np.concatenate(X))
+
+    def compare(self, kinds: Sequence[Kind], placing: Similarity) -> Differences:
+        """Return the differences of observations from the free network; each part of a kind is a value.
 
         Args:
             kinds: observations.
             placing: object frame from the frame of the free network.
         """
-        values = values_of(placing.apply_estimate(self.marginal.adjustment.estimate))
-        differences, by_unknowns, stated, own, item, of = [], [], [], [], [], list[int]()
+        free = placing.apply_estimate(self.marginal.adjustment.estimate)
+        values = values_of(free)
+        X = np.concatenate([self.places(kind, placing) for kind in kinds])
+        centre, size = centre_and_size(X) if len(X) else (np.zeros(3), 1.0)
+        moved = _motions(values, free, centre, size)
+        v, stated, motions, own, item, of = [], [], [], [], [], list[int]()
+        triplets, rows = [], 0
         for k, kind in enumerate(kinds):
             linear, covariance = kind.linearise(values), kind.covariances()
             n, d = linear.difference.shape
-            J = np.zeros((n, d, len(self.C)))
+            A = np.zeros((n, d, 7))
+            row = rows + np.arange(n * d).reshape(n, d, 1)
             for block, by in zip(kind.blocks(), linear.J, strict=True):
+                A += by @ moved[block.of][block.at]
                 columns, derivatives = self._by_free(block, by, placing)
-                place = np.arange(n)[:, None, None], np.arange(d)[:, None], columns[:, None, :]
-                np.add.at(J, place, derivatives)
+                triplets.append(np.broadcast_arrays(derivatives, row, columns[:, None, :]))
             parts = np.array([kind.part_of(row, a) for row in range(n) for a in range(d)], dtype=np.int64)
-            on = np.isfinite(np.einsum("nii->ni", covariance)).ravel()
-            differences.append(-linear.difference.ravel()[on])
-            by_unknowns.append(J.reshape(n * d, -1)[on])
-            stated.append(block_diag(*np.where(np.isfinite(covariance), covariance, 0.0))[np.ix_(on, on)])
+            v.append(-linear.difference.ravel())
+            stated += list(covariance)
+            motions.append(A.reshape(n * d, 7))
             own.append(np.zeros((n * d, 0)) if linear.taken is None else _columns(linear.taken[0]))
-            item.append(parts[on] + len(of))
+            item.append(parts + len(of))
             of += [k] * (int(parts.max(initial=-1)) + 1)
-        J = np.concatenate(by_unknowns)
-        model = GivenModel(
-            np.concatenate(differences),
-            J @ self.C @ J.T,
-            block_diag(*stated),
-            np.hstack([J @ self.motions, block_diag(*own)]),
-            np.concatenate(item),
-            self.marginal.adjustment.redundancy,
+            rows += n * d
+        data, row_of, column_of = (
+            np.concatenate([triplet[k].ravel() for triplet in triplets]) for k in range(3)
         )
-        return model, np.array(of, dtype=np.int64)
+        J = csr_matrix((data, (row_of, column_of)), shape=(rows, len(self.C)))
+        S = block_diag(*stated)
+        on = np.isfinite(np.diagonal(S))
+        A = np.hstack([np.concatenate(motions), block_diag(*own)])[on]
+        kept, items = np.concatenate(item)[on], np.array(of, dtype=np.int64)
+        S = np.where(np.isfinite(S), S, 0.0)[np.ix_(on, on)]
+        return Differences(np.concatenate(v)[on], J[on], S, A, kept, items, size)
+
+    def differences(self, kinds: Sequence[Kind], placing: Similarity) -> tuple[GivenModel, IntArray]:
+        """Return the differences as a model of given values, and the kind of each value; see `compare`."""
+        found = self.compare(kinds, placing)
+        network = np.asarray((found.J @ (found.J @ self.C).T).T)
+        redundancy = self.marginal.adjustment.redundancy
+        model = GivenModel(found.v, network, found.stated, found.A, found.item, redundancy)
+        return model, found.kind
 
     def _by_free(self, block: Block, by: FloatArray, placing: Similarity) -> tuple[IntArray, FloatArray]:
         """Return the columns of a block, (n, u), and its derivatives by the free unknowns, (n, d, u)."""
@@ -136,6 +171,24 @@ class Reference:
             terms = np.eye(6) * lengths * (columns >= 0)[:, None]
         # fixed unknowns have derivatives of 0 in any column
         return np.searchsorted(self.reduced, columns).clip(0, max(len(self.reduced) - 1, 0)), by @ terms
+
+
+def _motions(values: AdjustedValues, placed: Estimate, centre: FloatArray, size: float) -> dict[str, FloatArray]:
+    """Return the `similarity_motions` of the unknowns of each type, (n, 3 or 6, 7)."""
+    poses = np.zeros((len(values.position), 6, 7))
+    poses[:, :3] = similarity_motions(values.position, centre=centre, size=size)
+    poses[:, 3:, 3:6] = values.M / size
+    mounts = np.zeros((len(values.mount_position), 6, 7))
+    if placed.mounts is not None:
+        mounts[:, :3, 6] = placed.mounts.free[:, :3] * values.mount_position / size
+    points = similarity_motions(values.points, centre=centre, size=size)
+    return {POINT: points, PHOTOGRAPH: poses, MOUNT: mounts}
+
+
+def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
+    """Return the centre of points and the largest distance of a coordinate from it."""
+    centre = X.mean(axis=0)
+    return centre, max(float(np.abs(X - centre).max()), np.finfo(float).tiny)
 
 
 def confirmed(network: Network) -> tuple[Kind, ...]:
