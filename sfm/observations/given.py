@@ -8,14 +8,24 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import PARAMETER, POINT, Block, Kind, Linear, Values, no_index, no_value
+from sfm.observations.kind import (
+    PARAMETER,
+    POINT,
+    Block,
+    CoordinateKind,
+    Kind,
+    Linear,
+    Values,
+    no_index,
+    no_value,
+)
 
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
 
 @dataclass(frozen=True)
-class ObjectPoints(Kind):
+class ObjectPoints(CoordinateKind):
     """Object points with given coordinates (control)."""
 
     name: ClassVar[str] = "control points"
@@ -47,6 +57,10 @@ class ObjectPoints(Kind):
     def with_values(self, values: FloatArray) -> Self:
         """Return the points with other coordinates, (n, 3)."""
         return replace(self, xyz=values)
+
+    def with_covariance(self, covariance: FloatArray) -> Self:
+        """Return the points with another covariance, (n, 3, 3)."""
+        return replace(self, covariance=covariance)
 
     def blocks(self) -> tuple[Block, ...]:
         """Return the block of the points."""

@@ -217,6 +217,45 @@ class Kind(ABC):
         return self
 
 
+class CoordinateKind(Kind):
+    """A kind whose first components are coordinates of points or projection centres: X, Y, Z."""
+
+    @property
+    def coordinates(self) -> FloatArray:
+        """X, Y, Z, object unit; NaN where not observed, (n, 3)."""
+        return np.where(
+            np.isfinite(np.einsum("nii->ni", self.coordinate_covariance)), self.values[:, :3], np.nan
+        )
+
+    @property
+    def coordinate_covariance(self) -> FloatArray:
+        """Covariance of X, Y, Z, object unit^2; variance 0 = fixed, infinite = not observed, (n, 3, 3)."""
+        return self.covariances()[:, :3, :3]
+
+    @abstractmethod
+    def with_covariance(self, covariance: FloatArray) -> Self:
+        """Return the observations with another covariance, (n, d, d)."""
+
+    def with_coordinate_covariance(self, covariance: FloatArray) -> Self:
+        """Return the observations with another covariance of X, Y, Z, object unit^2, (n, 3, 3)."""
+        whole = self.covariances().copy()
+        whole[:, :3, :3] = covariance
+        return self.with_covariance(whole)
+
+    def reordered(self, order: IntArray) -> Self:
+        """Return the observations with the values of others, for example of exchanged names, (n,)."""
+        return self.with_values(self.values[order]).with_covariance(self.covariances()[order])
+
+    def mistakes(self) -> Mapping[str, Self]:
+        """Return the coordinates in a mirrored system."""
+        values, flip = self.values.copy(), np.array([-1.0, 1.0, 1.0])
+        values[:, :3] *= flip
+        mirrored = self.with_values(values)
+        return {
+            "mirrored": mirrored.with_coordinate_covariance(self.coordinate_covariance * flip * flip[:, None])
+        }
+
+
 class TableKind(Kind):
     """A kind that a survey gives as a table: names, then values, then their standard deviations."""
 

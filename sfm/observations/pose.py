@@ -17,7 +17,17 @@ from sfm.conventions import (
     rotation_from_angles,
     skew,
 )
-from sfm.observations.kind import MOUNT, PHOTOGRAPH, Block, Kind, Linear, RowKind, Values, no_index
+from sfm.observations.kind import (
+    MOUNT,
+    PHOTOGRAPH,
+    Block,
+    CoordinateKind,
+    Kind,
+    Linear,
+    RowKind,
+    Values,
+    no_index,
+)
 from sfm.observations.point_pairs import Pairs
 
 if TYPE_CHECKING:
@@ -113,7 +123,7 @@ class OfPhotographs(Kind):
 
 
 @dataclass(frozen=True)
-class ExteriorObservations(OfPhotographs, PoseObservations):
+class ExteriorObservations(OfPhotographs, PoseObservations, CoordinateKind):
     """Given exterior orientation (satellite positions, a calibrated rig)."""
 
     name: ClassVar[str] = "exterior orientation"
@@ -129,6 +139,18 @@ class ExteriorObservations(OfPhotographs, PoseObservations):
     def with_values(self, values: FloatArray) -> Self:
         """Return the observations with other positions and angles, (e, 6)."""
         return replace(self, position=values[:, :3], angles=values[:, 3:])
+
+    def with_covariance(self, covariance: FloatArray) -> Self:
+        """Return the observations with another covariance, (e, 6, 6)."""
+        return replace(self, covariance=covariance)
+
+    @property
+    def of_positions(self) -> Self:
+        """The observations without their angles."""
+        covariance = np.zeros_like(self.covariance)
+        covariance[:, :3, :3] = self.covariance[:, :3, :3]
+        covariance[:, range(3, 6), range(3, 6)] = np.inf
+        return self.with_covariance(covariance)
 
     def poses(self, values: Values) -> tuple[FloatArray, FloatArray]:
         """Return X0, (e, 3), and object to image axes, (e, 3, 3)."""

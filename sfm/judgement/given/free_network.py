@@ -173,7 +173,9 @@ class Reference:
         return np.searchsorted(self.reduced, columns).clip(0, max(len(self.reduced) - 1, 0)), by @ terms
 
 
-def _motions(values: AdjustedValues, placed: Estimate, centre: FloatArray, size: float) -> dict[str, FloatArray]:
+def _motions(
+    values: AdjustedValues, placed: Estimate, centre: FloatArray, size: float
+) -> dict[str, FloatArray]:
     """Return the `similarity_motions` of the unknowns of each type, (n, 3 or 6, 7)."""
     poses = np.zeros((len(values.position), 6, 7))
     poses[:, :3] = similarity_motions(values.position, centre=centre, size=size)

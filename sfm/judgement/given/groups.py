@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import FloatArray, IntArray
 from sfm.distributions import LEVEL
+from sfm.judgement.given.free_network import Reference
 from sfm.judgement.given.points import (
     GivenPoints,
     PlacedPoints,
@@ -20,28 +22,14 @@ from sfm.judgement.given.values import (
     Judgement,
 )
 from sfm.network import Network
+from sfm.observations.kind import PHOTOGRAPH, POINT, CoordinateKind, Kind
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import extended_axes
 
+K, C = TypeVar("K", bound=Kind), TypeVar("C", bound=CoordinateKind)
 MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
-
-
-@dataclass(frozen=True)
-class Places:
-    """Points and projection centres of the free network with their joint covariance."""
-
-    xyz: FloatArray  # (p, 3)
-    joint: FloatArray  # (3 p, 3 p)
-    redundancy: int
-    of_point: dict[str, int]  # row of a point by name
-    of_image: dict[str, int]  # row of a photograph by name
-
-    def at(self, places: Sequence[int]) -> tuple[IntArray, IntArray]:
-        """Return the indices of places as an array, and the indices of their coordinates."""
-        index = np.asarray(places, dtype=np.int64)
-        return index, (3 * index[:, None] + np.arange(3)).ravel()
 
 
 @dataclass(frozen=True)
@@ -49,12 +37,18 @@ class Task:
     """The values to judge, and the settings of the tests."""
 
     network: Network  # has all given values
-    places: Places
+    reference: Reference
+    of_point: IntArray  # index of each point of the network in the free network, -1 if it is not there, (n,)
+    of_image: IntArray  # the same of each photograph, (m,)
     datum: Datum  # of the survey
     unit: str
     rescale: bool
     plates: tuple[frozenset[str], ...] = ()  # points of each plate; the first plate is control
     checks_scale: bool = False  # whether mounts or tables check the scale of the others
+
+    def in_free(self, kind: K) -> tuple[IntArray, K]:
+        """Return the rows of observations whose points are in the free network, and these observations."""
+        return in_free(kind, self.of_point, self.of_image)
 
     @property
     def of_plate(self) -> bool:
@@ -73,6 +67,19 @@ class Task:
         return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
 
 
+def in_free(kind: K, of_point: IntArray, of_image: IntArray) -> tuple[IntArray, K]:
+    """Return the rows of observations whose points are in the free network, and these observations there.
+
+    Args:
+        kind: observations of a network.
+        of_point: index of each point of the network in the free network, -1 if it is not there, (n,).
+        of_image: the same of each photograph, (m,).
+    """
+    there = {POINT: of_point, PHOTOGRAPH: of_image}
+    on = np.all([there[block.of][block.at] >= 0 for block in kind.blocks()], axis=0)
+    return np.flatnonzero(on), kind.select(on).renumbered(of_point, of_image)
+
+
 @dataclass(frozen=True)
 class Group:
     """Judged given points of one kind."""
@@ -81,7 +88,6 @@ class Group:
     rows: IntArray  # rows of the points in their table of the network, (n,)
     names: tuple[str, ...]
     points: GivenPoints
-    places: IntArray  # rows of the points in `Places`, (n,)
     placed: PlacedPoints
     scatter: float = 0.0  # standard deviation of fixed coordinates from their scatter, object unit; 0: exact
 
@@ -110,27 +116,34 @@ class Group:
         """Test of all points."""
         return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
 
-    def taking_part(self, *, rescale: bool) -> tuple[GivenPoints, IntArray]:
-        """Return the points that take part, with their covariance in the adjustment, and their places."""
+    def taking_part(self, *, rescale: bool) -> GivenPoints:
+        """Return the points that take part, with their covariance in the adjustment."""
         kept = np.setdiff1d(np.arange(len(self.names)), self.out)
-        order = np.array(self.placed.order or range(len(self.names)), dtype=np.int64)
-        points = self.points.reordered(tuple(order.tolist())).select(kept)
+        points = self.points.reordered(self.placed.order) if self.placed.order else self.points
+        points = points.select(kept)
         if self.found.doubtful and rescale and self.points.stated.any():
-            points = replace(points, stated=self.placed.model.factor()[0] ** 2 * points.stated)
-        return points, self.places[kept]
+            points = points.with_stated(self.placed.model.factor()[0] ** 2 * points.stated)
+        return points
 
-    def as_judged(self, covariance: FloatArray, *, rescale: bool) -> tuple[IntArray, BoolArray, FloatArray]:
-        """Return the order of the given points, which points take part, and their covariance, (n, 3, 3).
+    def as_judged(self, given: C, *, rescale: bool, used: bool) -> C:
+        """Return the given points that fit, with their covariance; none if they are not used.
 
-        The order corrects names that were exchanged.
+        The values of names that were exchanged are those of the right names.
+
+        Args:
+            given: all points of the kind.
+            rescale: whether standard deviations that are too small may be replaced.
+            used: whether the points are used.
         """
-        order, keep = np.arange(len(covariance)), np.ones(len(covariance), dtype=bool)
-        if self.placed.order:
-            order[self.rows] = self.rows[list(self.placed.order)]
+        keep = np.full(len(given), used)
         keep[self.rows[list(self.out)]] = False
-        changed = covariance[order]
-        changed[self.rows] = self._confirmed(changed[self.rows], rescale)
-        return order, keep, changed
+        if self.placed.order:
+            order = np.arange(len(given))
+            order[self.rows] = self.rows[list(self.placed.order)]
+            given = given.reordered(order)
+        covariance = given.coordinate_covariance.copy()
+        covariance[self.rows] = self._confirmed(covariance[self.rows], rescale)
+        return given.with_coordinate_covariance(covariance).select(keep)
 
     def _confirmed(self, covariance: FloatArray, rescale: bool) -> FloatArray:
         """Return the covariance with which the points fit."""
@@ -162,27 +175,20 @@ def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
     """
     if len(groups) < 2:
         return None
-    parts = [one.taking_part(rescale=task.rescale) for one in groups]
-    index, coordinates = task.places.at(np.concatenate([at for _, at in parts]).tolist())
-    points = GivenPoints(
-        np.concatenate([one.given for one, _ in parts]),
-        np.concatenate([one.stated for one, _ in parts]),
-        task.places.xyz[index],
-        task.places.joint[np.ix_(coordinates, coordinates)],
-        task.places.redundancy,
-    )
-    model = points.model(groups[0].placed.placing, estimated=False)
-    second = model.item >= len(parts[0][0].given)
+    parts = [group.taking_part(rescale=task.rescale) for group in groups]
+    model, kind = task.reference.differences([points.kind for points in parts], groups[0].placed.placing)
+    second = (kind == 1)[model.item]
     columns = second[:, None] * model.A
     columns = columns[:, columns.any(axis=0)]
     apart = model.kept().bias(columns)
     if apart.probability >= task.level:
         return None
-    moved = np.zeros(points.given.shape)
-    moved[points.known] = columns @ apart.parameters
+    known = [np.isfinite(points.given) for points in parts]
+    moved = np.zeros((sum(map(len, known)), 3))
+    moved[np.concatenate(known)] = columns @ apart.parameters
     return remark(
         "datum_contradicted",
-        given=[one.of for one in groups],
+        given=[group.of for group in groups],
         distance=(float(np.linalg.norm(moved, axis=1).max()), task.unit),
         chi2=apart.statistic,
         dof=apart.dof,

@@ -15,21 +15,22 @@ import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
+from sfm.conventions import FloatArray, IntArray
 from sfm.judgement.given.free_network import FreeNetwork, every_of
 from sfm.judgement.given.groups import (
+    C,
     Group,
-    Places,
     Task,
     are_in_space,
     contradiction_of,
+    in_free,
     remarks_on_unchecked,
 )
 from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.values import NONCENTRALITY, GivenModel
 from sfm.network import ExteriorObservations, Network
+from sfm.observations.kind import CoordinateKind
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import Similarity
@@ -75,61 +76,49 @@ def judge_given(
     """
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
         return JudgedGiven(network, datum)
-    places = None if free is None else _places(network, free, datum)
-    if free is None or places is None:
+    task = None if free is None else _task(network, free, datum, unit)
+    if task is None:
         kinds = (("bars", network.scale_bars), ("control", network.control))
-        of = [name for name, some in kinds if len(some)]
+        of = [name for name, values in kinds if len(values)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
         connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
         return JudgedGiven(network, datum, remarks, checks_handedness=connects)
     of_plates = tuple(map(frozenset, plates))
-    task = Task(network, places, datum, unit, rescale, of_plates, checks_scale=checks_scale)
-    return _judged(task)
+    return _judged(replace(task, rescale=rescale, plates=of_plates, checks_scale=checks_scale))
 
 
-def _places(network: Network, of_image_points: FreeNetwork, datum: Datum) -> Places | None:
-    """Return the given points in the free network with their covariance; None if undetermined."""
-    free, marginal = of_image_points.adjustment, of_image_points.marginal
-    if marginal is None:
+def _task(network: Network, of_image_points: FreeNetwork, datum: Datum, unit: str) -> Task | None:
+    """Return what is judged, with the free network; None if the given points are not in it or undetermined."""
+    free, marginal = of_image_points.adjustment.network, of_image_points.marginal
+    if marginal is None or not determines_cameras(marginal):
         return None
-    bars, control = network.scale_bars, network.control
-    number = {name: j for j, name in enumerate(free.network.points)}
-    photograph = {name: i for i, name in enumerate(free.network.images)}
-    ends = [network.points[j] for j in np.unique(np.concatenate([bars.start, bars.end]))]
-    some = [network.points[j] for j in control.point]
-    step = every_of(len(some))
-    names = [name for name in dict.fromkeys([*ends, *some[::step]]) if name in number]
-    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
-    step = every_of(len(seen))
-    images = [name for name in (network.images[i] for i in seen.image[::step]) if name in photograph]
-    if not names and not images:
-        return None
-    points = np.array([number[name] for name in names], dtype=np.int64)
-    stations = np.array([photograph[name] for name in images], dtype=np.int64)
-    try:
-        joint = marginal.joint((6 * stations[:, None] + np.arange(3)).ravel(), points)
-    except (GeometryError, np.linalg.LinAlgError):
-        return None
-    if not np.isfinite(joint).all() or not determines_cameras(marginal):
-        return None
-    return Places(
-        np.concatenate([free.estimate.position[stations], free.estimate.points[points]]),
-        (joint + joint.T) / 2,
-        free.redundancy,
-        {name: len(images) + k for k, name in enumerate(names)},
-        {name: k for k, name in enumerate(images)},
+    of_point, of_image = (
+        np.array([number.get(name, -1) for name in names], dtype=np.int64)
+        for names, number in (
+            (network.points, {name: j for j, name in enumerate(free.points)}),
+            (network.images, {name: i for i, name in enumerate(free.images)}),
+        )
     )
+    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
+    kinds = (*(_thinned(kind)[1] for kind in (network.control, seen)), network.scale_bars)
+    there = [in_free(kind, of_point, of_image)[1] for kind in kinds]
+    reference = of_image_points.reference_of([kind for kind in there if len(kind)])
+    if reference is None or not any(map(len, there)):
+        return None
+    return Task(network, reference, of_point, of_image, datum, unit, True)
+
+
+def _thinned(kind: C) -> tuple[IntArray, C]:
+    """Return the rows of given points that are judged, of very many only some, and these points."""
+    rows = np.arange(len(kind))[:: every_of(len(kind))]
+    return rows, kind.select(rows)
 
 
 def _judged(task: Task) -> JudgedGiven:
     """Judge the given points, then the scales of bars and points."""
     network, datum = task.network, task.datum
-    control, seen = network.control, network.exterior
-    names = [network.points[j] for j in control.point], [network.images[i] for i in seen.image]
-    both = (
-        _group(task, "control", names[0], task.places.of_point, control.xyz, control.covariance),
-        _group(task, "centres", names[1], task.places.of_image, seen.position, seen.covariance[:, :3, :3]),
-    )
+    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
+    both = _group(task, "control", network.control), _group(task, "centres", seen.of_positions)
     groups = [one for one in both if one is not None]
     scales = judge_scales(task, [one for one in groups if one.dependable])
     used = [one for one in groups if not one.placed.mirrored and one.of not in scales.left_out]
@@ -137,8 +126,10 @@ def _judged(task: Task) -> JudgedGiven:
     if contradiction is not None:
         used = []
     network = replace(network, scale_bars=scales.bars)
-    for one in groups:
-        network = _as_judged(network, one, rescale=task.rescale, used=one in used)
+    for group in groups:
+        of = "control" if group.of == "control" else "exterior"
+        judged = group.as_judged(getattr(network, of), rescale=task.rescale, used=group in used)
+        network = replace(network, **{of: judged})
     if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
     return JudgedGiven(
@@ -155,57 +146,29 @@ def _judged(task: Task) -> JudgedGiven:
     )
 
 
-def _as_judged(network: Network, group: Group, *, rescale: bool, used: bool) -> Network:
-    """Return the network with the fitting points of a group; without any of its points if not used."""
-    if group.of == "control":
-        control = network.control
-        order, keep, covariance = group.as_judged(control.covariance, rescale=rescale)
-        control = replace(control, xyz=control.xyz[order], covariance=covariance)
-        return replace(network, control=control.select(keep & used))
-    seen = network.exterior
-    order, keep, of_centres = group.as_judged(seen.covariance[:, :3, :3], rescale=rescale)
-    covariance = seen.covariance[order]
-    covariance[:, :3, :3] = of_centres
-    seen = replace(seen, position=seen.position[order], angles=seen.angles[order], covariance=covariance)
-    return replace(network, exterior=seen.select(keep & used))
-
-
-def _group(
-    task: Task,
-    of: str,
-    names: Sequence[str],
-    place_of: dict[str, int],
-    xyz: FloatArray,
-    covariance: FloatArray,
-) -> Group | None:
+def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     """Judge the given points of a kind against the free network; None without any."""
-    given = np.where(np.isfinite(np.einsum("nii->ni", covariance)), xyz, np.nan)
-    placed_there = np.array([name in place_of for name in names], dtype=bool)
-    rows = np.flatnonzero(placed_there & np.isfinite(given).any(axis=1))
-    if not len(rows):
+    rows, kind = _thinned(kind)
+    names = kind.names(task.network, task.reference.marginal.adjustment.estimate)
+    there, kind = task.in_free(kind)
+    known = np.isfinite(kind.coordinates).any(axis=1)
+    if not known.any():
         return None
-    index, coordinates = task.places.at([place_of[names[k]] for k in rows.tolist()])
-    points = GivenPoints(
-        given[rows],
-        np.where(np.isfinite(covariance[rows]), covariance[rows], 0.0),
-        task.places.xyz[index],
-        task.places.joint[np.ix_(coordinates, coordinates)],
-        task.places.redundancy,
-    )
+    points, there = GivenPoints(kind.select(known), task.reference), there[known]
     in_datum = task.datum.kind == "control"
     fixed = not points.stated.any()
     start = Similarity(1.0, np.eye(3), np.zeros(3)) if in_datum else None
     placed = judge_points(points, task.level, start=start, estimated=fixed and not in_datum)
     if placed is None:
         return None
-    group = Group(of, rows, tuple(names[k] for k in rows.tolist()), points, index, placed)
+    group = Group(of, rows[there], tuple(names[k] for k in there.tolist()), points, placed)
     if fixed and in_datum and not (task.of_plate or placed.judgement.fits):
         group = _scattering(group, start, task)
     found = group.found
     if found.factor == 1.0:
         return group
     stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
-    points = replace(points, stated=found.factor**2 * stated)
+    points = points.with_stated(found.factor**2 * stated)
     fitting = judge_points(points, task.level, start=start)
     placed = group.placed if fitting is None else replace(fitting, judgement=found)
     return replace(group, points=points, placed=placed)
@@ -222,7 +185,7 @@ def _scattering(group: Group, start: Similarity | None, task: Task) -> Group:
         return group
     kept = ~np.isin(placed.model.item, placed.judgement.wrong)
     sigma = placed.model.part(kept).factor()[0]
-    points = replace(group.points, stated=np.broadcast_to(sigma**2 * np.eye(3), group.points.stated.shape))
+    points = group.points.with_stated(np.broadcast_to(sigma**2 * np.eye(3), group.points.stated.shape))
     again = judge_points(points, task.level, start=start)
     if again is None or again.judgement.doubtful or again.judgement.wrong != placed.judgement.wrong:
         return group

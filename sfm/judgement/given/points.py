@@ -19,6 +19,7 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.distributions import MARGIN
 from sfm.errors import GeometryError
+from sfm.judgement.given.free_network import Reference, centre_and_size
 from sfm.judgement.given.names import assignments, cost_of_choice, find_renamed
 from sfm.judgement.given.values import (
     RANK,
@@ -28,7 +29,8 @@ from sfm.judgement.given.values import (
     judge_values,
     misfit_of,
 )
-from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity, similarity_motions
+from sfm.observations.kind import CoordinateKind
+from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity
 
 MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct
 MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten
@@ -39,6 +41,7 @@ STRAINS = (  # derivatives of coordinates by the parameters, along an axis or of
         + [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
     ),
 )
+UNCHANGED = Similarity(1.0, np.eye(3), np.zeros(3))
 ROUNDING = 16 * np.finfo(float).eps  # rounding error of transformed coordinates, relative to the largest
 
 
@@ -57,55 +60,79 @@ class Strain:
         d = np.linalg.svd(self.F, compute_uv=False)
         return float(np.trace(self.F) - 3 if len(self.derivatives) == 1 else d[0] / d[-1] - 1)
 
+    def of(self, model: GivenModel, X: FloatArray) -> GivenModel:
+        """Return the differences of stretched points, with the strain among the parameters.
+
+        Args:
+            model: differences of all coordinates of points.
+            X: points that are stretched about their centre, (n, 3).
+        """
+        centre, size = centre_and_size(X)
+        by_strain = np.einsum("uab,nb->nau", self.derivatives, (X - centre) / size)
+        A = np.hstack([self._turned(model.A), by_strain.reshape(len(model.v), -1)])
+        away = (X - centre) @ (self.F - np.eye(3)).T
+        network = self._turned(self._turned(model.network).T)
+        return replace(model, v=model.v - away.ravel(), network=network, A=A)
+
+    def _turned(self, rows: FloatArray) -> FloatArray:
+        """Return the effect of changes of points on the stretched points, (3 n, u)."""
+        return np.einsum("ab,nbu->nau", self.F, rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
+
 
 @dataclass(frozen=True)
 class GivenPoints:
-    """Points with given coordinates, and the same points of the free network."""
+    """Given coordinates of points or projection centres, which are compared with the free network."""
 
-    given: FloatArray  # given coordinates; NaN where unknown, (n, 3)
-    stated: FloatArray  # covariance of the given coordinates, 0 where fixed, (n, 3, 3)
-    free: FloatArray  # points in the frame of the free network, (n, 3)
-    joint: FloatArray  # covariance of the free points, (3 n, 3 n)
-    redundancy: int  # redundancy of the free network
+    kind: CoordinateKind
+    reference: Reference
     strain: Strain | None = None  # strain of the given coordinates
 
     @property
-    def known(self) -> FloatArray:
-        """Which coordinates are known, (n, 3)."""
-        return np.isfinite(self.given)
+    def given(self) -> FloatArray:
+        """Given coordinates; NaN where unknown, (n, 3)."""
+        return self.kind.coordinates
+
+    @property
+    def stated(self) -> FloatArray:
+        """Covariance of the given coordinates, 0 where fixed or unknown, (n, 3, 3)."""
+        covariance = self.kind.coordinate_covariance
+        return np.where(np.isfinite(covariance), covariance, 0.0)
+
+    @property
+    def free(self) -> FloatArray:
+        """Points in the frame of the free network, (n, 3)."""
+        return self.reference.places(self.kind)
 
     @property
     def complete(self) -> IntArray:
         """Points with all three coordinates known."""
-        return np.flatnonzero(self.known.all(axis=1))
+        return np.flatnonzero(np.isfinite(self.given).all(axis=1))
 
     def select(self, some: IntArray) -> GivenPoints:
         """Return the points of the given indices."""
-        rows = (3 * np.asarray(some)[:, None] + np.arange(3)).ravel()
-        return replace(
-            self,
-            given=self.given[some],
-            stated=self.stated[some],
-            free=self.free[some],
-            joint=self.joint[np.ix_(rows, rows)],
-        )
+        return replace(self, kind=self.kind.select(np.asarray(some)))
 
     @property
     def variances(self) -> tuple[FloatArray, FloatArray]:
         """Mean variance of a coordinate of free points, in their frame, and of given ones, (n,) each."""
-        of_free = np.diagonal(self.joint).reshape(-1, 3).mean(axis=1)
+        everything = self.kind.with_coordinate_covariance(self.stated)
+        model, _ = self.reference.differences([everything], UNCHANGED)
+        of_free = np.diagonal(model.network).reshape(-1, 3).mean(axis=1)
         return of_free, np.einsum("nii->n", self.stated) / 3
 
     def reordered(self, order: tuple[int, ...]) -> GivenPoints:
         """Return the points with their given coordinates in another order."""
-        return replace(self, given=self.given[list(order)], stated=self.stated[list(order)])
+        return replace(self, kind=self.kind.reordered(np.array(order)))
+
+    def with_stated(self, stated: FloatArray) -> GivenPoints:
+        """Return the points with another covariance of the known coordinates, (n, 3, 3)."""
+        covariance = self.kind.coordinate_covariance
+        covariance = np.where(np.isfinite(covariance), stated, covariance)
+        return replace(self, kind=self.kind.with_coordinate_covariance(covariance))
 
     def mirrored(self) -> GivenPoints:
-        """Return the points with the free network mirrored."""
-        flip = np.tile([-1.0, 1.0, 1.0], len(self.free))
-        return replace(
-            self, free=self.free * (-1.0, 1.0, 1.0), joint=self.joint * flip[:, None] * flip[None, :]
-        )
+        """Return the points in a mirrored system."""
+        return replace(self, kind=self.kind.mistakes()["mirrored"])
 
     def model(self, placing: Similarity, *, estimated: bool) -> GivenModel:
         """Return the differences from the free network after a similarity.
@@ -114,33 +141,16 @@ class GivenPoints:
             placing: similarity, given frame from free frame.
             estimated: whether the standard deviations are unknown.
         """
-        rows = np.flatnonzero(self.known.ravel())
-        X = placing.apply(self.free)
-        centre, size = centre_and_size(X)
-        A = similarity_motions(X, centre=centre, size=size).reshape(-1, 3, 7)
-        n, R = len(X), placing.rotation
-        if self.strain is not None:
-            E, F = self.strain.derivatives, self.strain.F
-            by_strain = np.einsum("uab,nb->nau", E, (X - centre) / size)
-            X, R = centre + (X - centre) @ F.T, F @ R
-            A = np.concatenate([np.einsum("ab,nbu->nau", F, A), by_strain], axis=2)
-        A = A.reshape(3 * n, -1)[rows]
-        turned = np.einsum("ab,ibjc,dc->iajd", R, self.joint.reshape(n, 3, n, 3), R)
-        network = placing.scale**2 * turned.reshape(3 * n, 3 * n)[np.ix_(rows, rows)]
-        network[np.diag_indices(len(rows))] += (ROUNDING * np.abs(X).max()) ** 2
-        stated = np.zeros((3 * n, 3 * n))
-        for k in range(n):
-            stated[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = self.stated[k]
-        return GivenModel(
-            (self.given - X).ravel()[rows],
-            network,
-            stated[np.ix_(rows, rows)],
-            A,
-            rows // 3,
-            self.redundancy,
-            estimated,
-            2 * float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1))),
-        )
+        X = self.reference.places(self.kind, placing)
+        if self.strain is None:
+            model, _ = self.reference.differences([self.kind], placing)
+        else:
+            everything = self.kind.with_coordinate_covariance(self.stated)
+            model, _ = self.reference.differences([everything], placing)
+            model = self.strain.of(model, X).part(np.isfinite(self.given).ravel())
+        rounding = (ROUNDING * np.abs(X).max()) ** 2 * np.eye(len(model.v))
+        extent = 2 * float(np.median(np.linalg.norm(X - np.median(X, axis=0), axis=1)))
+        return replace(model, network=model.network + rounding, estimated=estimated, extent=extent)
 
     def moved(self, placing: Similarity, model: GivenModel, without: tuple[int, ...]) -> Similarity:
         """Return the similarity that best fits the given values, without some, by generalised least squares.
@@ -154,18 +164,11 @@ class GivenPoints:
         """
         kept = ~np.isin(model.item, without)
         dx = parameters_of(model, kept) @ model.v[kept]
-        X = placing.apply(self.free)
-        centre, size = centre_and_size(X)
+        centre, size = centre_and_size(self.reference.places(self.kind, placing))
         R, scale = rotation_from_vector(dx[3:6] / size), float(np.exp(dx[6] / size))
         rotation = R @ placing.rotation
         shift = centre + dx[:3] + scale * R @ (placing.translation - centre)
         return Similarity(scale * placing.scale, rotation, shift)
-
-
-def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
-    """Return the centre of points and the largest distance of a coordinate from it."""
-    centre = X.mean(axis=0)
-    return centre, max(float(np.abs(X - centre).max()), np.finfo(float).tiny)
 
 
 def parameters_of(model: GivenModel, kept: BoolArray) -> FloatArray:
