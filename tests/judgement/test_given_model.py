@@ -8,15 +8,18 @@ from itertools import combinations
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.sparse import csr_matrix
 
 from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.judgement.given import free_network
 from sfm.judgement.given import names as given_names
 from sfm.judgement.given import points as given_points
 from sfm.judgement.given import values as given_values
-from sfm.judgement.given.points import GivenPoints, judge_points
-from sfm.judgement.given.scales import GivenScale, scale_model, scale_of_length
+from sfm.judgement.given.scales import Scales, scales_of_lengths
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values
+from sfm.network import ScaleBars
 from sfm.similarity import Similarity, fit_similarity
+from tests.given_figures import Figure, judge
 from tests.synthetic import seed_of
 
 FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
@@ -271,23 +274,23 @@ def test_suspects_are_those_without_which_the_others_fit() -> None:
     assert given_values._suspects(bars(0.0, 9.0), 0.02) == (0, 1)
 
 
-def exact(n: int, name: str, sigma: float = 1e-3) -> GivenPoints:
+def exact(n: int, name: str, sigma: float = 1e-3) -> Figure:
     """Return points of a cube and of a free network in another frame, both without noise."""
     X = seed_of(name).uniform(-1, 1, (n, 3))
     stated = np.tile(sigma**2 * np.eye(3), (n, 1, 1))
-    return GivenPoints(X, stated, FRAME.apply(X), (0.1 * sigma) ** 2 * np.eye(3 * n), 500)
+    return Figure(X, stated, FRAME.apply(X), (0.1 * sigma) ** 2 * np.eye(3 * n), 500)
 
 
 def test_the_mirror_is_excluded_by_the_likelihood_of_a_variance_that_is_not_known() -> None:
     """Of points in a plane but one of height h; mirrored ones differ by 2 h in what a similarity leaves."""
     plane = exact(8, "mirror")
 
-    def judged(height: float) -> tuple[GivenPoints, given_points.PlacedPoints]:
+    def judged(height: float) -> tuple[given_points.GivenPoints, given_points.PlacedPoints]:
         X = plane.given * (1, 1, 0) + height * np.eye(8)[0][:, None] * (0, 0, 1)
         points = replace(plane, given=X, free=FRAME.apply(X))
-        found = judge_points(points, 0.001)
+        found = judge(points, 0.001)
         assert found is not None and found.judgement.fits
-        return points, found
+        return points.points, found
 
     n, flat = 3 * 8 - 7, judged(0.0)[1].model
     limit = n * np.exp(given_values.MARGIN / n)  # chi-square of the mirrored ones
@@ -297,22 +300,17 @@ def test_the_mirror_is_excluded_by_the_likelihood_of_a_variance_that_is_not_know
     assert given_points.excludes_mirror(*judged(1.05 * h))
 
 
-def test_points_are_selected_and_mirrored_with_their_covariance() -> None:
+def test_points_are_mirrored_with_their_covariance() -> None:
     rng = seed_of("select")
-    joint = rng.normal(size=(12, 12))
-    one = replace(exact(4, "select"), joint=joint @ joint.T, stated=rng.normal(size=(4, 3, 3)))
-    some = one.select(np.array([2, 0]))
-    np.testing.assert_array_equal(some.given, one.given[[2, 0]])
-    np.testing.assert_array_equal(some.free, one.free[[2, 0]])
-    np.testing.assert_array_equal(some.stated, one.stated[[2, 0]])
-    np.testing.assert_array_equal(some.joint, one.joint[np.ix_([6, 7, 8, 0, 1, 2], [6, 7, 8, 0, 1, 2])])
-    turned = one.mirrored()
-    np.testing.assert_array_equal(turned.free, one.free * (-1, 1, 1))
-    flip = np.diag(np.tile([-1.0, 1, 1], 4))
-    np.testing.assert_allclose(turned.joint, flip @ one.joint @ flip)
+    half = rng.normal(size=(4, 3, 3))
+    one = replace(exact(4, "select"), stated=half @ np.swapaxes(half, 1, 2))
+    turned, flip = one.points.mirrored(), np.diag([-1.0, 1, 1])
+    np.testing.assert_array_equal(turned.given, one.given * (-1, 1, 1))
+    np.testing.assert_allclose(turned.stated, flip @ one.stated @ flip)
     given = one.given.copy()
     given[1, 2] = np.nan
-    assert replace(one, given=given).complete.tolist() == [0, 2, 3]
+    some = replace(one, given=given).points
+    assert some.complete.tolist() == [0, 2, 3] and some.select(np.array([1, 3])).complete.tolist() == [1]
 
 
 def test_the_model_of_points_is_in_the_given_frame() -> None:
@@ -323,7 +321,7 @@ def test_the_model_of_points_is_in_the_given_frame() -> None:
     given[2, 1] = np.nan
     given[3] += (0.1, 0.2, 0.3)
     placing = FRAME.inverse()
-    model = replace(one, given=given).model(placing, estimated=True)
+    model = replace(one, given=given).points.model(placing, estimated=True)
     rows = np.delete(np.arange(12), 7)
     right = np.zeros(12)
     right[9:] = (0.1, 0.2, 0.3)
@@ -352,8 +350,8 @@ def test_a_similarity_is_moved_to_the_best_one(kind: str) -> None:
         right.translation + np.array([0.02, 0.01, -0.03]),
     )
     for _ in range(4):
-        model = one.model(placing, estimated=kind == "estimated")
-        placing = one.moved(placing, model, (4,))
+        model = one.points.model(placing, estimated=kind == "estimated")
+        placing = one.points.moved(placing, model, (4,))
     assert placing.scale == pytest.approx(right.scale, rel=1e-7)
     np.testing.assert_allclose(placing.rotation, right.rotation, atol=1e-7)
     np.testing.assert_allclose(placing.translation, right.translation, atol=1e-6)
@@ -366,7 +364,7 @@ def test_better_values_decide_where_a_similarity_is() -> None:
     strong = np.where(np.arange(8) < 4, 1e-10, 1.0)
     one = replace(one, given=given, stated=strong[:, None, None] * np.eye(3), joint=1e-14 * np.eye(24))
     placing = FRAME.inverse()
-    placing = one.moved(placing, one.model(placing, estimated=False), ())
+    placing = one.points.moved(placing, one.points.model(placing, estimated=False), ())
     np.testing.assert_allclose(placing.apply(one.free)[:4], given[:4], atol=1e-8)
     np.testing.assert_allclose(placing.apply(one.free)[4:], given[4:] - (1e-3, 0, 0), atol=1e-7)
 
@@ -378,23 +376,23 @@ def test_the_start_is_the_similarity_that_most_agree_upon(monkeypatch: pytest.Mo
     spoiled = replace(one, given=given)
     for most in (given_points.MAX_TRIPLES, 34):  # all 35, or as many at random
         monkeypatch.setattr(given_points, "MAX_TRIPLES", most)
-        of_all, found = given_points._starts(spoiled, None)
+        of_all, found = given_points._starts(spoiled.points, None)
         assert np.linalg.norm(of_all.apply(one.free) - given, axis=1).min() > 0.1
         assert found.scale == pytest.approx(2.5)
         np.testing.assert_allclose(found.apply(one.free)[[0, 2, 3]], one.given[[0, 2, 3]], atol=1e-9)
     three = one.select(np.arange(3))
-    assert [one.scale for one in given_points._starts(three, FRAME)] == pytest.approx([2.5])
-    assert list(given_points._starts(one.select(np.arange(2)), FRAME)) == [FRAME]
-    assert list(given_points._starts(one.select(np.arange(2)), None)) == []
+    assert [one.scale for one in given_points._starts(three.points, FRAME)] == pytest.approx([2.5])
+    assert list(given_points._starts(one.select(np.arange(2)).points, FRAME)) == [FRAME]
+    assert list(given_points._starts(one.select(np.arange(2)).points, None)) == []
     line = replace(three, free=np.outer(np.arange(3), np.ones(3)), given=np.outer(np.arange(3), np.ones(3)))
-    assert list(given_points._starts(line, FRAME)) == [FRAME]
+    assert list(given_points._starts(line.points, FRAME)) == [FRAME]
 
 
 @pytest.mark.parametrize(("n", "h"), [(4, 3), (5, 3), (6, 4), (7, 4), (8, 5)])
 def test_the_start_minimises_the_distance_of_more_than_half(n: int, h: int) -> None:
     one = exact(n, f"quantile {n}")
     one = replace(one, given=one.given + 0.05 * seed_of(f"quantile {n}").normal(size=(n, 3)))
-    found = list(given_points._starts(one, None))[-1]
+    found = list(given_points._starts(one.points, None))[-1]
 
     def distance(by: Similarity) -> float:
         return float(np.sort(np.linalg.norm(by.apply(one.free) - one.given, axis=1))[h - 1])
@@ -405,17 +403,22 @@ def test_the_start_minimises_the_distance_of_more_than_half(n: int, h: int) -> N
 
 
 def test_centre_and_size() -> None:
-    centre, size = given_points.centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
+    centre, size = free_network.centre_and_size(np.array([[0.0, 0, 0], [2, 0, 8]]))
     assert centre.tolist() == [1, 0, 4] and size == 4
 
 
 def test_scales_of_lengths_are_compared_with_their_covariance() -> None:
     free: FloatArray = np.array([[0.0, 0, 0], [3, 4, 0], [0, 0, 2]])
-    one = scale_of_length(10.0, 0.02, free, 0, 1)
-    assert (one.scale, one.sigma) == (pytest.approx(2), pytest.approx(4e-3))
-    assert one.rows.tolist() == pytest.approx([3 / 25, 4 / 25, 0, -3 / 25, -4 / 25, 0, 0, 0, 0])
-    other = scale_of_length(4.1, 0.02, free, 0, 2)
-    model = scale_model((one, other), 1e-4 * np.eye(9), 77)
+    reference = Figure(free, np.zeros((3, 3, 3)), free, 1e-4 * np.eye(9), 77).reference
+    sigma = np.array([0.02, 0.02])
+    found = scales_of_lengths(
+        ScaleBars(np.array([0, 0]), np.array([1, 2]), np.array([10.0, 4.1]), sigma), reference
+    )
+    np.testing.assert_allclose(found.log, np.log([2, 2.05]))
+    np.testing.assert_allclose(np.sqrt(found.variance), sigma / [10, 4.1])
+    by_first = [3 / 25, 4 / 25, 0, -3 / 25, -4 / 25, 0, 0, 0, 0]
+    assert found.J.toarray()[0].tolist() == pytest.approx(by_first)
+    model = found.model(reference)
     np.testing.assert_allclose(model.v, [np.log(2), np.log(2.05)])
     np.testing.assert_allclose(model.network, 1e-4 * np.array([[2 / 25, 0], [0, 0.5]]), atol=1e-18)
     np.testing.assert_allclose(model.stated, np.diag([4e-6, (0.02 / 4.1) ** 2]), rtol=0.03)
@@ -425,8 +428,9 @@ def test_scales_of_lengths_are_compared_with_their_covariance() -> None:
 @pytest.mark.parametrize("factor", [1e-3, 0.5, 1.0, 30.0])
 def test_a_mistyped_length_is_as_many_standard_deviations_off_as_its_logarithm(factor: float) -> None:
     """By the length that the others predict; by itself, a short bar would have little weight."""
-    scales = tuple(GivenScale(scale, np.zeros(3), 1e-4) for scale in (2.0, 2.0 * factor, 2.0))
-    model = scale_model(scales, np.zeros((3, 3)), 77)
+    scale = np.array([2.0, 2.0 * factor, 2.0])
+    one = exact(1, "mistyped length")
+    model = Scales(np.log(scale), csr_matrix((3, 3)), (1e-4 / scale) ** 2).model(one.reference)
     sigma = np.sqrt(np.diagonal(model.stated))
     np.testing.assert_allclose(sigma[[0, 2]], 1e-4 / 2)
     off = model.v[1] - model.v[0]
@@ -435,13 +439,13 @@ def test_a_mistyped_length_is_as_many_standard_deviations_off_as_its_logarithm(f
 
 def test_mirrored_points_state_what_was_wrong_as_given() -> None:
     one = exact(6, "mirror by hand")
-    found = judge_points(replace(one, given=one.given * (1, 1, -1)), 0.001)
+    found = judge(replace(one, given=one.given * (1, 1, -1)), 0.001)
     assert found is not None and found.mirrored and found.judgement.fits
     assert found.unmirrored is not None and found.unmirrored > 1e3
-    right = judge_points(one, 0.001)
+    right = judge(one, 0.001)
     assert right is not None and not right.mirrored and right.judgement.fits
     np.testing.assert_allclose(right.placing.apply(one.free), one.given, atol=1e-9)
-    assert judge_points(one.select(np.arange(2)), 0.001) is None
+    assert judge(one.select(np.arange(2)), 0.001) is None
 
 
 @pytest.mark.parametrize("estimated", [False, True])
@@ -450,11 +454,11 @@ def test_points_without_noise_fit(estimated: bool, far: float) -> None:
     """Differences of 1e-16 and covariances of a network whose residuals are 1e-13 px: ratios of rounding."""
     one = exact(7, "without noise")
     one = replace(one, given=one.given + far, stated=np.zeros((7, 3, 3)), joint=1e-30 * np.eye(21))
-    found = judge_points(one, 0.001, estimated=estimated)
+    found = judge(one, 0.001, estimated=estimated)
     assert found is not None and found.judgement.fits and found.judgement.statistic < 14  # on average
     given = one.given.copy()
     given[3, 1] += 1e-6 if far == 0 else 1e-2
-    wrong = judge_points(replace(one, given=given), 0.001, estimated=estimated)
+    wrong = judge(replace(one, given=given), 0.001, estimated=estimated)
     assert wrong is not None and wrong.judgement.wrong == (3,)
 
 
@@ -463,7 +467,7 @@ def test_coordinates_have_the_rounding_of_the_largest() -> None:
     one = replace(one, given=one.given + 1e3, joint=np.zeros((12, 12)))
     placing = replace(FRAME.inverse(), translation=FRAME.inverse().translation + 1e3)
     largest = float(np.abs(one.given).max())
-    sigma = np.sqrt(np.diagonal(one.model(placing, estimated=False).network))
+    sigma = np.sqrt(np.diagonal(one.points.model(placing, estimated=False).network))
     np.testing.assert_allclose(sigma, 16 * 2.0**-52 * largest)
 
 
@@ -501,11 +505,11 @@ def test_few_values_do_not_confirm_one_another() -> None:
     """A value must be checked in all its rows: three points leave two degrees of freedom, bars one of two."""
     five, four = exact(5, "five confirm"), exact(4, "four do not")
     placing = FRAME.inverse()
-    assert five.model(placing, estimated=False).confirms_rest((1,))
-    assert not four.model(placing, estimated=False).confirms_rest((1,))
+    assert five.points.model(placing, estimated=False).confirms_rest((1,))
+    assert not four.points.model(placing, estimated=False).confirms_rest((1,))
     assert bars(0.0, 1.0, 2.0).confirms_rest((1,)) and not bars(0.0, 1.0).confirms_rest((1,))
     line = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 1]])
-    near = replace(five, given=line, free=FRAME.apply(line)).model(placing, estimated=False)
+    near = replace(five, given=line, free=FRAME.apply(line)).points.model(placing, estimated=False)
     assert near.confirms_rest((4,)) and not near.kept((0,)).dof < 3 and not near.confirms_rest((0,))
 
 
@@ -517,7 +521,7 @@ def test_names_of_four_to_forty_points_are_assigned(n: int, agreed: int, assigne
     one = exact(n, f"assigned {n}")
     given = np.concatenate([one.given[:agreed], np.roll(one.given[agreed:], 1, axis=0)])
     placing = FRAME.inverse() if agreed else None
-    found = list(given_names.assignments(one.free, given, one.variances, placing))[:1]
+    found = list(given_names.assignments(one.free, given, one.points.variances, placing))[:1]
     right = (*range(agreed), *np.roll(range(agreed, n), -1).tolist())
     assert found == [right] * assigned
 

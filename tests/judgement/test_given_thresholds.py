@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.conventions import SWELLING
+from sfm.adjustment.datum import Datum
 from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import scales as given_scales
-from sfm.judgement.given.points import GivenPoints
 from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
@@ -35,15 +34,6 @@ def test_a_print_may_be_half_a_percent_larger_than_stated(off: float, contradict
     bar = ScaleBar("9", "20", float(np.linalg.norm(truth.points[8] - truth.points[19])), 1e-4)
     result = run_survey(survey_of(network, truth, control=control, scale_bars=(bar,), datum={"kind": "free"}))
     assert ("scale_contradicted" in kinds_of(remarks_on_given(result))) == contradicted
-
-
-def test_the_scale_of_unstated_coordinates_is_known_to_a_part_of_itself() -> None:
-    X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    points = GivenPoints(3.0 * X, np.zeros((2, 3, 3)), X, np.eye(6), 100)
-    task: Any = SimpleNamespace(places=SimpleNamespace(xyz=X), datum=SimpleNamespace(kind="free"))
-    group: Any = SimpleNamespace(points=points, places=np.arange(2))
-    found = given_scales._scale_of(task, group)
-    assert found is not None and found.scale == 3.0 and found.sigma == pytest.approx(3.0 * SWELLING)
 
 
 @pytest.mark.parametrize("weaker", [5.0, 11.0, 100.0])
@@ -113,7 +103,8 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
 
     def said(bars: int = 3, *, on_points: bool = False, **found: tuple[int, ...]) -> tuple[set[int], Remark]:
         judged, names = Judgement(30.0, 2, 1e-6, **found), ["a", "b", "control"]
-        out, remarks = given_scales._contradicting_scales(model, judged, names, bars, on_points=on_points)
+        task: Any = SimpleNamespace(datum=Datum("control" if on_points else "free"), plates=())
+        out, remarks = given_scales._contradicting_scales(task, model, judged, names, bars)
         return set(out), remarks[0]
 
     out, both = said(doubtful=(0, 1, 2))
@@ -157,17 +148,17 @@ def test_a_bar_given_twice_counts_once() -> None:
         np.array([1.0, 1.0003, 1.2, 0.5, 2.0]),
         np.array([1e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
     )
-    found = given_scales._lengths(bars)
-    assert [one.bars for one in found] == [(0, 1), (2,), (3,), (4,)]
-    assert [one.contradicted for one in found] == [True, True, False, False]
-    assert found[0].length == pytest.approx(1.00006) and found[0].sigma == 1e-4
+    merged, members, contradicted = given_scales.merge_lengths(bars)
+    assert members == ((0, 1), (2,), (3,), (4,))
+    assert contradicted == (True, True, False, False)
+    assert merged.length[0] == pytest.approx(1.00006) and merged.sigma[0] == 1e-4
 
 
 @pytest.mark.parametrize(("apart", "agree"), [(3.2, True), (3.4, False)])
 def test_bars_of_the_same_ends_agree_at_the_level(apart: float, agree: bool) -> None:
     length = np.array([1.0, 1.0 + apart * 1e-4 * np.sqrt(2)])
     bars = ScaleBars(np.array([0, 0]), np.array([1, 1]), length, np.array([1e-4, 1e-4]))
-    assert (len(given_scales._lengths(bars)) == 1) == agree
+    assert (len(given_scales.merge_lengths(bars)[0]) == 1) == agree
 
 
 def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:

@@ -12,7 +12,6 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
-from sfm.judgement.given.points import GivenPoints
 from sfm.judgement.given.values import GivenModel
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
@@ -22,6 +21,7 @@ from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.findings import findings_of
+from tests.given_figures import Figure
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import add_narrow_points, make_network, observed_anew, seed_of
 
@@ -120,11 +120,11 @@ def test_three_control_points_are_partly_checked() -> None:
     level, kinds = _kinds(network, truth, control=control, datum={"kind": "control"})
     assert level == "good" and kinds == ("given_partly_checked", "scale_unchecked")
     three, two = (
-        GivenPoints(X, np.tile(1e-8 * np.eye(3), (len(X), 1, 1)), X, 1e-10 * np.eye(3 * len(X)), 500)
+        Figure(X, np.tile(1e-8 * np.eye(3), (len(X), 1, 1)), X, 1e-10 * np.eye(3 * len(X)))
         for X in (truth.points[:3], truth.points[:2])
     )
     for one, kind in ((three, "given_partly_checked"), (two, "given_unchecked")):
-        model = one.model(Similarity(1.0, np.eye(3), np.zeros(3)), estimated=False)
+        model = one.points.model(Similarity(1.0, np.eye(3), np.zeros(3)), estimated=False)
         (said,) = remarks_on_unchecked("control", ["1", "2", "3"], model)
         assert said.kind == kind and len(said.names("given")) == len(one.given)
 

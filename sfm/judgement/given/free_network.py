@@ -188,9 +188,9 @@ def _motions(
 
 
 def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
-    """Return the centre of points and the largest distance of a coordinate from it."""
+    """Return the centre of points and the largest distance of a coordinate from it; 1 if they coincide."""
     centre = X.mean(axis=0)
-    return centre, max(float(np.abs(X - centre).max()), np.finfo(float).tiny)
+    return centre, float(np.abs(X - centre).max()) or 1.0
 
 
 def confirmed(network: Network) -> tuple[Kind, ...]:

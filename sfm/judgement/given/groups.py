@@ -28,7 +28,8 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import extended_axes
 
-K, C = TypeVar("K", bound=Kind), TypeVar("C", bound=CoordinateKind)
+K = TypeVar("K", bound=Kind)
+C = TypeVar("C", bound=CoordinateKind)
 MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
 
 

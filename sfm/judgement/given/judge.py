@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.judgement.given.free_network import FreeNetwork, every_of
 from sfm.judgement.given.groups import (
     C,
@@ -88,7 +88,7 @@ def judge_given(
 
 
 def _task(network: Network, of_image_points: FreeNetwork, datum: Datum, unit: str) -> Task | None:
-    """Return what is judged, with the free network; None if the given points are not in it or undetermined."""
+    """Return what is judged, with the free network; None without any of them in it."""
     free, marginal = of_image_points.adjustment.network, of_image_points.marginal
     if marginal is None or not determines_cameras(marginal):
         return None
@@ -151,7 +151,7 @@ def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     rows, kind = _thinned(kind)
     names = kind.names(task.network, task.reference.marginal.adjustment.estimate)
     there, kind = task.in_free(kind)
-    known = np.isfinite(kind.coordinates).any(axis=1)
+    known: BoolArray = np.asarray(np.isfinite(kind.coordinates).any(axis=1))
     if not known.any():
         return None
     points, there = GivenPoints(kind.select(known), task.reference), there[known]

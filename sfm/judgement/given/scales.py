@@ -17,7 +17,7 @@ from sfm.conventions import FloatArray, find_unit
 from sfm.distributions import LEVEL, chi2_isf, chi2_sf
 from sfm.judgement.given.free_network import Reference
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
-from sfm.judgement.given.points import UNCHANGED, parameters_of
+from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
 from sfm.judgement.given.values import UNSTATED_FRACTION, GivenModel, Judgement, judge_values
 from sfm.network import ScaleBars
 from sfm.remarks.kind import significant
@@ -46,7 +46,13 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
         groups: dependable groups of given points.
     """
     lengths = _lengths_of(task)
-    of_groups = [(group, scale) for group in groups if (scale := _scale_of(task, group)) is not None]
+    found = [(group, scale_of_points(group.points, group.placed)) for group in groups]
+    of_groups = [(group, scale) for group, scale in found if scale is not None]
+    if task.datum.kind != "control":  # coordinates without a standard deviation may be those of a print
+        of_groups = [
+            (group, scale if group.points.stated.any() else scale.looser(UNSTATED_FRACTION))
+            for group, scale in of_groups
+        ]
     names = list(lengths.sources)
     names += [
         plate_name(0) if task.of_plate and group.of == "control" else group.of for group, _ in of_groups
@@ -58,7 +64,9 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     )
     model = scales.model(task.reference)
     judgement = judge_values(model, task.level)
-    tests = (GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),)
+    tests: tuple[GivenTest, ...] = (
+        GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),
+    )
     out: tuple[int, ...] = ()
     remarks: tuple[Remark, ...] = ()
     factor = 1.0
@@ -94,6 +102,10 @@ class Scales(NamedTuple):
         """Return all scales."""
         log, variance = (np.concatenate([scales[k] for scales in every]) for k in (0, 2))
         return cls(log, vstack([scales.J for scales in every]).tocsr(), variance)
+
+    def looser(self, sigma: float) -> Scales:
+        """Return the scales with a further relative standard deviation."""
+        return self._replace(variance=self.variance + sigma**2)
 
     def mean(self, sets: Collection[Sequence[int]]) -> Scales:
         """Return the mean of each of several sets of scales from independent lengths."""
@@ -131,11 +143,15 @@ def scales_of_lengths(bars: ScaleBars, reference: Reference) -> Scales:
     return Scales(np.log(bars.length / length), J, (bars.sigma / bars.length) ** 2)
 
 
-def _scale_of(task: Task, group: Group) -> Scales | None:
-    """Return the scale from given points; from their distance if there are two."""
-    points, complete, reference = group.points, group.points.complete, task.reference
-    known = np.isfinite(points.given)
-    if len(complete) == 2 and known.sum() == 6:
+def scale_of_points(points: GivenPoints, placed: PlacedPoints) -> Scales | None:
+    """Return the scale from given points, from their distance if there are two; None if they give none.
+
+    Args:
+        points: given points.
+        placed: these points, judged.
+    """
+    complete, reference, out = points.complete, points.reference, placed.judgement.wrong
+    if len(complete) == 2 and np.isfinite(points.given).sum() == 6:
         pair = points.select(complete)
         apart, apart_free = (X[1] - X[0] for X in (pair.given, pair.free))
         length, free = float(np.linalg.norm(apart)), float(np.linalg.norm(apart_free))
@@ -144,16 +160,13 @@ def _scale_of(task: Task, group: Group) -> Scales | None:
         log, G = np.log(length / free), np.concatenate([-apart_free, apart_free]) / free**2
         J, e = reference.compare([pair.kind], UNCHANGED).J, apart / length
         variance = float(e @ pair.stated.sum(axis=0) @ e) / length**2
-    elif len(complete) < 3 or group.placed.model.kept(group.out).dof < 0:
+    elif len(complete) < 3 or placed.model.kept(out).dof < 0:
         return None
     else:
-        model, placing = group.placed.model, group.placed.placing
-        found, kept = reference.compare([points.kind], placing), ~np.isin(model.item, group.out)
-        G = np.zeros(len(model.v))
-        G[kept] = parameters_of(model, kept)[6] / found.size
-        log, J, variance = np.log(placing.scale), found.J, float(G @ model.stated @ G)
-    if task.datum.kind != "control" and not points.stated.any():
-        variance += UNSTATED_FRACTION**2
+        found, kept = reference.compare([points.kind], placed.placing), ~np.isin(placed.model.item, out)
+        G = np.zeros(len(kept))
+        G[kept] = parameters_of(placed.model, kept)[6] / found.size
+        log, J, variance = np.log(placed.placing.scale), found.J, float(G @ placed.model.stated @ G)
     return Scales(np.array([log]), csr_matrix(-csr_matrix(G) @ J), np.array([variance]))
 
 
