@@ -63,7 +63,8 @@ def _pattern(sentence: str) -> str:
 def _severity(kind: Kind) -> str:
     """Return the severity, or the limits of the number that it depends on."""
     if isinstance(kind.severity, Unless):
-        return f"{kind.severity.severity}, {kind.severity.named} if the {kind.severity.part} is known"
+        parts = " or the ".join(kind.severity.parts)
+        return f"{kind.severity.severity}, {kind.severity.named} if the {parts} is known"
     if not isinstance(kind.severity, Grade):
         return kind.severity
     grade: Grade | None = kind.severity

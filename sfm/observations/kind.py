@@ -191,13 +191,20 @@ class Kind(ABC):
         """Return the observations corrected for common mistakes, by the name of the mistake."""
         return {}
 
-    def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the observations that involve only the points (n,) and photographs (m,) to keep."""
+    def parts_within(self, points: BoolArray, images: BoolArray) -> BoolArray:
+        """Return which parts involve only the points (n,) and photographs (m,) of two masks, (q,)."""
         on = np.ones(len(self), dtype=bool)
         for of, at in self.blocks():
             if of in (POINT, PHOTOGRAPH):
                 on &= (points if of == POINT else images)[at]
-        return self.select(on)
+        return on
+
+    def keep(self, points: BoolArray, images: BoolArray) -> Self:
+        """Return the observations that involve only the points (n,) and photographs (m,) to keep.
+
+        A group has length 0 if too few remain.
+        """
+        return self.select_parts(self.parts_within(points, images))
 
     def weight_of_all(self) -> FloatArray | None:
         """Return the weight matrix of all components, (n d, n d); None if it is block diagonal."""
@@ -491,11 +498,11 @@ class Group(TableKind):
         point = np.concatenate([self.point[:stations], self.point[stations:][on]])
         return replace(self, point=point, value=self.value[on], sigma=self.sigma[on])
 
-    def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the group with the points to keep; it has length 0 if too few remain."""
+    def parts_within(self, points: BoolArray, images: BoolArray) -> BoolArray:
+        """Return which rows involve only the points of a mask, (r,)."""
         on = points[self.point]
         stations = len(on) - len(self.value)
-        return self.select_parts(on[stations:] & on[:stations].all())
+        return np.asarray(on[stations:] & on[:stations].all())
 
     def renumbered(self, points: IntArray, images: IntArray | None = None) -> Self:
         """Return the group with new indices of its points."""

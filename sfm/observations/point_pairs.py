@@ -147,9 +147,9 @@ class OffsetDistances(Group):
         names = [network.points[j] for j in self.point]
         return [(names[i], names[j]) for i, j in self.ends]
 
-    def keep(self, points: BoolArray, images: BoolArray) -> Self:
-        """Return the distances between points to keep."""
-        return self.select_parts(np.logical_and(*points[self.point[self.ends]].T))
+    def parts_within(self, points: BoolArray, images: BoolArray) -> BoolArray:
+        """Return which distances are between points of a mask, (r,)."""
+        return np.asarray(np.logical_and(*points[self.point[self.ends]].T))
 
     def select_parts(self, on: BoolArray) -> Self:
         """Return the distances selected by a mask (r,), with their end points."""

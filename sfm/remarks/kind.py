@@ -116,15 +116,16 @@ class Grade:
 
 @dataclass(frozen=True)
 class Unless:
-    """Severity of a remark, and a lower one of a remark that names a part, such as the cause of an error."""
+    """Severity of a remark, and a lower one of a remark that has a part, such as the cause of an error."""
 
-    part: str
+    parts: tuple[str, ...]  # any of these
     severity: Severity
     named: Severity
 
     def severity_of(self, one: Remark) -> Severity:
         """Return the severity of a remark."""
-        return self.named if one.names(self.part) else self.severity
+        known = any(one.names(part) or part in one.numbers for part in self.parts)
+        return self.named if known else self.severity
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.adjustment.datum import Datum
 from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
@@ -103,7 +102,7 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
 
     def said(bars: int = 3, *, on_points: bool = False, **found: tuple[int, ...]) -> tuple[set[int], Remark]:
         judged, names = Judgement(30.0, 2, 1e-6, **found), ["a", "b", "control"]
-        task: Any = SimpleNamespace(datum=Datum("control" if on_points else "free"), plates=())
+        task: Any = SimpleNamespace(in_control=on_points, settings=SimpleNamespace(plates=()))
         out, remarks = given_scales._contradicting_scales(task, model, judged, names, bars)
         return set(out), remarks[0]
 

@@ -10,7 +10,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.judgement.given.free_network import FreeNetwork
-from sfm.judgement.given.groups import remarks_on_unchecked
+from sfm.judgement.given.groups import GivenSettings, remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.values import GivenModel
 from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
@@ -213,9 +213,8 @@ def test_a_grid_of_a_plate_does_not_scatter() -> None:
     control = ObjectPoints(at, np.round(truth.points[:8], 3), np.zeros((8, 3, 3)))
     free = FreeNetwork(adjust(network, truth, datum=Datum("free")))
     for plates, kind in (((), "given_scatter"), ((network.points[:8],), "given_not_exact")):
-        judged = judge_given(
-            replace(network, control=control), free, Datum("control"), unit="m", plates=plates
-        )
+        settings = GivenSettings(Datum("control"), "m", plates=tuple(map(frozenset, plates)))
+        judged = judge_given(replace(network, control=control), free, settings)
         assert kind in kinds_of(judged.remarks)
         assert ("scale_unchecked" in kinds_of(judged.remarks)) is not bool(plates)
 

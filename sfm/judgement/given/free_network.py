@@ -194,16 +194,15 @@ def centre_and_size(X: FloatArray) -> tuple[FloatArray, float]:
 
 
 def confirmed(network: Network) -> tuple[Kind, ...]:
-    """Return the given values that are judged before all others; of very many control points only some."""
+    """Return the given values that are judged before all others; of very many of a kind only some."""
     return tuple(
-        kind.select(np.arange(len(kind))[:: every_of(len(kind))])
-        for kind in (network.control, network.exterior, network.scale_bars)
+        kind.select(thinned(len(kind))) for kind in (network.control, network.exterior, network.scale_bars)
     )
 
 
-def every_of(count: int) -> int:
-    """Return the step by which given values are thinned if there are more than MAX_PLACES."""
-    return max(1, -(-count // MAX_PLACES))
+def thinned(count: int) -> IntArray:
+    """Return the indices of the given values that are judged: not all if there are more than MAX_PLACES."""
+    return np.arange(count)[:: max(1, -(-count // MAX_PLACES))]
 
 
 def _columns(cofactor: FloatArray) -> FloatArray:

@@ -10,8 +10,8 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.conventions import FloatArray, IntArray
-from sfm.distributions import LEVEL
-from sfm.judgement.given.free_network import Reference
+from sfm.distributions import FALSE_ALARM, LEVEL, share_of
+from sfm.judgement.given.free_network import FreeNetwork, Reference
 from sfm.judgement.given.points import (
     GivenPoints,
     PlacedPoints,
@@ -22,7 +22,7 @@ from sfm.judgement.given.values import (
     Judgement,
 )
 from sfm.network import Network
-from sfm.observations.kind import PHOTOGRAPH, POINT, CoordinateKind, Kind
+from sfm.observations.kind import CoordinateKind, Kind
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
@@ -34,51 +34,71 @@ MIN_IN_SPACE = 4  # points off a plane, whose mirror image is another figure
 
 
 @dataclass(frozen=True)
+class GivenSettings:
+    """How given values are judged, and what they are used for."""
+
+    datum: Datum  # of the survey
+    unit: str  # object unit
+    rescale: bool = True  # whether standard deviations that are too small may be replaced
+    # names of the points of each plate, if control is the first plate: its fixed coordinates are not rounded
+    # to decimals, its scale is that of the survey, and bars between points of another plate are its size
+    plates: tuple[frozenset[str], ...] = ()
+    checks_scale: bool = False  # whether mounts or tables check the scale of the others
+    false_alarm: float = FALSE_ALARM  # probability that right values are called wrong
+
+    @property
+    def level(self) -> float:
+        """Probability of reporting one kind of right values as wrong."""
+        return share_of(LEVEL, self.false_alarm)
+
+
+@dataclass(frozen=True)
 class Task:
-    """The values to judge, and the settings of the tests."""
+    """The values to judge, and what they are compared with."""
 
     network: Network  # has all given values
-    reference: Reference
+    free: FreeNetwork
+    reference: Reference  # unknowns of control, centres and bars
     of_point: IntArray  # index of each point of the network in the free network, -1 if it is not there, (n,)
     of_image: IntArray  # the same of each photograph, (m,)
-    datum: Datum  # of the survey
-    unit: str
-    rescale: bool
-    plates: tuple[frozenset[str], ...] = ()  # points of each plate; the first plate is control
-    checks_scale: bool = False  # whether mounts or tables check the scale of the others
+    settings: GivenSettings
 
     def in_free(self, kind: K) -> tuple[IntArray, K]:
-        """Return the rows of observations whose points are in the free network, and these observations."""
+        """Return the parts of observations that are in the free network, and these observations there."""
         return in_free(kind, self.of_point, self.of_image)
 
     @property
     def of_plate(self) -> bool:
         """Whether control is the grid of a plate."""
-        return bool(self.plates)
+        return bool(self.settings.plates)
+
+    @property
+    def in_control(self) -> bool:
+        """Whether the datum is control."""
+        return self.settings.datum.kind == "control"
 
     def plate_at(self, points: Collection[str]) -> str | None:
         """Return the name of the plate that has all these points, or None."""
-        on = (plate_name(k) for k, plate in enumerate(self.plates) if plate.issuperset(points))
+        on = (plate_name(k) for k, plate in enumerate(self.settings.plates) if plate.issuperset(points))
         return next(on, None)
 
     @property
     def level(self) -> float:
         """Probability of reporting one kind of correct given values as wrong."""
         kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
-        return LEVEL / max(sum(len(one) > 0 for one in kinds), 1)
+        return self.settings.level / max(sum(len(one) > 0 for one in kinds), 1)
 
 
 def in_free(kind: K, of_point: IntArray, of_image: IntArray) -> tuple[IntArray, K]:
-    """Return the rows of observations whose points are in the free network, and these observations there.
+    """Return the parts of observations that are in the free network, and these observations there.
 
     Args:
         kind: observations of a network.
         of_point: index of each point of the network in the free network, -1 if it is not there, (n,).
         of_image: the same of each photograph, (m,).
     """
-    there = {POINT: of_point, PHOTOGRAPH: of_image}
-    on = np.all([there[block.of][block.at] >= 0 for block in kind.blocks()], axis=0)
-    return np.flatnonzero(on), kind.select(on).renumbered(of_point, of_image)
+    on = kind.parts_within(of_point >= 0, of_image >= 0)
+    return np.flatnonzero(on), kind.select_parts(on).renumbered(of_point, of_image)
 
 
 @dataclass(frozen=True)
@@ -176,7 +196,7 @@ def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
     """
     if len(groups) < 2:
         return None
-    parts = [group.taking_part(rescale=task.rescale) for group in groups]
+    parts = [group.taking_part(rescale=task.settings.rescale) for group in groups]
     model, kind = task.reference.differences([points.kind for points in parts], groups[0].placed.placing)
     second = (kind == 1)[model.item]
     columns = second[:, None] * model.A
@@ -190,7 +210,7 @@ def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
     return remark(
         "datum_contradicted",
         given=[group.of for group in groups],
-        distance=(float(np.linalg.norm(moved, axis=1).max()), task.unit),
+        distance=(float(np.linalg.norm(moved, axis=1).max()), task.settings.unit),
         chi2=apart.statistic,
         dof=apart.dof,
     )

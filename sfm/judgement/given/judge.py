@@ -8,17 +8,18 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.judgement.given.free_network import FreeNetwork, every_of
+from sfm.conventions import BoolArray, FloatArray
+from sfm.judgement.given.free_network import FreeNetwork, confirmed, thinned
 from sfm.judgement.given.groups import (
-    C,
+    GivenSettings,
     Group,
     Task,
     are_in_space,
@@ -26,11 +27,14 @@ from sfm.judgement.given.groups import (
     in_free,
     remarks_on_unchecked,
 )
+from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
+from sfm.judgement.given.tables import Table, as_judged, judge_tables
 from sfm.judgement.given.values import NONCENTRALITY, GivenModel
-from sfm.network import ExteriorObservations, Network
+from sfm.network import ExteriorObservations, Network, ObjectPoints
 from sfm.observations.kind import CoordinateKind
+from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import Similarity
@@ -49,49 +53,58 @@ class JudgedGiven:
     placing: Similarity | None = None
     """transformation from the free network to the object frame; None if nothing gives it"""
     checks_handedness: bool = False  # whether a mirrored network does not fit
+    mounts: MountObservations | None = None  # mounts that may take part
+    others_contradict: bool = False  # whether survey observations or mounts contradict others
 
 
 def judge_given(
     network: Network,
     free: FreeNetwork | None,
-    datum: Datum,
+    settings: GivenSettings,
     *,
-    unit: str,
-    rescale: bool = True,
-    plates: Sequence[Collection[str]] = (),
-    checks_scale: bool = False,
+    mounts: MountObservations | None = None,
+    place: Callable[[Network], Similarity] | None = None,
 ) -> JudgedGiven:
     """Return the given values that may take part in an adjustment, and remarks on the others.
 
+    Mounts are compared with the photographs, then control, bars and projection centres with the image points,
+    then all other observations, and the lengths of mounts, with everything that was found right.
+
     Args:
-        network: has all given values.
+        network: has all given values, except for the mounts.
         free: adjustment of its image points alone, or of some of them, in a free datum; None without one.
-        datum: datum of the survey.
-        unit: object unit.
-        rescale: whether standard deviations that are too small may be replaced; fixed values stay fixed.
-        plates: names of the points of each plate, if control is the first plate. Fixed coordinates of a grid
-            are not rounded to decimals. The scale is that of the plate, as the survey states. Bars between
-            points of another plate are the size of that plate.
-        checks_scale: whether mounts or tables check the scale.
+        settings: datum, unit, and how the values are judged.
+        mounts: mounts of the cameras of rigs.
+        place: gives the object frame from the frame of the free network, by all given values of a network.
     """
+    of_mounts: tuple[Remark, ...] = ()
+    if free is not None and mounts is not None and len(mounts):
+        mounts, of_mounts = judge_mounts(mounts, free, settings.level)
+    with_mounts = mounts is not None and len(mounts) > 0
+    task = None if free is None else _task(network, free, settings)
     if not (len(network.scale_bars) or len(network.control) or len(network.exterior)):
-        return JudgedGiven(network, datum)
-    task = None if free is None else _task(network, free, datum, unit)
-    if task is None:
+        given = JudgedGiven(network, settings.datum)
+    elif task is None or not len(task.reference.C) or not determines_cameras(task.reference.marginal):
         kinds = (("bars", network.scale_bars), ("control", network.control))
         of = [name for name, values in kinds if len(values)]
         remarks = (remark("given_not_judged", of=of),) if of else ()
-        connects = datum.kind == "control" and are_in_space(network.control.complete.xyz)
-        return JudgedGiven(network, datum, remarks, checks_handedness=connects)
-    of_plates = tuple(map(frozenset, plates))
-    return _judged(replace(task, rescale=rescale, plates=of_plates, checks_scale=checks_scale))
+        connects = settings.datum.kind == "control" and are_in_space(network.control.complete.xyz)
+        given = JudgedGiven(network, settings.datum, remarks, checks_handedness=connects)
+    else:
+        checks = settings.checks_scale or with_mounts
+        given = _judged(replace(task, settings=replace(settings, checks_scale=checks)))
+    given = replace(given, remarks=(*of_mounts, *given.remarks), mounts=mounts)
+    if not (network.observations or with_mounts):
+        return given
+    if task is None or place is None or (given.datum.kind == "control" and not given.tests):
+        unjudged = remark("given_not_judged", of=("observations",))
+        return replace(given, remarks=(*given.remarks, unjudged))
+    return _with_others(task, given, place)
 
 
-def _task(network: Network, of_image_points: FreeNetwork, datum: Datum, unit: str) -> Task | None:
-    """Return what is judged, with the free network; None without any of them in it."""
-    free, marginal = of_image_points.adjustment.network, of_image_points.marginal
-    if marginal is None or not determines_cameras(marginal):
-        return None
+def _task(network: Network, of_image_points: FreeNetwork, settings: GivenSettings) -> Task | None:
+    """Return what is judged, with the free network; None if this does not determine the given points."""
+    free = of_image_points.adjustment.network
     of_point, of_image = (
         np.array([number.get(name, -1) for name in names], dtype=np.int64)
         for names, number in (
@@ -99,25 +112,65 @@ def _task(network: Network, of_image_points: FreeNetwork, datum: Datum, unit: st
             (network.images, {name: i for i, name in enumerate(free.images)}),
         )
     )
-    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
-    kinds = (*(_thinned(kind)[1] for kind in (network.control, seen)), network.scale_bars)
-    there = [in_free(kind, of_point, of_image)[1] for kind in kinds]
-    reference = of_image_points.reference_of([kind for kind in there if len(kind)])
-    if reference is None or not any(map(len, there)):
+    seen = network.exterior if settings.datum.kind == "control" else ExteriorObservations()
+    kinds = [
+        in_free(kind.select(thinned(len(kind))), of_point, of_image)[1]
+        for kind in (network.control, seen, network.scale_bars)
+    ]
+    reference = of_image_points.reference_of(kinds)
+    if reference is None:
         return None
-    return Task(network, reference, of_point, of_image, datum, unit, True)
+    return Task(network, of_image_points, reference, of_point, of_image, settings)
 
 
-def _thinned(kind: C) -> tuple[IntArray, C]:
-    """Return the rows of given points that are judged, of very many only some, and these points."""
-    rows = np.arange(len(kind))[:: every_of(len(kind))]
-    return rows, kind.select(rows)
+def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Similarity]) -> JudgedGiven:
+    """Return the judged values with the survey observations and mounts that do not contradict others."""
+    settings, network, mounts = task.settings, given.network, given.mounts
+    in_control = given.datum.kind == "control"
+    of_datum = (network.control, network.exterior) if in_control else (ObjectPoints(), ExteriorObservations())
+    found = [(k, *task.in_free(kind)) for k, kind in enumerate(network.observations)]
+    tables = [Table(kind, k, parts) for k, parts, kind in found if len(kind)]
+    part = replace(
+        task.free.adjustment.network,
+        control=task.in_free(of_datum[0])[1],
+        exterior=task.in_free(of_datum[1])[1],
+        scale_bars=task.in_free(network.scale_bars)[1],
+        observations=tuple(table.kind for table in tables),
+    )
+    kinds = [*confirmed(part), *part.observations]
+    reference = task.free.reference_of(kinds if mounts is None else [*kinds, mounts])
+    if reference is None:
+        return given
+    if in_control and given.placing is not None:
+        place = partial(_unchanged, given.placing)
+    wrong = judge_tables(tables, part, reference, place, settings.level)
+    part = replace(part, observations=tuple(table.kind for table in as_judged(tables, wrong)))
+    of_mounts: tuple[Remark, ...] = ()
+    if mounts is not None and len(mounts):
+        mounts, of_mounts = judge_mount_scales(mounts, part, reference, place, settings.level)
+    estimate = task.free.adjustment.estimate
+    names = [kind.parts(network, estimate) for kind in network.observations]
+    every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.observations)]
+    observations = tuple(table.kind for table in as_judged(every, wrong))
+    remarks = (*(one.remark(names) for one in wrong), *of_mounts)
+    return replace(
+        given,
+        network=replace(network, observations=observations),
+        remarks=(*given.remarks, *remarks),
+        mounts=mounts,
+        others_contradict=bool(remarks),
+    )
+
+
+def _unchanged(placing: Similarity, network: Network) -> Similarity:
+    """Return a placing that further observations of a network do not change."""
+    return placing
 
 
 def _judged(task: Task) -> JudgedGiven:
     """Judge the given points, then the scales of bars and points."""
-    network, datum = task.network, task.datum
-    seen = network.exterior if datum.kind == "control" else ExteriorObservations()
+    network, datum = task.network, task.settings.datum
+    seen = network.exterior if task.in_control else ExteriorObservations()
     both = _group(task, "control", network.control), _group(task, "centres", seen.of_positions)
     groups = [one for one in both if one is not None]
     scales = judge_scales(task, [one for one in groups if one.dependable])
@@ -128,7 +181,7 @@ def _judged(task: Task) -> JudgedGiven:
     network = replace(network, scale_bars=scales.bars)
     for group in groups:
         of = "control" if group.of == "control" else "exterior"
-        judged = group.as_judged(getattr(network, of), rescale=task.rescale, used=group in used)
+        judged = group.as_judged(getattr(network, of), rescale=task.settings.rescale, used=group in used)
         network = replace(network, **{of: judged})
     if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
@@ -148,14 +201,15 @@ def _judged(task: Task) -> JudgedGiven:
 
 def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     """Judge the given points of a kind against the free network; None without any."""
-    rows, kind = _thinned(kind)
+    rows = thinned(len(kind))
+    kind = kind.select(rows)
     names = kind.names(task.network, task.reference.marginal.adjustment.estimate)
     there, kind = task.in_free(kind)
     known: BoolArray = np.asarray(np.isfinite(kind.coordinates).any(axis=1))
     if not known.any():
         return None
     points, there = GivenPoints(kind.select(known), task.reference), there[known]
-    in_datum = task.datum.kind == "control"
+    in_datum = task.in_control
     fixed = not points.stated.any()
     start = Similarity(1.0, np.eye(3), np.zeros(3)) if in_datum else None
     placed = judge_points(points, task.level, start=start, estimated=fixed and not in_datum)
@@ -217,17 +271,17 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
     if found.wrong:
-        yield _left_out(group, task.unit)
+        yield _left_out(group, task.settings.unit)
     if found.doubtful:
         yield _doubtful(task, group)
     if group.scatter:
-        sigma, shift = (group.scatter, task.unit), shift_of_fixed(group.placed.model, group.scatter)
-        if task.rescale:
+        sigma, shift = (group.scatter, task.settings.unit), shift_of_fixed(group.placed.model, group.scatter)
+        if task.settings.rescale:
             share = (100 * group.scatter / group.placed.model.extent, "%")
             yield remark("given_scatter", of=of, sigma=sigma, share=share, shift=shift)
         else:
             yield remark("given_not_exact", of=of, sigma=sigma, shift=shift)
-    if task.datum.kind == "control":
+    if task.in_control:
         yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong)
     if found.factor == 1.0 or group.scatter or group.placed.model.estimated:
         return
@@ -235,9 +289,9 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     of_points = covariance[group.rows, :3, :3]
     if not of_points[np.isfinite(of_points)].any():
         shift = shift_of_fixed(group.placed.model, found.factor)
-        yield remark("given_not_exact", of=of, sigma=(found.factor, task.unit), shift=shift)
+        yield remark("given_not_exact", of=of, sigma=(found.factor, task.settings.unit), shift=shift)
     else:
-        used_factor = found.factor if task.rescale else None
+        used_factor = found.factor if task.settings.rescale else None
         yield remark("given_sigmas", of=of, factor=found.factor, used=used_factor)
 
 
@@ -270,7 +324,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
     if found.one_wrong:
         shift = float(_shifts(model)[list(found.doubtful)].max())
         # they take part with standard deviations from their differences, if these may be replaced
-        if task.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
+        if task.settings.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
             shift /= model.factor()[0]
     return remark(
         "given_contradicted",

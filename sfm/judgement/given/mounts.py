@@ -13,7 +13,6 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.distributions import LEVEL
 from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
 from sfm.judgement.given.scales import numbers_of_scale
 from sfm.judgement.given.values import RANK, GivenModel
@@ -26,17 +25,21 @@ from sfm.similarity import Similarity
 TINY = float(np.finfo(float).tiny)
 
 
-def judge_mounts(given: MountObservations, free: FreeNetwork) -> tuple[MountObservations, tuple[Remark, ...]]:
+def judge_mounts(
+    given: MountObservations, free: FreeNetwork, level: float
+) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the mounts whose rotation and base direction the photographs confirm, and remarks on the others.
 
     Args:
         given: mounts, held fixed or observed.
         free: adjustment of the image points alone.
+        level: probability that right mounts are reported as wrong.
     """
     reference, mounts = free.reference_of([given]), free.adjustment.estimate.mounts
     if reference is None or mounts is None:
         return given, ()
-    level, kept, remarks = LEVEL / len(given), np.ones(len(given), dtype=bool), []
+    level, kept, remarks = level / len(given), np.ones(len(given), dtype=bool), []
+    rest = free.adjustment.redundancy
     for k, camera in enumerate(given.camera.tolist()):
         one = given.select(np.array([k]))
         model = _shape(one, reference, mounts.position[camera])
@@ -57,6 +60,7 @@ def judge_mounts(given: MountObservations, free: FreeNetwork) -> tuple[MountObse
                 direction=(_degrees(_cosine(one.position[0], mounts.position[camera])), "deg"),
                 sigmas=float(np.sqrt(model.kept().chi2)),
                 mistake=next(mistakes, None),
+                rest=rest if rest > model.kept().dof else None,
             )
         )
     return given.select(kept), tuple(remarks)
@@ -71,21 +75,25 @@ def _shape(one: MountObservations, reference: Reference, X: FloatArray) -> Given
 
 
 def judge_mount_scales(
-    given: MountObservations, network: Network, free: FreeNetwork, place: Callable[[Network], Similarity]
+    given: MountObservations,
+    network: Network,
+    reference: Reference,
+    place: Callable[[Network], Similarity],
+    level: float,
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the mounts if their scales agree; otherwise no mounts, and the remark that they contradict.
 
     Args:
         given: mounts whose rotation and direction the photographs confirm.
         network: has all other given values and observations that were found right.
-        free: adjustment of the image points alone.
+        reference: the unknowns of all these.
         place: gives the object frame from the frame of the free network, by all given values of a network.
+        level: probability that right mounts are reported as wrong.
     """
     right = [kind for kind in (*confirmed(network), *network.observations) if len(kind)]
-    reference = free.reference_of([*right, given]) if len(given) else None
-    mounts = free.adjustment.estimate.mounts
-    has_scale = given.position.any(axis=1).all()  # a base of 0 has none
-    if reference is None or mounts is None or not has_scale:
+    free = reference.marginal.adjustment.estimate
+    mounts, has_scale = free.mounts, given.position.any(axis=1).all()  # a base of 0 has none
+    if mounts is None or not has_scale:
         return given, ()
     placing = place(network)
     model = _lengths(given, right, reference, placing)
@@ -93,9 +101,9 @@ def judge_mount_scales(
         bases = np.linalg.norm(mounts.position[given.camera], axis=1)
         scale = float(np.median(np.linalg.norm(given.position, axis=1) / bases))
         model = _lengths(given, right, reference, replace(placing, scale=scale))
-    if model.kept().probability() >= LEVEL:
+    if model.kept().probability() >= level:
         return given, ()
-    cameras, S = free.adjustment.estimate.cameras, model.network + model.stated
+    cameras, S = free.cameras, model.network + model.stated
     if model.A.any():  # the two that differ most
         low, high = int(model.v.argmin()), int(model.v.argmax())
         off, sigma = model.v[high] - model.v[low], np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high])

@@ -76,7 +76,8 @@ class Strain:
 
     def _turned(self, rows: FloatArray) -> FloatArray:
         """Return the effect of changes of points on the stretched points, (3 n, u)."""
-        return np.einsum("ab,nbu->nau", self.F, rows.reshape(-1, 3, rows.shape[1])).reshape(rows.shape)
+        turned = np.einsum("ab,nbu->nau", self.F, rows.reshape(-1, 3, rows.shape[1]))
+        return np.asarray(turned.reshape(rows.shape))
 
 
 @dataclass(frozen=True)

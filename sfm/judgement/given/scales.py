@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix, vstack
 
 from sfm.conventions import FloatArray, find_unit
 from sfm.distributions import LEVEL, chi2_isf, chi2_sf
-from sfm.judgement.given.free_network import Reference
+from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
 from sfm.judgement.given.values import UNSTATED_FRACTION, GivenModel, Judgement, judge_values
@@ -48,7 +48,7 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     lengths = _lengths_of(task)
     found = [(group, scale_of_points(group.points, group.placed)) for group in groups]
     of_groups = [(group, scale) for group, scale in found if scale is not None]
-    if task.datum.kind != "control":  # coordinates without a standard deviation may be those of a print
+    if not task.in_control:  # coordinates without a standard deviation may be those of a print
         of_groups = [
             (group, scale if group.points.stated.any() else scale.looser(UNSTATED_FRACTION))
             for group, scale in of_groups
@@ -72,20 +72,19 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     factor = 1.0
     if len(names) == 1:
         tests = lengths.tests or tests
-        alone = not (task.of_plate or task.checks_scale)
+        alone = not (task.of_plate or task.settings.checks_scale)
         remarks = (remark("scale_unchecked", given=names[0]),) if alone else ()
     elif judgement.fits:
         remarks = tuple(remarks_on_unchecked("lengths", names, model))
     elif judgement.factor != 1.0:
-        factor = judgement.factor if task.rescale else 1.0
-        used = factor if task.rescale else None
+        factor = judgement.factor if task.settings.rescale else 1.0
+        used = factor if task.settings.rescale else None
         remarks = (remark("given_sigmas", of="bars", factor=judgement.factor, used=used),)
     else:
         out, remarks = _contradicting_scales(task, model, judgement, names, len(lengths.sources))
-    sources = list(lengths.sources.values())
-    left_out = frozenset(of_groups[k - len(sources)][0].of for k in out if k >= len(sources))
-    wrong = [length for k in out if k < len(sources) for length in sources[k]]
-    bars = lengths.without(wrong)
+    count = len(lengths.sources)
+    left_out = frozenset(of_groups[k - count][0].of for k in out if k >= count)
+    bars = lengths.without([names[k] for k in out if k < count])
     bars = replace(bars, sigma=factor * bars.sigma)
     return JudgedScales(bars, (*lengths.remarks, *remarks), tests, left_out)
 
@@ -137,6 +136,8 @@ class Scales(NamedTuple):
 
 def scales_of_lengths(bars: ScaleBars, reference: Reference) -> Scales:
     """Return the scale of each length between two points of the free network."""
+    if not len(bars):
+        return Scales(np.zeros(0), csr_matrix((0, len(reference.C))), np.zeros(0))
     found = reference.compare([bars], UNCHANGED)
     length = bars.length - found.v  # in the free network
     J = csr_matrix(-found.J.multiply(1 / length[:, None]))
@@ -178,14 +179,19 @@ class _Lengths:
     bars: ScaleBars  # with standard deviations that fit
     members: tuple[tuple[int, ...], ...]  # bars of each length
     sources: dict[str, list[int]]  # lengths of each source
+    tables: dict[str, int]  # number of each table
     wrong: tuple[int, ...] = ()  # lengths of tables that contradict the others of their table
     remarks: tuple[Remark, ...] = ()  # on rows of tables
     tests: tuple[GivenTest, ...] = ()  # of the rows of a table
 
-    def without(self, lengths: Sequence[int]) -> ScaleBars:
-        """Return the bars of all other lengths, except for the wrong ones."""
-        out = [b for length in (*lengths, *self.wrong) for b in self.members[length]]
-        return self.bars.select(~np.isin(np.arange(len(self.bars)), out))
+    def without(self, sources: Collection[str]) -> ScaleBars:
+        """Return the bars of all other sources; of a table that is left out, none remains."""
+        lengths = [*self.wrong, *(length for source in sources for length in self.sources[source])]
+        out = np.isin(np.arange(len(self.bars)), [b for length in lengths for b in self.members[length]])
+        if len(self.bars.table):
+            tables = [self.tables[source] for source in sources if source in self.tables]
+            out |= np.isin(self.bars.table, tables)
+        return self.bars.select(~out)
 
 
 def _lengths_of(task: Task) -> _Lengths:
@@ -195,29 +201,31 @@ def _lengths_of(task: Task) -> _Lengths:
     are left out. If nothing shows which rows of a table are wrong, each of them is a source.
     """
     bars = task.network.scale_bars
-    rows, seen = task.in_free(bars)
+    judged = thinned(len(bars))
+    rows, seen = task.in_free(bars.select(judged))
     apart = seen.start != seen.end
-    rows, seen = rows[apart], seen.select(apart)
+    rows, seen = judged[rows[apart]], seen.select(apart)
     merged, members, contradicted = merge_lengths(seen)
     several = len(np.unique(bars.table[bars.table > 0])) > 1
     lengths = _Lengths(
-        scales_of_lengths(merged, task.reference)
-        if len(merged)
-        else Scales(np.zeros(0), csr_matrix((0, len(task.reference.C))), np.zeros(0)),
+        scales_of_lengths(merged, task.reference),
         bars,
         tuple(tuple(rows[list(group)].tolist()) for group in members),
+        {},
         {},
     )
     tables: dict[str, dict[str, list[int]]] = {}
     for k, of_length in enumerate(lengths.members):
         b = of_length[0]
         ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
-        given = f" ({significant(float(merged.length[k]))} {task.unit})" if contradicted[k] else ""
+        given = f" ({significant(float(merged.length[k]))} {task.settings.unit})" if contradicted[k] else ""
         name = task.plate_at(ends) or f"{ends[0]} - {ends[1]}{given}"
         number = int(bars.table[b]) if len(bars.table) else 0
         table = (f"{TABLE} {number}" if several else TABLE) if number else ""
         of = tables.setdefault(table, {}) if table else lengths.sources
         of.setdefault(name, []).append(k)
+        if table:
+            lengths.tables[table] = number
     for table, of_table in tables.items():
         lengths = _with_table(task, lengths, table, of_table)
     return lengths
@@ -236,14 +244,13 @@ def _with_table(task: Task, lengths: _Lengths, table: str, rows: dict[str, list[
     remarks = [_left_out(model, judgement.wrong, names, k) for k in judgement.wrong]
     scales, bars = lengths.scales, lengths.bars
     if judgement.factor != 1.0:
-        used = judgement.factor if task.rescale else None
+        used = judgement.factor if task.settings.rescale else None
         remarks.append(remark("given_sigmas", of=table, factor=judgement.factor, used=used))
         every = [length for row in rows.values() for length in row]
         variance = scales.variance.copy()
         variance[every] *= judgement.factor**2
-        sigma = bars.sigma.copy()
-        sigma[[b for length in every for b in lengths.members[length]]] *= used or 1.0
-        scales, bars = scales._replace(variance=variance), replace(bars, sigma=sigma)
+        factor = np.where(bars.table == lengths.tables[table], used or 1.0, 1.0)
+        scales, bars = scales._replace(variance=variance), replace(bars, sigma=factor * bars.sigma)
     remarks += remarks_on_unchecked("lengths", names, model, judgement.wrong)
     test = GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability)
     return replace(
@@ -295,8 +302,8 @@ def _contradicting_scales(
     names: bars and plates, of which the first `bars` are lengths, then kinds of given points.
     If given points carry the datum, bars, which may share a wrong unit, do not replace them.
     """
-    on_points = task.datum.kind == "control"
-    plates = {plate_name(k) for k in range(len(task.plates))}.intersection(names)
+    on_points = task.in_control
+    plates = {plate_name(k) for k in range(len(task.settings.plates))}.intersection(names)
     wrong, every = judgement.wrong, range(model.items)
     if wrong and not (on_points and max(wrong) >= bars and {*every[bars:]} <= {*wrong}):
         return wrong, tuple(_left_out(model, wrong, names, k, plates) for k in wrong)

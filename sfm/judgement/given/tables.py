@@ -9,17 +9,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from math import prod
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm.conventions import IntArray
-from sfm.distributions import LEVEL
-from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
+from sfm.judgement.given.free_network import Reference, confirmed, thinned
 from sfm.judgement.given.values import GivenModel, judge_values
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.observations.kind import Group, Kind, TableKind
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
+
+
+class Table(NamedTuple):
+    """Observations of one kind, and which ones of the survey they are."""
+
+    kind: Kind
+    number: int  # of the kind among the observations of the survey
+    parts: IntArray  # indices of its parts, see `Kind.parts`, (q,)
+
+    def select(self, on: Sequence[int] | IntArray) -> Table:
+        """Return the parts of the given indices."""
+        kept = np.isin(np.arange(len(self.parts)), on)
+        return self if kept.all() else Table(self.kind.select_parts(kept), self.number, self.parts[kept])
 
 
 @dataclass(frozen=True)
@@ -27,69 +41,70 @@ class Contradiction:
     """Observations of a kind that contradict others."""
 
     kind: str  # name of the kind
-    names: tuple[str, ...]  # as in `Kind.parts`
+    parts: tuple[tuple[int, int], ...] = ()  # index of the kind, and of the part
     whole: bool = False  # whether most of the kind contradict: nothing shows which are right
     mistakes: tuple[str, ...] = ()  # correcting any of these makes them agree, see `Kind.mistakes`
     factor: float = 1.0  # on the standard deviations of the kind, with which its observations agree
+    rest: int | None = None  # degrees of freedom of the others, if these confirm one another
 
-    @property
-    def remark(self) -> Remark:
-        """The remark on these observations."""
+    def remark(self, names: Sequence[Sequence[str]]) -> Remark:
+        """Return the remark on these observations.
+
+        Args:
+            names: names of the parts of each kind of the survey.
+        """
         if self.factor != 1.0:
             return remark("given_sigmas", of=self.kind, factor=self.factor, used=self.factor)
         if self.whole:
-            return remark("kind_wrong", of=self.kind, mistake=self.mistakes or None)
-        return remark("observations_wrong", observations=self.names, mistake=self.mistakes or None)
+            return remark("kind_wrong", of=self.kind, mistake=self.mistakes or None, rest=self.rest)
+        observations = [names[k][part] for k, part in self.parts]
+        return remark("observations_wrong", observations=observations, mistake=self.mistakes or None)
 
 
 def judge_tables(
-    network: Network, free: FreeNetwork, place: Callable[[Network], Similarity]
+    tables: Sequence[Table],
+    network: Network,
+    reference: Reference,
+    place: Callable[[Network], Similarity],
+    level: float,
 ) -> tuple[Contradiction, ...]:
-    """Return the survey observations that contradict others.
+    """Return the survey observations that contradict others. Of very many of a kind only some are judged.
 
     Args:
-        network: that of the image points, with the given values that they confirm, and the observations.
-        free: adjustment of the image points alone.
+        tables: observations between points and photographs of the free network.
+        network: the free network, with the given values that it confirms.
+        reference: the unknowns of all these.
         place: gives the object frame from the frame of the free network, by all given values of a network.
+        level: probability that right observations are reported as wrong.
     """
-    reference = free.reference_of([*confirmed(network), *network.observations])
-    if reference is None or not network.observations:
-        return ()
-    judge = _Judge(network, reference, place)
-    tables, found = network.observations, list[Contradiction]()
-    while tables and not judge.fit(tables):
-        wrong = list(judge.explained(tables)) or judge.contradicting(tables)
-        tables = as_judged(network, judge.estimate, tables, wrong)
+    judge = _Judge(network, reference, place, level)
+    given = [table.select(thinned(len(table.parts))) for table in tables]
+    kept, found = given, list[Contradiction]()
+    while kept and not judge.fit([table.kind for table in kept]):
+        wrong = list(judge.explained(kept)) or judge.contradicting(kept)
+        kept = as_judged(kept, wrong)
         found += wrong
     unexplained = (not one.mistakes and one.factor == 1.0 for one in found)
     return tuple(
-        replace(one, mistakes=judge.mistakes_of(one, tables)) if open_ else one
+        replace(one, mistakes=judge.mistakes_of(one, given, kept)) if open_ else one
         for one, open_ in zip(found, unexplained, strict=True)
     )
 
 
-def as_judged(
-    network: Network, estimate: Estimate, tables: Sequence[Kind], wrong: Sequence[Contradiction]
-) -> tuple[Kind, ...]:
-    """Return the tables without observations that contradict others, with standard deviations that fit.
-
-    Args:
-        network: network of the tables.
-        estimate: its values.
-        tables: observations.
-        wrong: those that contradict others.
-    """
+def as_judged(tables: Sequence[Table], wrong: Sequence[Contradiction]) -> list[Table]:
+    """Return the tables without observations that contradict others, with standard deviations that fit."""
     whole = {one.kind for one in wrong if one.whole}
-    names = {name for one in wrong for name in one.names}
-    factors = {one.kind: one.factor for one in wrong if one.factor != 1.0}
+    parts = {part for one in wrong for part in one.parts}
     kept = []
-    for kind in (kind for kind in tables if kind.name not in whole):
-        on = np.array([name not in names for name in kind.parts(network, estimate)], dtype=bool)
-        part = kind if on.all() else kind.select_parts(on)
-        if isinstance(part, TableKind) and part.name in factors:
-            part = part.with_sigma(factors[part.name] * part.sigma)
-        kept.append(part)
-    return tuple(kind for kind in kept if len(kind))
+    for table in (table for table in tables if table.kind.name not in whole):
+        table = table.select(
+            [k for k, p in enumerate(table.parts.tolist()) if (table.number, p) not in parts]
+        )
+        factor = prod(one.factor for one in wrong if one.kind == table.kind.name)
+        if factor != 1.0 and isinstance(table.kind, TableKind):
+            table = table._replace(kind=table.kind.with_sigma(factor * table.kind.sigma))
+        kept.append(table)
+    return [table for table in kept if len(table.kind)]
 
 
 @dataclass(frozen=True)
@@ -99,74 +114,92 @@ class _Judge:
     network: Network
     reference: Reference
     place: Callable[[Network], Similarity]
+    level: float
 
-    @property
-    def estimate(self) -> Estimate:
-        """Values of the free network, for names."""
-        return self.reference.marginal.adjustment.estimate
-
-    def model(self, tables: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
+    def model(self, kinds: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
         """Return the differences of observations from what the right values imply, and the kind of each."""
         right = [kind for kind in confirmed(self.network) if len(kind)]
-        placing = self.place(replace(self.network, observations=tuple(tables)))
-        model, kind = self.reference.differences([*right, *tables], placing)
+        placing = self.place(replace(self.network, observations=tuple(kinds)))
+        model, kind = self.reference.differences([*right, *kinds], placing)
         of_right = kind < len(right)
         return model.beside(of_right[model.item]), kind[~of_right] - len(right)
 
-    def fit(self, tables: Sequence[Kind]) -> bool:
+    def fit(self, kinds: Sequence[Kind]) -> bool:
         """Return whether observations fit the network, the right values and one another."""
-        return self.model(tables)[0].fits(LEVEL)
+        return self.model(kinds)[0].fits(self.level)
 
-    def explained(self, tables: Sequence[Kind]) -> Iterator[Contradiction]:
+    def explained(self, tables: Sequence[Table]) -> Iterator[Contradiction]:
         """Yield each kind whose common mistake explains all contradictions; several leave the cause open."""
-        names = dict.fromkeys(kind.name for kind in tables)
-        sources = [[kind for kind in tables if kind.name == name] for name in names]
-        sources += [[kind] for kinds in sources if len(kinds) > 1 for kind in kinds]  # each group
+        names = dict.fromkeys(table.kind.name for table in tables)
+        sources = [[table for table in tables if table.kind.name == name] for name in names]
+        sources += [[table] for source in sources if len(source) > 1 for table in source]  # each group
         explained = set[str]()
-        for kinds in sources:
-            others = [kind for kind in tables if not any(kind is one for one in kinds)]
-            name, mistakes = kinds[0].name, self._mistakes(kinds, others)
+        for source in sources:
+            of_source = {table.number for table in source}
+            others = [table.kind for table in tables if table.number not in of_source]
+            name, mistakes = source[0].kind.name, self._mistakes([table.kind for table in source], others)
             if mistakes and name not in explained:
                 whole = not any(kind.name == name for kind in others)
                 explained.add(name)
-                yield Contradiction(name, self._parts(kinds), whole, mistakes)
+                yield Contradiction(name, _parts_of(source), whole, mistakes)
 
-    def contradicting(self, tables: Sequence[Kind]) -> list[Contradiction]:
+    def contradicting(self, tables: Sequence[Table]) -> list[Contradiction]:
         """Return single observations that are wrong, imprecise kinds, or kinds that the others contradict."""
-        model, kind = self.model(tables)
-        names, of = self._parts(tables), np.array([tables[k].name for k in kind])
-        judgement = judge_values(model, LEVEL)
+        model, kind = self.model([table.kind for table in tables])
+        parts, of = _parts_of(tables), np.array([tables[k].kind.name for k in kind])
+        judgement = judge_values(model, self.level)
         rows = {name: np.flatnonzero(of == name) for name in dict.fromkeys(of.tolist())}
         wrong = {name: np.intersect1d(at, judgement.wrong) for name, at in rows.items()}
         if judgement.wrong and all(2 * len(wrong[name]) <= len(at) for name, at in rows.items()):
-            singled = {name: tuple(names[k] for k in at) for name, at in wrong.items() if len(at)}
+            singled = {name: tuple(parts[k] for k in at) for name, at in wrong.items() if len(at)}
             return [Contradiction(name, out) for name, out in singled.items()]
         if judgement.factor != 1.0:
             return self._imprecise(tables, judgement.factor)
         without = {name: model.kept(tuple(at.tolist())).probability() for name, at in rows.items()}
-        blamed = [name for name, probability in without.items() if probability >= LEVEL]
+        blamed = [name for name, probability in without.items() if probability >= self.level]
+        rest = self._rest(tables, blamed[0]) if len(blamed) == 1 else None
         return [
-            Contradiction(name, tuple(names[k] for k in rows[name]), whole=True)
+            Contradiction(name, tuple(parts[k] for k in rows[name]), whole=True, rest=rest)
             for name in blamed or [max(without, key=lambda name: without[name])]
         ]
 
-    def _imprecise(self, tables: Sequence[Kind], factor: float) -> list[Contradiction]:
+    def _rest(self, tables: Sequence[Table], name: str) -> int | None:
+        """Return the degrees of freedom of the others, if these exceed those by which a kind contradicts.
+
+        If the kind contradicts the image points alone, these are among the others.
+        """
+        placing = self.place(replace(self.network, observations=tuple(table.kind for table in tables)))
+        right = [kind for kind in confirmed(self.network) if len(kind)]
+        kinds = [*right, *(table.kind for table in tables)]
+        model, kind = self.reference.differences(kinds, placing)
+        of_kind = np.array([one.name == name for one in kinds])[kind][model.item]
+        rest = model.part(~of_kind).kept().dof if (~of_kind).any() else 0
+        confirming = rest
+        if not model.part(of_kind).fits(self.level):
+            confirming += self.reference.marginal.adjustment.redundancy
+        return confirming if confirming > model.kept().dof - rest else None
+
+    def _imprecise(self, tables: Sequence[Table], factor: float) -> list[Contradiction]:
         """Return the kind whose standard deviations are too small, or all kinds if no single one is."""
-        kinds = [Contradiction(name, (), factor=factor) for name in dict.fromkeys(k.name for k in tables)]
-        alone = (one for one in kinds if self.fit(as_judged(self.network, self.estimate, tables, [one])))
+        names = dict.fromkeys(table.kind.name for table in tables)
+        kinds = [Contradiction(name, factor=factor) for name in names]
+        alone = (one for one in kinds if self.fit([table.kind for table in as_judged(tables, [one])]))
         imprecise = next(alone, None)
         return kinds if imprecise is None else [imprecise]
 
-    def mistakes_of(self, found: Contradiction, tables: Sequence[Kind]) -> tuple[str, ...]:
+    def mistakes_of(
+        self, found: Contradiction, given: Sequence[Table], kept: Sequence[Table]
+    ) -> tuple[str, ...]:
         """Return the mistakes whose correction makes observations agree that were left out."""
-        out, others = list[Kind](), list(tables)
-        for kind in (kind for kind in self.network.observations if kind.name == found.kind):
-            on = np.isin(self._parts([kind]), found.names)
-            if isinstance(kind, Group) and on.any():  # its rows share parameters
+        out, others = list[Kind](), [table.kind for table in kept]
+        for table in given:
+            on = [k for k, part in enumerate(table.parts.tolist()) if (table.number, part) in found.parts]
+            kind = table.kind
+            if isinstance(kind, Group) and on:  # its rows share parameters
                 out.append(kind)
                 others = [one for one in others if not (type(one) is type(kind) and one.group == kind.group)]
-            elif on.any():
-                out.append(kind.select_parts(on))
+            elif on:
+                out.append(table.select(on).kind)
         return self._mistakes(out, others)
 
     def _mistakes(self, kinds: Sequence[Kind], others: Sequence[Kind]) -> tuple[str, ...]:
@@ -187,5 +220,6 @@ class _Judge:
                 found.append(mistake)
         return tuple(found)
 
-    def _parts(self, kinds: Sequence[Kind]) -> tuple[str, ...]:
-        return tuple(name for kind in kinds for name in kind.parts(self.network, self.estimate))
+
+def _parts_of(tables: Sequence[Table]) -> tuple[tuple[int, int], ...]:
+    return tuple((table.number, part) for table in tables for part in table.parts.tolist())

@@ -54,7 +54,7 @@ ROWS = (
     ),
     Kind(
         "c_looks_wrong",
-        Unless("pair", "warning", "error"),
+        Unless(("pair",), "warning", "error"),
         "c = {given} of camera {camera} looks wrong: starting from {better}, {oriented} of {total} "
         "photographs can be oriented instead of {before}.[[ Two photographs do not determine {pair}.]]",
         "a wrong start value of c or a wrong size of the pixels",

@@ -65,8 +65,10 @@ PULLED = (
 ROWS = (
     Kind(
         "kind_wrong",
-        Unless("mistake", "error", "warning"),  # what is explained and not used does no harm
-        "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:@?}.]]",
+        # what is explained, or alone contradicts a rest that agrees, does no harm if it is not used
+        Unless(("mistake", "rest"), "error", "warning"),
+        "The other observations contradict most {of}; none of them was used.[[ They agree if {mistake:@?}.]]"
+        "[[ The rest agrees, with {rest} degrees of freedom.]]",
         "another unit, order of columns, sense of an axis or angle, or names exchanged",
         "Check the table: signs, units, and the point or photograph of each row.",
     ),
@@ -107,7 +109,7 @@ ROWS = (
     ),
     Kind(
         "mount_contradicted",
-        Unless("mistake", "error", "warning"),
+        Unless(("mistake", "rest"), "error", "warning"),
         "The mount given for {camera} contradicts the photographs, by {angle} in its rotation and "
         "{direction} in the direction of its base, {sigmas} standard deviations: it was not used.[[ It fits "
         "if {mistake:@}.]]",

@@ -108,7 +108,7 @@ ROWS = (
     ),
     Kind(
         "clock_differs",
-        Unless("unsure", "note", "warning"),
+        Unless(("unsure",), "note", "warning"),
         "By the EXIF times, the clock of camera {camera} is {ahead} ahead of that of camera "
         "{reference}[[; they agree as well {unsure}]].",
         "clocks that were not set to the same time; or photographs at regular intervals, of which one camera "
@@ -274,7 +274,7 @@ ROWS = (
     ),
     Kind(
         "photograph_of_mirror_image",
-        Unless("decided_by", "error", "warning"),
+        Unless(("decided_by",), "error", "warning"),
         "{photographs} {photographs:shows|show} the mirror image of the others, judging by "
         "{points:common point}.[[ {decided_by:@} shows that these are mirrored.]]",
         "{photographs:this photograph|these photographs} or the others were mirrored by a program, or x "

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
@@ -21,14 +23,13 @@ from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
-from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
-from sfm.judgement.given.tables import as_judged, judge_tables
 from sfm.judgement.hypotheses.bumps import bump_remarks
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
@@ -121,13 +122,9 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     survey, matched = model.survey, model.matched
     start = _prepare(survey, matched, model.varying)
     free = _free_network(start)
-    reference = _reference(start, free)
-    mounts, of_mounts = _confirmed_mounts(start, reference)
     plates = _points_of_plates(survey, matched.naming, matched.network)
-    others = replace(start.task.network, scale_bars=ScaleBars())
-    checks = len(mounts) > 0 or bool(np.isfinite(scale_sigma(others, start.estimate)))
-    task, given = _with_confirmed_values(start, free, reference, plates, checks_scale=checks)
-    settled, gross = _settle_with_given(start, free, reference, task, given, mounts)
+    task, given = _with_confirmed_values(start, free, plates)
+    settled = _settle_with_given(start, free, task, given)
     report_step("adjusting all observations")
     found = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
@@ -157,9 +154,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
         (
             *start.remarks,
             *(() if settled.per_photograph is None else settled.per_photograph.remarks),
-            *of_mounts,
             *given.remarks,
-            *gross,
             *found.remarks,
             *settled.held,
             *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
@@ -329,30 +324,11 @@ def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork |
     return FreeNetwork(adjustment)
 
 
-def _confirmed_mounts(
-    start: _Prepared, reference: FreeNetwork | None
-) -> tuple[MountObservations, tuple[Remark, ...]]:
-    """Return the given mounts that the image points confirm, and remarks on the others."""
-    mounts = start.task.survey.given_mounts
-    if start.estimate.mounts is not None:  # of a camera that no moment pairs with others, nothing is used
-        mounts = mounts.select(np.array(start.estimate.mounts.rig)[mounts.camera] != "")
-    if reference is None or not len(mounts):
-        return mounts, ()
-    report_step("testing the given mounts")
-    return judge_mounts(mounts, reference)
-
-
 def _with_confirmed_values(
-    start: _Prepared,
-    free: StableAdjustment | None,
-    reference: FreeNetwork | None,
-    plates: tuple[tuple[str, ...], ...],
-    *,
-    checks_scale: bool,
+    start: _Prepared, free: StableAdjustment | None, plates: tuple[tuple[str, ...], ...]
 ) -> tuple[Task, JudgedGiven]:
     """Return the task with the given values that the image points confirm, and their judgement."""
-    task = start.task
-    network = task.network
+    task, survey, network = start.task, start.task.survey, start.task.network
     if free is not None:  # with its per-photograph cameras, if any
         network = replace(
             free.task.network,
@@ -361,19 +337,27 @@ def _with_confirmed_values(
             exterior=network.exterior,
             observations=network.observations,
         )
-    if _has_no_identity(task.survey):
-        return task, JudgedGiven(network, task.datum)
+    mounts = survey.given_mounts
+    if start.estimate.mounts is not None:  # of a camera that no moment pairs with others, nothing is used
+        mounts = mounts.select(np.array(start.estimate.mounts.rig)[mounts.camera] != "")
+    if _has_no_identity(survey):
+        unjudged = len(network.observations) > 0 or len(mounts) > 0
+        remarks = (remark("given_not_judged", of=("observations",)),) if unjudged else ()
+        return task, JudgedGiven(network, task.datum, remarks, mounts=mounts)
     report_step("testing the given values")
-    plate = plate_control(task.survey.targets)
-    given = judge_given(
-        network,
-        reference,
+    is_plate = is_plate_control(survey.control, plate_control(survey.targets))
+    others = replace(start.task.network, scale_bars=ScaleBars())
+    settings = GivenSettings(
         task.datum,
-        unit=task.survey.unit,
-        rescale=task.survey.adjust.weights == "components",
-        plates=plates if is_plate_control(task.survey.control, plate) else (),
-        checks_scale=checks_scale,
+        survey.unit,
+        rescale=survey.adjust.weights == "components",
+        plates=tuple(map(frozenset, plates)) if is_plate else (),
+        checks_scale=bool(np.isfinite(scale_sigma(others, start.estimate))),
+        false_alarm=survey.adjust.false_alarm,
     )
+    reference = _reference(start, free)
+    place = None if free is None else partial(_placing, start, free)
+    given = judge_given(network, reference, settings, mounts=mounts, place=place)
     needed = task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
@@ -382,19 +366,21 @@ def _with_confirmed_values(
     return replace(task, network=given.network, needed=needed), given
 
 
-def _settle_with_given(
-    start: _Prepared,
-    free: StableAdjustment | None,
-    reference: FreeNetwork | None,
-    task: Task,
-    given: JudgedGiven,
-    mounts: MountObservations,
-) -> tuple[StableAdjustment, tuple[Remark, ...]]:
-    """Adjust the image points together with the given values that they confirm.
+def _placing(start: _Prepared, free: StableAdjustment, part: Network) -> Similarity:
+    """Return the object frame from the frame of the free network, by the given values of this network."""
+    network, datum = start.task.network, Datum("free")
+    before = start.estimate if start.task.datum.kind == "control" else free.whole
+    before = scale_to_bars(network, before, start.task.datum)
+    placed = reduce_network(network, before, free.images, free.points, free.accepted)[1]
+    placed = place_on_observations(part, scale_to_bars(part, placed, datum))
+    places = [np.concatenate([one.points, one.position]) for one in (free.estimate, placed)]
+    return fit_similarity(places[0], places[1])
 
-    Returns:
-        The adjustment, and remarks on tabulated observations and mounts that were left out.
-    """
+
+def _settle_with_given(
+    start: _Prepared, free: StableAdjustment | None, task: Task, given: JudgedGiven
+) -> StableAdjustment:
+    """Adjust the image points together with the given values that they confirm."""
     if free is not None and task.survey.adjust.weights == "components":
         alone = free.adjustment
         if alone.redundancy > 0:  # without redundancy there is only the stated sigma
@@ -402,29 +388,24 @@ def _settle_with_given(
             task = replace(task, factor=factor)
     if not given.tests and task.datum.kind == "control":
         # neither the free network is a start, nor are its per-photograph cameras
-        free = reference = None
+        free = None
         task = replace(task, network=replace(task.network, camera=start.task.network.camera))
     estimate = start.estimate
     if free is not None:
         estimate = _free_network_in_frame(estimate, free.whole, task, given)
     estimate = scale_to_bars(task.network, estimate, task.datum)
-    gross: tuple[Remark, ...] = ()
-    if reference is None and (task.network.observations or len(mounts)):
-        gross = (remark("given_not_judged", of=("observations",)),)
-    if free is not None and reference is not None and (task.network.observations or len(mounts)):
-        task, mounts, gross = _with_confirmed_observations(task, free, reference, estimate, mounts)
-        if gross and task.datum.kind != "control":
-            estimate = place_on_observations(task.network, estimate)
+    if given.others_contradict and task.datum.kind != "control":
+        estimate = place_on_observations(task.network, estimate)
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
-    if len(mounts):
-        task, estimate = _with_mounts(task, estimate, mounts)
+    if given.mounts is not None and len(given.mounts):
+        task, estimate = _with_mounts(task, estimate, given.mounts)
     if free is None:
-        return settle_by_photograph(task, estimate), gross
+        return settle_by_photograph(task, estimate)
     if task.datum.kind != "control" and not is_scaled(task.network, estimate):
-        return _with_given(replace(free, task=task)), gross
+        return _with_given(replace(free, task=task))
     settled = settle(task, estimate, free.accepted).after(free)
-    return replace(settled, held=settled.held or free.held), gross
+    return replace(settled, held=settled.held or free.held)
 
 
 def _with_mounts(task: Task, estimate: Estimate, mounts: MountObservations) -> tuple[Task, Estimate]:
@@ -486,27 +467,6 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
     if before is not None and len(before.network.points) == len(final.network.points):
         starts = (*starts, before.estimate)
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
-
-
-def _with_confirmed_observations(
-    task: Task, free: StableAdjustment, reference: FreeNetwork, estimate: Estimate, mounts: MountObservations
-) -> tuple[Task, MountObservations, tuple[Remark, ...]]:
-    """Return the task and the mounts without what contradicts the image points and other given values."""
-    part, start = reduce_network(task.network, estimate, free.images, free.points, free.accepted)
-    if task.datum.kind != "control":
-        part = replace(part, control=ObjectPoints(), exterior=ExteriorObservations())
-
-    def place(network: Network) -> Similarity:
-        placed = start if task.datum.kind == "control" else place_on_observations(network, start)
-        places = [np.concatenate([one.points, one.position]) for one in (free.estimate, placed)]
-        return fit_similarity(places[0], places[1])
-
-    wrong = judge_tables(part, reference, place)
-    part = replace(part, observations=as_judged(part, start, part.observations, wrong))
-    tables = as_judged(task.network, estimate, task.network.observations, wrong)
-    mounts, of_mounts = judge_mount_scales(mounts, part, reference, place)
-    task = replace(task, network=replace(task.network, observations=tables))
-    return task, mounts, (*(one.remark for one in wrong), *of_mounts)
 
 
 def _free_network_in_frame(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:

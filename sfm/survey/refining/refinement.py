@@ -25,6 +25,7 @@ from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import judge_given
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window
@@ -433,7 +434,7 @@ def adjust_finally(
         covariance=False,
         max_iterations=MANY_ITERATIONS,
     )
-    given = judge_given(part, FreeNetwork(free), datum, unit=unit)
+    given = judge_given(part, FreeNetwork(free), GivenSettings(datum, unit))
     part, datum = given.network, given.datum
     remarks = list(given.remarks)
     if given.placing is not None and datum.kind == "control":
