@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
 from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import scales as given_scales
+from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
@@ -158,6 +161,43 @@ def test_bars_of_the_same_ends_agree_at_the_level(apart: float, agree: bool) -> 
     length = np.array([1.0, 1.0 + apart * 1e-4 * np.sqrt(2)])
     bars = ScaleBars(np.array([0, 0]), np.array([1, 1]), length, np.array([1e-4, 1e-4]))
     assert (len(given_scales.merge_lengths(bars)[0]) == 1) == agree
+
+
+@pytest.mark.parametrize(("false_alarm", "found"), [(0.05, True), (1e-4, False)])
+def test_the_level_of_given_values_follows_the_false_alarm_of_the_survey(
+    false_alarm: float, found: bool
+) -> None:
+    """Two bars that are 4 standard deviations apart."""
+    network, truth = make_network(seed_of("level of bars"), images=8, points=30)
+    network = observed_anew(network, truth, 0.0, seed_of("level of bars"))
+    length = [float(np.linalg.norm(truth.points[i] - truth.points[j])) for i, j in ((8, 19), (3, 12))]
+    relative = 1e-4
+    bars = (
+        ScaleBar("9", "20", length[0], relative * length[0]),
+        ScaleBar("4", "13", (1 + 4 * np.sqrt(2) * relative) * length[1], relative * length[1]),
+    )
+    said = remarks_on_given(
+        run_survey(survey_of(network, truth, scale_bars=bars, adjust={"false_alarm": false_alarm}))
+    )
+    assert ("scale_contradicted" in kinds_of(said)) == found
+
+
+def test_all_rows_of_a_long_table_that_is_wrong_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 30 lengths 10 are judged: eight in feet, two right ones in none of the tables, which stay."""
+    monkeypatch.setattr(free_network, "MAX_PLACES", 10)
+    network, truth = make_network(seed_of("long tape"), images=8, points=30)
+    start, end = np.array([(k, k + 9) for k in range(15)] + [(k, k + 11) for k in range(15)]).T
+    length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1)
+    in_feet = ~np.isin(np.arange(30), (0, 3))
+    bars = ScaleBars(
+        start, end, length / np.where(in_feet, 0.3048, 1.0), np.full(30, 1e-3), in_feet.astype(np.int64)
+    )
+    free = free_network.FreeNetwork(adjust(network, truth, datum=Datum("free")))
+    settings = given_groups.GivenSettings(Datum("free"), "m")
+    judged = judge_given(replace(network, scale_bars=bars), free, settings)
+    (said,) = of_kind(judged.remarks, "scale_left_out")
+    assert said.names("given") == ("the table of distances",)
+    assert judged.network.scale_bars.start.tolist() == [0, 3]
 
 
 def test_a_wrong_bar_given_twice_does_not_outvote_a_right_one() -> None:

@@ -276,6 +276,7 @@ def test_given_mounts_are_judged_before_they_are_used(
         assert found.number("angle") == pytest.approx(np.degrees(0.05) if mistake == "turned" else 0, abs=0.1)
     if kind == "mount_contradicted":
         assert judged[kind].subjects.get("mistake", ()) == (() if mistake == "turned" else (mistake,))
+        assert judged[kind].severity == "warning"  # by many more photographs, and it is not used
     if kind == "scale_contradicted":
         assert judged[kind].number("off") == pytest.approx(5.0, abs=0.5)
         assert judged[kind].names("cameras") == ("camera 2",) and judged[kind].names("others") == ("bars",)

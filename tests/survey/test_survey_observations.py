@@ -16,6 +16,8 @@ from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.errors import SurveyFileError
+from sfm.judgement.given import free_network
+from sfm.judgement.given.tables import Contradiction, Table, as_judged
 from sfm.network import (
     Estimate,
     ExteriorObservations,
@@ -434,6 +436,65 @@ def test_points_that_are_not_on_their_plane_are_in_no_other_unit(offset: float, 
     (found,) = [one for one in remarks if one.kind == "kind_wrong"]
     assert found.names("of") == ("planes",) and not found.names("mistake")
     assert "observations_unused" not in {one.kind for one in remarks}  # its points are in the result
+    assert found.severity == "warning" and found.number("rest") > 100  # the image points agree
+
+
+def test_of_two_verticals_that_contradict_one_another_neither_is_right_alone(tmp_path: Path) -> None:
+    """Axes and heights in a free datum: each agrees without the other, and nothing else decides."""
+    network, truth = network_of("two verticals", ("coordinate difference", "height difference"))
+    axes, heights = network.observations
+    assert isinstance(heights, HeightDifferences)
+    slope = 0.1 * (truth.points[heights.end, 0] - truth.points[heights.start, 0])
+    tilted = replace(heights, value=heights.value + slope[:, None])
+    given = {"coordinate difference": [axes], "height difference": [tilted]}
+    said = of_kind(run_with(tmp_path, network, truth, given).remarks, "kind_wrong")  # type: ignore[arg-type]
+    assert {one.names("of") for one in said} == {("coordinate differences",), ("height differences",)}
+    assert {one.severity for one in said} == {"error"}
+
+
+def test_of_rows_of_the_same_points_only_the_wrong_one_is_left_out(tmp_path: Path) -> None:
+    network, truth = network_of("same points twice", ("height difference", "distance"))
+    heights, tape = network.observations
+    assert isinstance(heights, HeightDifferences)
+    twice = [*range(len(heights)), 2]
+    value = heights.value[twice].copy()
+    value[-1] += 0.3
+    again = replace(heights.select(np.array(twice)), value=value)
+    result = run_with(tmp_path, network, truth, {"height difference": [again], "distance": [tape]})
+    (said,) = of_kind(result.remarks, "observations_wrong")
+    assert said.names("observations") == (f"height difference {heights.names(network, truth)[2]}",)
+    (kept,) = [one for one in result.network.observations if isinstance(one, HeightDifferences)]
+    assert len(kept) == len(heights)
+
+
+def test_factors_of_several_rounds_multiply() -> None:
+    network, truth = network_of("rounds", ("height difference", "distance"))
+    tables = [
+        Table(kind, k, np.arange(len(kind.parts(network, truth))))
+        for k, kind in enumerate(network.observations)
+    ]
+    rounds = [Contradiction("height differences", factor=factor) for factor in (2.0, 3.0)]
+    heights, tape = (table.kind for table in as_judged(tables, rounds))
+    before, of_tape = network.observations
+    assert isinstance(heights, TableKind) and isinstance(before, TableKind) and tape is of_tape
+    np.testing.assert_allclose(heights.sigma, 6 * before.sigma)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_of_a_long_table_some_rows_are_judged_and_all_follow(
+    wrong: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(free_network, "MAX_PLACES", 10)
+    network, truth = network_of("long table", ("coordinate difference", "height difference"))
+    heights, (start, end) = network.observations[1], np.triu_indices(12, 1)
+    dZ = (truth.points[end, 2] - truth.points[start, 2])[:, None]
+    long = HeightDifferences(start, end, (-1 if wrong else 1) * dZ, np.full((len(dZ), 1), 1e-3))
+    given = {"coordinate difference": [network.observations[0]], "height difference": [long]}
+    result = run_with(tmp_path, network, truth, given)  # type: ignore[arg-type]
+    kept = [one for one in result.network.observations if isinstance(one, type(heights))]
+    assert [len(one) for one in kept] == ([] if wrong else [66])
+    said = of_kind(result.remarks, "kind_wrong")
+    assert [one.names("mistake") for one in said] == ([("exchanged",)] if wrong else [])
 
 
 def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None:

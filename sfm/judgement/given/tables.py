@@ -166,7 +166,7 @@ class _Judge:
     def _rest(self, tables: Sequence[Table], name: str) -> int | None:
         """Return the degrees of freedom of the others, if these exceed those by which a kind contradicts.
 
-        If the kind contradicts the image points alone, these are among the others.
+        If the kind contradicts the image points alone, at the scale of all, these are among the others.
         """
         placing = self.place(replace(self.network, observations=tuple(table.kind for table in tables)))
         right = [kind for kind in confirmed(self.network) if len(kind)]
@@ -175,7 +175,8 @@ class _Judge:
         of_kind = np.array([one.name == name for one in kinds])[kind][model.item]
         rest = model.part(~of_kind).kept().dof if (~of_kind).any() else 0
         confirming = rest
-        if not model.part(of_kind).fits(self.level):
+        at_scale = replace(model, A=np.delete(model.A, 6, axis=1)).part(of_kind)
+        if not at_scale.fits(self.level):
             confirming += self.reference.marginal.adjustment.redundancy
         return confirming if confirming > model.kept().dof - rest else None
 
@@ -207,7 +208,9 @@ class _Judge:
 
         A unit also changes the standard deviations. It explains nothing if these alone do.
         """
-        found = []
+        found = list[str]()
+        if self.fit([*others, *kinds]):  # there is nothing to correct
+            return ()
         corrected = [kind.mistakes() for kind in kinds]
         for mistake in dict.fromkeys(mistake for mistakes in corrected for mistake in mistakes):
             mended = [by.get(mistake, kind) for by, kind in zip(corrected, kinds, strict=True)]
