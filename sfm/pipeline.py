@@ -19,8 +19,6 @@ from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
-from sfm.survey.board_turns import agree_on_turns
-from sfm.survey.clock_offsets import agree_on_clocks
 from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
 from sfm.survey.inputs.measurements import Measurements, find_photographs, refuse_incomplete_cameras
@@ -29,7 +27,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import separate_sizes
 from sfm.survey.measuring.tie_points import tie_photographs
-from sfm.survey.orientation import Oriented, orient_with_models
+from sfm.survey.orientation import Oriented, orient_survey
 from sfm.survey.target_network import measure_targets
 from sfm.survey.unfinished import UnfinishedSurveyError, unfinished_survey
 
@@ -62,7 +60,7 @@ def run_survey(
     with _stating_how_far(reached, clock), own_threads(jobs):
         reached.survey, reached.measured = survey, measured = _measure(survey, images_dir, jobs, store, clock)
         with clock.stage("orientation"):
-            oriented = agree_on_turns(agree_on_clocks(orient_with_models(survey, measured)))
+            oriented = orient_survey(survey, measured)
         reached.oriented = oriented
         with clock.stage("matching"):
             reached.matched = matched = find_correspondences(oriented, jobs=jobs)

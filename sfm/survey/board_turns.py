@@ -21,10 +21,10 @@ from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import LEVEL, f_isf
 from sfm.network import Estimate, rows_of
-from sfm.remarks.remark import remark
+from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.orientation import Oriented, orient_survey
+from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import build_network, name_coded
 from sfm.targets.codes.plates import PlateFamily
 
@@ -62,17 +62,22 @@ class _Rig:
         return -int(self.agrees.sum()), self.squares(self.agrees)
 
 
-def agree_on_turns(oriented: Oriented) -> Oriented:
+@dataclass(frozen=True)
+class AgreedTurns:
+    """The plate in the turn that the first camera sees, and what remains uncertain."""
+
+    measured: Measurements | None  # with image points renamed; None if all had the names of that turn
+    uncertain: Remark | None  # names the photographs whose turn is uncertain; None without any
+
+
+def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -> AgreedTurns:
     """Rename the points of a plate that looks alike turned, so that mounted cameras see the same turn.
 
     Args:
-        oriented: orientation from the points of the plate in each photograph, in any turn.
-
-    Returns:
-        The orientation from the image points renamed where the turn differed from that of the first camera.
-        A remark lists the photographs of pairs whose turn remains uncertain.
+        survey: states the plate.
+        measured: all named image points.
+        estimate: orientation from the points of the plate in each photograph, in any turn.
     """
-    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     plate, photographs = survey.family, measured.photographs
     cameras = np.unique(measured.network.camera)
     if (
@@ -81,37 +86,39 @@ def agree_on_turns(oriented: Oriented) -> Oriented:
         or photographs is None
         or len(cameras) < 2
     ):
-        return oriented
-    codes = [found.code for found in photographs.targets]
-    uncertain: set[int] = set()
+        return AgreedTurns(None, None)
+    codes = [target.code for target in photographs.targets]
+    unsure = np.zeros(len(measured.network.images), dtype=bool)
     for camera in cameras[1:].tolist():
         tried = [
-            (pairs, _common_rig(plate, measured, start.estimate, pairs))
+            (pairs, _common_rig(plate, measured, estimate, pairs))
             for pairs in _pairings(measured, int(cameras[0]), camera)
         ]
         pairs, rig = max(tried, key=lambda one: 0 if one[1] is None else int(one[1].agrees.sum()))
         if rig is None:
-            either = np.isin(measured.network.camera, [cameras[0], camera])
-            uncertain |= set(np.flatnonzero(either).tolist())
+            unsure |= np.isin(measured.network.camera, [cameras[0], camera])
             continue
-        uncertain |= {i for k in np.flatnonzero(~rig.agrees) for i in pairs[k]}
+        for k in np.flatnonzero(~rig.agrees).tolist():
+            unsure[list(pairs[k])] = True
         for k in np.flatnonzero(rig.agrees & (rig.turn > 0)).tolist():
             right, number = pairs[k].right, plate.turns[int(rig.turn[k]) - 1]
             codes[right] = np.where(codes[right] >= 0, number[codes[right]], codes[right])
-    if any((found.code != code).any() for found, code in zip(photographs.targets, codes, strict=True)):
-        targets = [replace(found, code=code) for found, code in zip(photographs.targets, codes, strict=True)]
-        photographs = replace(photographs, targets=tuple(targets))
-        naming = name_coded(photographs)
-        network = build_network(survey, photographs, naming)
-        measured = replace(measured, network=network, photographs=photographs, naming=naming)
-        start = orient_survey(survey, measured)
-    uncertain &= set(np.flatnonzero(start.estimate.oriented).tolist())
-    if not uncertain:
-        return Oriented(survey, measured, start)
-    names = [photographs.names[i] for i in sorted(uncertain)]
-    involved = sorted({measured.cameras[measured.network.camera[i]].name for i in uncertain})
-    alike = remark("plate_looks_alike_turned", cameras=involved, photographs=names)
-    return Oriented(survey, measured, replace(start, remarks=(*start.remarks, alike)))
+    uncertain = None
+    unsure &= estimate.oriented
+    if unsure.any():
+        uncertain = remark(
+            "plate_looks_alike_turned",
+            cameras=sorted({measured.cameras[a].name for a in measured.network.camera[unsure]}),
+            photographs=[photographs.names[i] for i in np.flatnonzero(unsure)],
+        )
+    pairs_of_codes = list(zip(photographs.targets, codes, strict=True))
+    if not any((target.code != code).any() for target, code in pairs_of_codes):
+        return AgreedTurns(None, uncertain)
+    targets = tuple(replace(target, code=code) for target, code in pairs_of_codes)
+    photographs = replace(photographs, targets=targets)
+    naming = name_coded(photographs)
+    network = build_network(survey, photographs, naming)
+    return AgreedTurns(replace(measured, network=network, photographs=photographs, naming=naming), uncertain)
 
 
 def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair]]:

@@ -12,41 +12,47 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.conventions import IntArray
-from sfm.distributions import LEVEL, f_isf
+from sfm.distributions import LEVEL, f_isf, share_of
 from sfm.network import Estimate
-from sfm.survey.orientation import Oriented, orient_with_models
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.survey import Survey
 from sfm.survey.rigs import middle_rotation, with_moments
 
 MIN_MOMENTS = 3  # of two cameras, whose relative rotations are compared
 
 
-def agree_on_clocks(oriented: Oriented) -> Oriented:
-    """Take the second offset of clocks that fit at two, if the cameras then agree better on their mounts.
+def agree_on_clocks(
+    survey: Survey, measured: Measurements, estimate: Estimate
+) -> tuple[Survey, Measurements] | None:
+    """Return the moments by the second offset of clocks, if the cameras agree better on their mounts by it.
 
     Args:
-        oriented: its survey may have the moments by a second offset.
+        survey: may have the moments by a second offset.
+        measured: all named image points, with the moments by the first.
+        estimate: has photographs oriented one by one.
 
     Returns:
-        The orientation with the moments that agree, and a remark on the offset if these are the other ones.
+        Survey and measurements with the other moments, whose remarks state that offset; None if the first one
+        stays.
     """
-    survey, measured, estimate = oriented.survey, oriented.measured, oriented.orientation.estimate
     if not survey.other_moments or measured.network.moment is None:
-        return oriented
+        return None
     other = replace(survey, moments=survey.other_moments, other_moments={})
     network = with_moments(other, replace(measured.network, moment=None))
     assert network.moment is not None
     now, count = rotation_spread(measured.network.camera, measured.network.moment, estimate)
     then, of_other = rotation_spread(network.camera, network.moment, estimate)
     dof = 3 * (min(count, of_other) - 1)
-    if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(LEVEL, dof, dof):
-        return oriented
+    level = share_of(LEVEL, survey.adjust.false_alarm)
+    if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(level, dof, dof):
+        return None
     said = tuple(
         replace(one, subjects={role: names for role, names in one.subjects.items() if role != "unsure"})
         if one.kind == "clock_differs"
         else one
         for one in measured.remarks
     )
-    return orient_with_models(other, replace(measured, network=network, remarks=said))
+    return other, replace(measured, network=network, remarks=said)
 
 
 def rotation_spread(camera: IntArray, moment: IntArray, estimate: Estimate) -> tuple[float, int]:

@@ -1,7 +1,7 @@
 """Orientation of a survey: approximate values of its network, and the distortion model of its cameras.
 
 The photographs are oriented on their control, if that fits, else without it. Lost photographs get a reason.
-If nothing works, other principal distances are tried.
+If nothing works, other principal distances are tried. What the survey leaves open is a table of choices.
 
 Where the survey does not state the distortion model, it is central perspective or fisheye. A fisheye lens
 images equal angles as nearly equal lengths. No polynomial of the tangents describes such a lens over a wide
@@ -24,9 +24,8 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray
 from sfm.errors import GeometryError
-from sfm.judgement.choices import Choice, choose
-from sfm.judgement.hypotheses.alternatives import ALPHA
-from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
+from sfm.judgement.choices import Choice, solve_likeliest
+from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
@@ -34,7 +33,9 @@ from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, MIN_POINTS,
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
+from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.circles import circle_misfit
+from sfm.survey.clock_offsets import agree_on_clocks
 from sfm.survey.diagnosis.codes_found import describe_codes
 from sfm.survey.diagnosis.lost_photographs import (
     explain_lost_photographs,
@@ -62,17 +63,70 @@ ORIENTATION_POINTS, POINTS_PER_PHOTOGRAPH = 400, 100
 CONTROL_OF_CAMERA = 6  # control points in the datum with which two photographs determine their camera
 
 
-def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
-    """Return approximate values of a survey's network.
+@dataclass(frozen=True)
+class Oriented:
+    """An oriented survey, with what its orientation decided."""
+
+    survey: Survey  # with the lens models of its cameras, and the moments of its photographs
+    measured: Measurements  # start values of these cameras, names of the points, remarks on choices
+    orientation: Orientation
+
+
+Model = tuple[Survey, Measurements]
+Present = Oriented | None  # None if the usual model has no orientation
+
+
+def orient_survey(survey: Survey, measured: Measurements) -> Oriented:
+    """Return approximate values of a survey's network, for the likeliest of the models that it leaves open.
+
+    Open are the lens models of cameras without a stated one, the offset of clocks that fit at two, and the
+    turns of a plate that looks alike turned.
 
     Args:
-        survey: may give start values; error messages name its settings.
+        survey: may give start values and lens models; error messages name its settings.
         measured: all named image points.
 
     Raises:
         GeometryError: no two photographs could be oriented, the connected photographs could not be adjusted,
             or the photographs have no base.
     """
+    fisheyes = Choice[Model, Present](
+        partial(_models_with_fisheyes, survey, measured), _gain, partial(_freed_by_fisheyes, survey),
+        partial(_report_fisheyes, survey),
+    )  # fmt: skip
+    oriented = solve_likeliest(
+        (survey, measured), (fisheyes, CLOCKS, TURNS), _orient_model, false_alarm=survey.adjust.false_alarm
+    )
+    start = oriented.orientation
+    uncertain = agree_on_turns(oriented.survey, oriented.measured, start.estimate).uncertain
+    if uncertain is None:
+        return oriented
+    return replace(oriented, orientation=replace(start, remarks=(*start.remarks, uncertain)))
+
+
+def _models_by_other_clocks(found: Present) -> Iterator[Model]:
+    """Yield the model with the second offset of clocks, if the cameras keep their mounts better by it."""
+    if found is not None:
+        other = agree_on_clocks(found.survey, found.measured, found.orientation.estimate)
+        if other is not None:
+            yield other
+
+
+def _models_with_other_turns(found: Present) -> Iterator[Model]:
+    """Yield the model with the image points of plates renamed as the first camera sees them."""
+    if found is not None:
+        renamed = agree_on_turns(found.survey, found.measured, found.orientation.estimate).measured
+        if renamed is not None:
+            yield found.survey, renamed
+
+
+CLOCKS = Choice[Model, Present](_models_by_other_clocks)
+TURNS = Choice[Model, Present](_models_with_other_turns)
+
+
+def _orient_model(model: Model) -> Oriented:
+    """Return the orientation of a survey with one model of its lenses, clocks and turns."""
+    survey, measured = model
     refuse_too_large(measured.network)
     if survey.tie_points is not None:
         refuse_no_base(measured.network, measured.cameras)
@@ -80,6 +134,35 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
     network = replace(
         measured.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=()
     )
+    found, wrong_c = _orient_with_best_c(survey, measured, network)
+    chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
+    found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
+    if held and len(network.images) > 2:
+        held += (remark("pair_contradicted", others=len(network.images) - 2),)
+    elif held:
+        of_pair = {"pair": ("c",)}
+        wrong_c = tuple(replace(one, subjects={**one.subjects, **of_pair}) for one in wrong_c)
+    found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
+    if survey.tie_points:
+        moving = find_second_motion(network, found, _orient_strongest)
+        found = replace(found, remarks=(*found.remarks, *moving))
+    elif not wrong_c:
+        second = find_second_objects(network, found, partial(orient, refine=refine))
+        failures = tuple((image, second.get(image, reason)) for image, reason in found.failures)
+        found = replace(found, failures=failures)
+    estimate = mount_cameras(survey, network, found.estimate)
+    if survey.datum.kind != "control":
+        estimate = place_on_observations(measured.network, estimate)
+    found = replace(found, estimate=estimate)
+    return Oriented(
+        survey, measured, explain_lost_photographs(network, found, named=survey.tie_points is None)
+    )
+
+
+def _orient_with_best_c(
+    survey: Survey, measured: Measurements, network: Network
+) -> tuple[Orientation, tuple[Remark, ...]]:
+    """Return the orientation, with another principal distance if that is likelier, and remarks on it."""
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None
 
@@ -99,39 +182,14 @@ def orient_survey(survey: Survey, measured: Measurements) -> Orientation:
             raise GeometryError(describe_codes(survey, measured.photographs)) from error
     wrong_c: tuple[Remark, ...] = ()
     if not given:
-        found, wrong_c = try_other_principal_distances(network, estimate, found, orient_from)
+        found, wrong_c = try_other_principal_distances(
+            network, estimate, found, orient_from, survey.adjust.false_alarm
+        )
     if found is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
         hint += "".join(f"; {one.text}" for one in wrong_c)
         raise GeometryError(f"{failure}{hint}") from failure
-    chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
-    found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
-    if held and len(network.images) > 2:
-        held += (remark("pair_contradicted", others=len(network.images) - 2),)
-    elif held:
-        of_pair = {"pair": ("c",)}
-        wrong_c = tuple(replace(one, subjects={**one.subjects, **of_pair}) for one in wrong_c)
-    found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
-    if survey.tie_points:
-        found = replace(
-            found, remarks=(*found.remarks, *find_second_motion(network, found, _orient_strongest))
-        )
-    elif not wrong_c:
-        second = find_second_objects(network, found, _orient)
-        failures = tuple((image, second.get(image, reason)) for image, reason in found.failures)
-        found = replace(found, failures=failures)
-    estimate = mount_cameras(survey, network, found.estimate)
-    if survey.datum.kind != "control":
-        estimate = place_on_observations(measured.network, estimate)
-    found = replace(found, estimate=estimate)
-    return explain_lost_photographs(network, found, named=survey.tie_points is None)
-
-
-def _orient(
-    network: Network, estimate: Estimate, *, contradicting: bool = False, judge: Judge | None = None
-) -> Orientation:
-    """Orient all photographs on all points."""
-    return orient(network, estimate, refine=refine, contradicting=contradicting, judge=judge)
+    return found, wrong_c
 
 
 def _orient_on_control(
@@ -142,35 +200,34 @@ def _orient_on_control(
     given: whether the image points were given; the adjustment, not the orientation, then judges
     contradictions.
     """
-    found, failure = None, None
-    try:
-        found = _orient(network, estimate, contradicting=given, judge=judge)
-    except GeometryError as error:
-        failure = error
-    if not len(network.control) or (found is not None and _fits(network, found).all()):
-        return _require(found, failure)
-    points = estimate.points.copy()
-    points[network.control.point] = np.nan
-    alone = replace(network, control=ObjectPoints())
-    try:
-        other = _orient(alone, replace(estimate, points=points), contradicting=given, judge=judge)
-    except GeometryError:
-        return _require(found, failure)
-    if found is not None and _fits(network, other).sum() <= _fits(network, found).sum():
+
+    def orient_part(part: Network) -> Orientation:
+        values = estimate
+        if len(part.control) < len(network.control):
+            values = replace(estimate, points=estimate.points.copy())
+            values.points[network.control.point] = np.nan
+        return orient(part, values, refine=refine, contradicting=given, judge=judge)
+
+    def without_control(found: Orientation | None) -> Iterator[Network]:
+        if len(network.control) and (found is None or not _fits(network, found).all()):
+            yield replace(network, control=ObjectPoints())
+
+    def more_fit(before: Orientation | None, after: Orientation | None) -> float:
+        if before is None or after is None:
+            return math.inf
+        return float(_fits(network, after).sum() - _fits(network, before).sum())
+
+    def placed(_: Orientation | None, found: Orientation | None) -> Orientation | None:
+        with suppress(GeometryError):  # fewer than three control points, or on a line
+            if found is not None:
+                control = network.control.complete
+                known = found.estimate.determined[control.point]
+                placing = fit_similarity(found.estimate.points[control.point[known]], control.xyz[known])
+                return replace(found, estimate=placing.apply_estimate(found.estimate))
         return found
-    with suppress(GeometryError):  # fewer than three control points, or on a line
-        control = network.control.complete
-        known = other.estimate.determined[control.point]
-        placing = fit_similarity(other.estimate.points[control.point[known]], control.xyz[known])
-        other = replace(other, estimate=placing.apply_estimate(other.estimate))
-    return other
 
-
-def _require(found: Orientation | None, failure: GeometryError | None) -> Orientation:
-    """Return the orientation, or raise the reason why there is none."""
-    if found is None:
-        raise failure or GeometryError("orientation: none")
-    return found
+    row = Choice[Network, Orientation | None](without_control, more_fit, report=placed)
+    return solve_likeliest(network, (row,), orient_part)
 
 
 def _fits(network: Network, found: Orientation) -> BoolArray:
@@ -226,7 +283,8 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     """
     images = np.ones(len(network.images), dtype=bool)
     image_points = np.ones(len(network.image_points), dtype=bool)
-    found = _orient(*reduce_network(network, estimate, images, _strongest(network), image_points))
+    part, start = reduce_network(network, estimate, images, _strongest(network), image_points)
+    found = orient(part, start, refine=refine)
     rays = intersect_image_points(
         network.image_points,
         network.camera,
@@ -265,50 +323,16 @@ def refine(network: Network, estimate: Estimate) -> Estimate:
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
-@dataclass(frozen=True)
-class Oriented:
-    """An oriented survey, with what its orientation decided."""
-
-    survey: Survey  # with the lens models of its cameras, and the moments of its photographs
-    measured: Measurements  # with start values of these cameras, and the names of the points
-    orientation: Orientation
-
-
-def orient_with_models(survey: Survey, measured: Measurements) -> Oriented:
-    """Orient a survey; cameras without a stated model get the fisheye model if it is likelier.
-
-    Args:
-        survey: may state the models of its cameras.
-        measured: all named image points.
-
-    Raises:
-        GeometryError: as in `orient_survey`.
-    """
-    unstated = [a for a, camera in enumerate(survey.cameras) if not camera.states_model]
-
-    def fisheyes(found: Oriented | None) -> Iterator[tuple[Survey, Measurements]]:
-        wide = unstated
-        if found is not None and _likelihood(found)[1] >= MIN_FITTING_FRACTION * len(
-            measured.network.image_points
-        ):
-            wide = [a for a in unstated if _is_wide(found.orientation.estimate.cameras[a])]
-        if wide:
-            known = measured.cameras if found is None else found.orientation.estimate.cameras
-            yield _with_fisheyes(survey, measured, known, wide)
-
-    def orient_model(model: tuple[Survey, Measurements]) -> Oriented:
-        return Oriented(*model, orient_survey(*model))
-
-    failure, found = None, None
-    try:
-        found = orient_model((survey, measured))
-    except GeometryError as error:
-        failure = error
-    choice = Choice(fisheyes, partial(_evidence_of_fisheyes, survey), partial(_report_fisheyes, survey))
-    found = choose(found, (choice,), orient_model)
-    if found is None:
-        raise failure or GeometryError("orientation: none")
-    return found
+def _models_with_fisheyes(survey: Survey, measured: Measurements, found: Present) -> Iterator[Model]:
+    """Yield the model with fisheyes where the survey states no model, if it may be likelier."""
+    wide = [a for a, camera in enumerate(survey.cameras) if not camera.states_model]
+    if found is not None and _likelihood(found)[1] >= MIN_FITTING_FRACTION * len(
+        measured.network.image_points
+    ):
+        wide = [a for a in wide if _is_wide(found.orientation.estimate.cameras[a])]
+    if wide:
+        known = measured.cameras if found is None else found.orientation.estimate.cameras
+        yield _with_fisheyes(survey, measured, known, wide)
 
 
 def _with_fisheyes(
@@ -322,16 +346,21 @@ def _with_fisheyes(
     return replace(survey, cameras=tuple(cameras)), replace(measured, cameras=tuple(starts))
 
 
-def _evidence_of_fisheyes(survey: Survey, before: Oriented | None, after: Oriented | None) -> float:
-    """Return the gain of ln likelihood of all image points minus the price of a parameter per fisheye."""
+def _gain(before: Present, after: Present) -> float:
+    """Return the gain of ln likelihood of all image points."""
     if before is None or after is None:
         return math.inf
-    count = len(_fisheyes_of(survey, after))
-    price = price_of(count, len(after.measured.network.image_points), math.log(1 / ALPHA))
-    return _likelihood(after)[0] - _likelihood(before)[0] - price
+    return _likelihood(after)[0] - _likelihood(before)[0]
 
 
-def _report_fisheyes(survey: Survey, before: Oriented | None, after: Oriented | None) -> Oriented | None:
+def _freed_by_fisheyes(survey: Survey, _: Present, after: Present) -> list[tuple[int, int]]:
+    """Return a parameter for each fisheye, all together, and the number of image points."""
+    if after is None:
+        return []
+    return [(len(_fisheyes_of(survey, after)), len(after.measured.network.image_points))]
+
+
+def _report_fisheyes(survey: Survey, before: Present, after: Present) -> Present:
     """Return the orientation with a remark on each camera that has the fisheye model now."""
     if after is None:
         return None
@@ -345,9 +374,7 @@ def _report_fisheyes(survey: Survey, before: Oriented | None, after: Oriented | 
         )
         for name in _fisheyes_of(survey, after)
     )
-    return replace(
-        after, orientation=replace(after.orientation, remarks=(*after.orientation.remarks, *taken))
-    )
+    return replace(after, measured=replace(after.measured, remarks=(*after.measured.remarks, *taken)))
 
 
 def _fisheyes_of(survey: Survey, after: Oriented) -> list[str]:

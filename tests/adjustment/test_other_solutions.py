@@ -52,7 +52,7 @@ def test_networks_of_many_image_points_are_not_searched(
 @pytest.mark.parametrize(("redundancy", "vPv", "allowed"), [(1, 0.01, 17.92), (90, 90.0, 11.50)])
 def test_stated_weights_count_as_ten_observations(redundancy: int, vPv: float, allowed: float) -> None:
     """F of 1 and 11, and of 1 and 100, degrees of freedom at 0.001 is 19.69 and 11.50 (tables)."""
-    found = searched._allowed(stub(redundancy=redundancy, vPv=vPv))
+    found = searched._allowed(stub(redundancy=redundancy, vPv=vPv), 0.001)
     assert found == pytest.approx(allowed, rel=1e-3)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from sfm.errors import GeometryError
-from sfm.judgement.choices import Choice, choose
+from sfm.judgement.choices import Choice, choose, solve_likeliest
 
 
 def solve(model: float) -> float:
@@ -14,12 +16,36 @@ def solve(model: float) -> float:
     return model
 
 
-def test_the_model_with_most_evidence_is_taken_if_it_pays_its_price() -> None:
-    def choice(price: float) -> Choice[float, float]:
-        return Choice(lambda _: [1.0, 3.0, 2.0], lambda before, after: after - before - price)
+def gained(before: float, after: float) -> float:
+    return after - before
 
-    assert choose(0.5, [choice(2.0)], solve) == 3.0
-    assert choose(0.5, [choice(3.0)], solve) == 0.5
+
+@pytest.mark.parametrize(("alternatives", "behind"), [(1, 1), (3, 1), (3, 20)])
+def test_further_parameters_and_the_search_have_a_price(alternatives: int, behind: int) -> None:
+    """Two parameters of 50 image points: ln 100; a wrong choice in 1 of 100: ln 100 and the alternatives."""
+    price = 2 * math.log(100.0) + math.log(alternatives * behind)
+
+    def taken(gain: float, false_alarm: float = 0.05) -> bool:
+        models = [gain, *[0.0] * (alternatives - 1)]
+        row = Choice[float, float](lambda _: models, gained, lambda _, __: [(2, 50)], behind=behind)
+        return choose(0.0, [row], solve, false_alarm=false_alarm) == gain
+
+    assert taken(price + 0.1) and not taken(price - 0.1)
+    assert not taken(price + 0.1, false_alarm=0.005)
+
+
+def test_the_better_solution_of_the_same_model_has_no_price() -> None:
+    row = Choice[float, float](lambda _: [1.0, 3.0, 2.0], gained)
+    assert choose(2.9, [row], solve) == 3.0 and choose(3.1, [row], solve) == 3.1
+
+
+def test_another_model_is_taken_where_the_usual_one_has_no_solution() -> None:
+    row = Choice[float, float | None](
+        lambda before: [2.0] if before is None else [], lambda before, _: float(before is None)
+    )
+    assert solve_likeliest(-1.0, [row], solve) == 2.0 and solve_likeliest(1.0, [row], solve) == 1.0
+    with pytest.raises(GeometryError, match="no solution"):
+        solve_likeliest(-1.0, [Choice[float, float | None](lambda _: [-2.0], lambda _, __: 1.0)], solve)
 
 
 def test_a_choice_begins_with_what_the_one_before_took() -> None:

@@ -17,10 +17,10 @@ from sfm.remarks.remark import of_kind, remark
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.report.survey_report import text_report
-from sfm.survey.clock_offsets import agree_on_clocks, rotation_spread
+from sfm.survey.clock_offsets import rotation_spread
 from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.orientation import orient_with_models
+from sfm.survey.orientation import orient_survey
 from sfm.survey.rigs import with_moments
 from tests.findings import findings_of
 from tests.rigs import make_rig
@@ -50,7 +50,7 @@ def test_the_offset_at_which_cameras_keep_their_mounts_is_taken(wrong: bool, tmp
     measured = replace(
         measured, network=with_moments(survey, replace(measured.network, moment=None)), remarks=(unsure,)
     )
-    oriented = agree_on_clocks(orient_with_models(survey, measured))
+    oriented = orient_survey(survey, measured)
     found, agreed, start = oriented.survey, oriented.measured, oriented.orientation
     assert found.moments == right
     assert [one.severity for one in agreed.remarks] == ["note" if wrong else "warning"]

@@ -27,7 +27,7 @@ from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.orientation import FISHEYE, orient_with_models
+from sfm.survey.orientation import FISHEYE, orient_survey
 from tests.findings import findings_of
 from tests.survey.faults import planted
 from tests.survey.texture_scenes import Plane, upright, wall
@@ -208,7 +208,7 @@ def oriented(folder: Path, camera: Camera, model: str = "") -> tuple[Survey, Mea
     names = tuple(f"{i}.png" for i in range(6))
     network = Network(names, np.zeros(6, dtype=np.int64), tuple(map(str, range(150))), seen)
     cameras = start_cameras(survey.cameras, "room")
-    found = orient_with_models(survey, Measurements(network, cameras, names, np.full(150, 3)))
+    found = orient_survey(survey, Measurements(network, cameras, names, np.full(150, 3)))
     return found.survey, found.measured, found.orientation
 
 
@@ -229,7 +229,7 @@ def test_the_image_points_tell_a_fisheye_from_a_wide_lens(
     taken = FISHEYE if model == FISHEYE else "brown"
     assert survey.cameras[0].model == measured.cameras[0].model == found.estimate.cameras[0].model == taken
     assert found.estimate.oriented.all() and found.estimate.cameras[0].c_px == pytest.approx(f, rel=0.01)
-    assert len(of_kind(found.remarks, "fisheye_taken")) == (model == FISHEYE)
+    assert len(of_kind(measured.remarks, "fisheye_taken")) == (model == FISHEYE)
 
 
 @pytest.mark.parametrize("model", ['model = "brown"', pytest.param('free = ["c"]', marks=pytest.mark.slow)])

@@ -20,12 +20,12 @@ from sfm.rendering.render import corner_rays, render_photograph
 from sfm.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.similarity import fit_similarity
 from sfm.survey.assembly import settings_by_table
-from sfm.survey.board_turns import _is_certain, _Rig, agree_on_turns
+from sfm.survey.board_turns import _is_certain, _Rig
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
-from sfm.survey.orientation import Oriented, orient_survey
+from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded, plate_bars
 from sfm.targets.codes import boards
 from sfm.targets.codes.plates import PlateFamily, group_plates
@@ -316,7 +316,7 @@ def measured_pairs(
         build_network(survey, photographs, naming), tuple(cameras), tuple(every), min_rays(naming),
         files=PhotographList(tuple(every), paths, camera, folder), photographs=photographs, naming=naming,
     )  # fmt: skip
-    oriented = agree_on_turns(Oriented(survey, measured, orient_survey(survey, measured)))
+    oriented = orient_survey(survey, measured)
     found, start = oriented.measured, oriented.orientation
     return found, start, photographs
 

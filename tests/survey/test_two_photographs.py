@@ -104,7 +104,7 @@ def test_points_of_a_plane_and_the_circles_in_it(survey: Survey, measured: Measu
         for named in measured.naming.point
     )
     naming = replace(measured.naming, point=point)
-    found = orient_survey(survey, replace(measured, network=network, naming=naming))
+    found = orient_survey(survey, replace(measured, network=network, naming=naming)).orientation
     assert found.kind == "planar" and kinds_of(found.remarks) == ("interior_held_of_pair",)
     assert error_mm(network.points, found.estimate.points) < 0.3
     true = circle_misfit(measured.photographs, naming, network, found.estimate)

@@ -17,7 +17,6 @@ from sfm.camera import base_name
 from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.alternatives import ALPHA
-from sfm.likelihood import price_of
 from sfm.network import Mounts
 from sfm.remarks.remark import of_kind, remark
 from sfm.runtime.progress import report_step
@@ -53,7 +52,8 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     Raises:
         GeometryError: too little is left to adjust, or the datum is control but no control is seen.
     """
-    return choose(solve_model(SurveyModel(survey, matched)), CHOICES, solve_model)
+    usual = solve_model(SurveyModel(survey, matched))
+    return choose(usual, CHOICES, solve_model, false_alarm=survey.adjust.false_alarm)
 
 
 def _models_without_copies(found: SolvedSurvey) -> Iterator[SurveyModel]:
@@ -143,17 +143,23 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     )
 
 
-def _evidence_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
-    """Return the gain of ln likelihood minus the price of each further pose."""
-    moment, earlier = after.model.matched.network.moment, before.model.matched.network.moment
-    if moment is None or not after.adjustment.converged or after.adjustment.undetermined:
+def _gain_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
+    """Return the gain of ln likelihood."""
+    if not after.adjustment.converged or after.adjustment.undetermined:
         return -float("inf")
-    of_point = moment[after.model.matched.network.image_points.image]
-    count = np.bincount(of_point, minlength=int(moment.max()) + 1)
+    freed = POSE * len(_further_poses(before, after)) + _free_of_mounts(after) - _free_of_mounts(before)
+    return _log_likelihood(after, freed) - _log_likelihood(before)
+
+
+def _further_poses(before: SolvedSurvey, after: SolvedSurvey) -> list[tuple[int, int]]:
+    """Return the parameters of each further pose, and the number of its image points."""
+    network, earlier = after.model.matched.network, before.model.matched.network.moment
+    moment = network.moment
+    if moment is None:
+        return []
+    count = np.bincount(moment[network.image_points.image], minlength=int(moment.max()) + 1)
     further = np.setdiff1d(moment, moment if earlier is None else earlier)
-    price = sum(price_of(POSE, int(count[k])) for k in further)
-    freed = POSE * len(further) + _free_of_mounts(after) - _free_of_mounts(before)
-    return _log_likelihood(after, freed) - _log_likelihood(before) - price
+    return [(POSE, int(count[k])) for k in further]
 
 
 def _free_of_mounts(solved: SolvedSurvey) -> int:
@@ -162,15 +168,20 @@ def _free_of_mounts(solved: SolvedSurvey) -> int:
     return 0 if mounts is None else int(mounts.free.sum())
 
 
-def _evidence_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
-    """Return the gain of ln likelihood minus the price, if c differs by more than focusing changes it."""
+def _gain_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
+    """Return the gain of ln likelihood, if c differs by more than focusing changes it."""
     a = zoomed.adjustment
     focal = [c for _, c, _ in _c_per_photograph(zoomed)]
     if not a.converged or a.undetermined or not any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal):
         return -float("inf")
+    return _log_likelihood(zoomed, _freed_by_varying_c(before, zoomed)[0][0]) - _log_likelihood(before)
+
+
+def _freed_by_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> list[tuple[int, int]]:
+    """Return the further parameters, and the number of image points of a photograph."""
+    a = zoomed.adjustment
     freed = a.unknown_counts[1] - before.adjustment.unknown_counts[1]
-    price = price_of(freed, len(a.rejected) // len(a.network.images))
-    return _log_likelihood(zoomed, freed) - _log_likelihood(before) - price
+    return [(freed, len(a.rejected) // len(a.network.images))]
 
 
 def _log_likelihood(solved: SolvedSurvey, freed: int = 0) -> float:
@@ -200,10 +211,10 @@ def _c_per_photograph(solved: SolvedSurvey) -> Iterator[tuple[str, list[float], 
             yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]
 
 
-FREE_OF_RIGS = Choice(_models_free_of_rigs, _evidence_of_free_photographs)
+FREE_OF_RIGS = Choice(_models_free_of_rigs, _gain_of_free_photographs, _further_poses)
 CHOICES = (
     Choice(_models_without_copies),
     FREE_OF_RIGS,
     FREE_OF_RIGS,  # others, which those found first concealed
-    Choice(_models_with_varying_c, _evidence_of_varying_c, _report_varying_c),
+    Choice(_models_with_varying_c, _gain_of_varying_c, _freed_by_varying_c, _report_varying_c),
 )

@@ -435,7 +435,7 @@ def _with_better_start(final: _Final) -> Iterator[_Final]:
         yield final
 
 
-def _evidence_of_start(before: _Final, again: _Final) -> float:
+def _gain_of_start(before: _Final, again: _Final) -> float:
     """Return the gain of ln likelihood of all image points; both have the same parameters."""
     if not again.adjustment.converged:
         return -np.inf
@@ -447,7 +447,7 @@ def _report_start(before: _Final, again: _Final) -> _Final:
     return replace(again, remarks=(_remark_on_better_start(before.adjustment, before.others[0]),))
 
 
-BETTER_START = Choice(_with_better_start, _evidence_of_start, _report_start)
+BETTER_START = Choice(_with_better_start, _gain_of_start, report=_report_start)
 
 
 def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:

@@ -41,8 +41,7 @@ from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
-from sfm.judgement.hypotheses.alternatives import ALPHA
-from sfm.likelihood import areas_of_photographs, log_likelihood, price_of
+from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
@@ -133,7 +132,11 @@ def lost_groups(network: Network, estimate: Estimate) -> list[LostGroup]:
 
 
 def try_other_principal_distances(
-    network: Network, estimate: Estimate, found: Orientation | None, orient: Callable[[Estimate], Orientation]
+    network: Network,
+    estimate: Estimate,
+    found: Orientation | None,
+    orient: Callable[[Estimate], Orientation],
+    false_alarm: float,
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
@@ -151,6 +154,7 @@ def try_other_principal_distances(
         estimate: start values.
         found: the orientation with the given principal distance; None if there was none.
         orient: returns the orientation from start values.
+        false_alarm: probability that a right result is called wrong.
 
     Returns:
         The better orientation if the survey adjusts c, else the given one. There are no remarks if no other
@@ -163,7 +167,6 @@ def try_other_principal_distances(
     free = all(camera.free[0] for camera in estimate.cameras)
     single = lost < 2  # a single lost photograph has another cause
     least = _count_oriented(found) + (0 if single else int(MAJORITY_FRACTION * lost) + 1)
-    price = price_of(1, len(seen), math.log(len(C_FACTORS) / ALPHA))
     limit = MISFIT * seen.median_sigma_px
 
     def starts(before: Orientation | None) -> list[Estimate]:
@@ -172,11 +175,10 @@ def try_other_principal_distances(
         misfit = before is not None and free and before.rms_px > limit
         return [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
 
-    def evidence(before: Orientation | None, after: Orientation | None) -> float:
+    def gain(before: Orientation | None, after: Orientation | None) -> float:
         if _count_oriented(after) < least:
             return -math.inf
-        gain = _likelihood(network, estimate.cameras, after) - _likelihood(network, estimate.cameras, before)
-        return gain - price
+        return _likelihood(network, estimate.cameras, after) - _likelihood(network, estimate.cameras, before)
 
     def all_fits(after: Orientation | None) -> bool:
         return (
@@ -185,7 +187,8 @@ def try_other_principal_distances(
             and after.rms_px <= MISFIT * seen.median_sigma_px
         )
 
-    best = choose(found, (Choice(starts, evidence, suffices=all_fits),), orient)
+    row = Choice(starts, gain, lambda _, __: [(1, len(seen))], suffices=all_fits)
+    best = choose(found, (row,), orient, false_alarm=false_alarm)
     if best is None or best is found:
         return found, ()
     taken = _with_original_freedom(best, estimate) if free else found

@@ -211,7 +211,6 @@ def _photograph_camera(
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
     shared = _adjust_alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
-    search = float(np.log(len(SCALES) * len(FREED_ROLES) * len(network.images) / ALPHA))
 
     def freed_parameters(_: _Fit) -> Iterator[BoolArray]:
         for roles in FREED_ROLES:
@@ -224,17 +223,22 @@ def _photograph_camera(
     def adjust_freed(freed: BoolArray) -> _Fit:
         return _Fit(_adjust_alone(alone, start, points, freed), freed)
 
-    def evidence(before: _Fit, after: _Fit) -> float:
+    def gain(before: _Fit, after: _Fit) -> float:
         found = after.adjustment
         if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
             return -np.inf
         if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             return -np.inf  # not a picture of these points: their names may be wrong
         sigma = max(sigma_px, found.sigma0_px)
-        gain = _likelihood(found, camera, n, sigma) - _likelihood(before.adjustment, camera, n, sigma)
-        return gain - price_of(int(after.freed.sum()), n, search)
+        return _likelihood(found, camera, n, sigma) - _likelihood(before.adjustment, camera, n, sigma)
 
-    best = choose(_Fit(shared, nothing), (Choice(freed_parameters, evidence),), adjust_freed)
+    row = Choice(
+        freed_parameters,
+        gain,
+        lambda _, after: [(int(after.freed.sum()), n)],
+        behind=len(SCALES) * len(network.images),
+    )
+    best = choose(_Fit(shared, nothing), (row,), adjust_freed)
     if best.adjustment is None or not best.freed.any():
         return None
     found, freed = best.adjustment, best.freed

@@ -1,7 +1,7 @@
 """The distortion model of the cameras that photographed a plate: central perspective or fisheye.
 
 The photographs that the plate was searched in are measured and oriented as in a survey that states no model,
-so the same likelihood decides here and there, see `orient_with_models`. The survey finds them measured.
+so the same likelihood decides here and there, see `orient_survey`. The survey finds them measured.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.survey import survey_of_file
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.orientation import orient_with_models
+from sfm.survey.orientation import orient_survey
 from sfm.survey.target_network import measure_targets
 
 MAX_OF_CAMERA = 8  # photographs of a camera, spread over the folder
@@ -53,13 +53,13 @@ def with_lens_models(
     files = PhotographList(tuple(names), tuple(folder / name for name in names), np.array(owner), folder)
     try:
         measured = measure_targets(survey, files, store=store, progress=progress)
-        found = orient_with_models(survey, measured).orientation
+        oriented = orient_survey(survey, measured)
     except (GeometryError, PhotographError):  # the survey states the reason
         return cameras
     taken = {
         name: f"likelier: {one.number('fitting'):.0f} of {one.number('total'):.0f} image points fit it, "
         f"{one.number('before'):.0f} a central perspective"
-        for one in of_kind(found.remarks, "fisheye_taken")
+        for one in of_kind(oriented.measured.remarks, "fisheye_taken")
         for name in one.names("camera")
     }
     return tuple(replace(camera, fisheye=taken.get(camera.name, camera.fisheye)) for camera in cameras)

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
-from sfm.distributions import LEVEL, f_sf
+from sfm.distributions import LEVEL, f_sf, share_of
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
 
@@ -49,6 +49,7 @@ def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
     place = np.hstack(
         [estimate.position / max(float(np.median(distance)), 1e-300), estimate.rotation.reshape(-1, 9)]
     )
+    level = share_of(LEVEL, adjustment.false_alarm)
     pairs = sorted(cKDTree(place).query_pairs(SAME_PLACE))
     of_image = rows_of(seen.image, len(network.images))
     copies: dict[str, tuple[str, float]] = {}
@@ -57,7 +58,7 @@ def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
         if names[0] in copies or names[1] in copies:
             continue
         rho, p = _correlation(adjustment, of_image[i], of_image[j])
-        if rho > MIN_CORRELATION and p < LEVEL / len(pairs):
+        if rho > MIN_CORRELATION and p < level / len(pairs):
             copies[names[1]] = names[0], rho
     return copies
 
