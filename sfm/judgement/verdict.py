@@ -325,6 +325,14 @@ def consistency_remarks(found: Consistency, rejected: int, *, named: bool = True
             remark("points_tested", tested=found.tested, **large),
             remark("doubtful_tested", tested=rejected, **of_rejected),
         ]
+    if found.parts:
+        remarks.append(remark("parts_tested", parts=found.parts, different=int(found.change is not None)))
+    if found.change is not None:
+        change = found.change
+        differing = {"first": change.first, "next": change.next, "count": change.points}
+        remarks += unless_note(
+            remark("photographs_differ", times=change.times, shift=change.shift, **differing)
+        )
     if named and doubtful:
         remarks.append(remark("points_doubtful", points=doubtful))
     if named and found.outlying:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 # sigma_px is a rough guess, so the global test alone says little. A ratio of 2 deserves a warning. A ratio of
@@ -213,6 +215,16 @@ ROWS = (
         short="points that moved",
     ),
     Kind(
+        "photographs_differ",
+        Grade("shift", warning=EXPECTED_SIGMAS),
+        "Up to {first} and from {next} on, the photographs give different points: {count:point} "
+        "{count:differs|differ} by {times} times their standard deviations (RMS). Coordinates shift by up to "
+        "{shift} standard deviations.",
+        "part of the object or the camera changed between the two",
+        "Adjust the two parts as two surveys and compare them with epochs; use one of them if they differ.",
+        short="photographs that give different points",
+    ),
+    Kind(
         "windows_elsewhere",
         Grade("shift", warning=EXPECTED_SIGMAS),  # of these points alone
         "From {from} on, the windows of {points:point} show a different spot, up to {distance} away, "
@@ -244,4 +256,9 @@ ROWS = (
         "they were confused when the photographs were measured",
         "Swap the two in these photographs.",
     ),
+)
+# Each of them makes photographs give different points, of which no cause is known.
+ROWS = tuple(
+    replace(row, explains=(*row.explains, "photographs_differ")) if row.name != "photographs_differ" else row
+    for row in ROWS
 )

@@ -28,6 +28,12 @@ ROWS = (
         "{larger:point} with larger ones than chance allows[[: {points}]]",
     ),
     Tested(
+        "parts_tested",
+        "points from the first photographs and from the others",
+        "{parts:division}",
+        "{different:division} with other points than chance allows",
+    ),
+    Tested(
         "rays_tested",
         "rejected rays of each point",
         "{tested:ray}",
