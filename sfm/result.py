@@ -37,6 +37,16 @@ class FailedImage:
         """Whether it is a copy of another photograph, which is used instead."""
         return self.reason.kind == "copies"
 
+    @property
+    def is_unreadable(self) -> bool:
+        """Whether the file cannot be read, so that it may be no photograph."""
+        return self.reason.kind == "photographs_unreadable"
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether it counts as a photograph: copies and files that cannot be read do not."""
+        return not (self.is_copy or self.is_unreadable)
+
 
 @dataclass(frozen=True)
 class LeftOutPoint:
@@ -154,7 +164,7 @@ class SurveyResult:
 
     survey: str  # name of the survey
     unit: str  # object unit
-    images_total: int  # photographs that the survey names
+    images_total: int  # photographs that the survey names, without copies and files that cannot be read
     failed: tuple[FailedImage, ...]  # photographs that could not be read or oriented, with the reason
     adjustment: Adjustment  # adjustment in the datum and with the control that the survey specifies
     code: IntArray  # code number of each point of adjustment.network, -1 = uncoded, (n,)

@@ -115,13 +115,13 @@ def solve_likeliest(
     Raises:
         GeometryError: no model has a solution; the reason is that of the usual one.
     """
-    present: Solution | None = None
-    failure = GeometryError("no model has a solution")
     try:
-        present = solve(usual)
-    except GeometryError as error:
-        failure = error
-    present = choose(present, choices, solve, false_alarm=false_alarm)
-    if present is None:
-        raise failure
-    return present
+        present: Solution | None = solve(usual)
+    except GeometryError:
+        present = choose(None, choices, solve, false_alarm=false_alarm)
+        if present is None:
+            raise
+        return present
+    chosen = choose(present, choices, solve, false_alarm=false_alarm)
+    assert chosen is not None
+    return chosen

@@ -49,7 +49,6 @@ from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.result import SurveyResult
 
 MM = 1e-3  # m
-UNREADABLE = "photographs_unreadable"
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}
 # Below this redundancy number, the rest of a value's error is smaller than rounding and the neglected second
 # order of other errors, and w magnifies those.
@@ -188,15 +187,15 @@ def convergence_remarks(a: Adjustment) -> tuple[Remark, ...]:
 def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on photographs that are not in the result, on unreadable files, and on copies."""
     copies = [one.image for one in result.failed if one.is_copy]
-    unreadable = [one.image for one in result.failed if one.reason.kind == UNREADABLE]
-    total = result.images_total - len(unreadable)  # they may be no photographs
+    unreadable = [one.image for one in result.failed if one.is_unreadable]
+    total = result.images_total
     missing = total - len(result.adjustment.network.images)
     remarks: list[Remark] = []
     if missing:
         remarks.append(remark("photographs_missing", missing=missing, total=total, share=missing / total))
         remarks += _mirrored(result)
     if unreadable:
-        remarks.append(remark(UNREADABLE, photographs=unreadable))
+        remarks.append(remark("photographs_unreadable", photographs=unreadable))
     if copies:
         remarks.append(remark("copies", copies=copies))
     return tuple(remarks)
@@ -329,10 +328,15 @@ def consistency_remarks(found: Consistency, rejected: int, *, named: bool = True
         remarks.append(remark("parts_tested", parts=found.parts, different=int(found.change is not None)))
     if found.change is not None:
         change = found.change
-        differing = {"first": change.first, "next": change.next, "count": change.points}
-        remarks += unless_note(
-            remark("photographs_differ", times=change.times, shift=change.shift, **differing)
+        differ = remark(
+            "photographs_differ",
+            first=change.first,
+            next=change.next,
+            count=change.points,
+            times=change.times,
+            shift=change.shift,
         )
+        remarks += unless_note(differ)
     if named and doubtful:
         remarks.append(remark("points_doubtful", points=doubtful))
     if named and found.outlying:

@@ -127,7 +127,7 @@ def _steps(found: UnfinishedSurvey) -> list[tuple[str, str]]:
     rays = np.bincount(seen.point, minlength=len(network.points))
     measured, shared = (counted(int((rays >= least).sum()), "object point") for least in (1, 2))
     finished = ", ".join(f"{one.stage} ({one.seconds:.1f} s)" for one in found.seconds)
-    lost = {one.image for one in found.failed} - set(network.images)
+    lost = {one.image for one in found.failed if one.is_counted} - set(network.images)
     photographs = f"{found.images_total - len(lost)} of {found.images_total} measured"
     rows = [
         ("Stopped in", found.stage),

@@ -57,7 +57,7 @@ def assemble_result(
     result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
-        images_total=len(measured.images) - sum(one.is_copy for one in failed),
+        images_total=len(measured.images) - sum(not one.is_counted for one in failed),
         failed=failed,
         adjustment=adjustment,
         code=code,

@@ -43,8 +43,8 @@ class UnfinishedSurvey:
 
     @property
     def images_total(self) -> int:
-        """Number of photographs of the survey, without copies."""
-        return len(self.images) - sum(one.is_copy for one in self.failed)
+        """Number of photographs of the survey, without copies and files that cannot be read."""
+        return len(self.images) - sum(not one.is_counted for one in self.failed)
 
     @property
     def steps(self) -> tuple[str, ...]:

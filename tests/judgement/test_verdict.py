@@ -91,7 +91,7 @@ def test_files_that_cannot_be_read_are_no_missing_photographs(
     reason = remark("photographs_unreadable", reason="not a photograph")
     failed = tuple(FailedImage(f"{k}.jpg", reason) for k in range(unreadable))
     adjustment = sfm.adjust(*made)
-    result = SurveyResult("s", "m", 6 + unreadable, failed, adjustment, np.full(30, -1), None)
+    result = SurveyResult("s", "m", 6, failed, adjustment, np.full(30, -1), None)
     verdict = judge_survey(result).verdict
     kinds = kinds_of(verdict.remarks)
     assert verdict.level == level and "photographs_missing" not in kinds

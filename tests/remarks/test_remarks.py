@@ -152,6 +152,7 @@ LIMITS: dict[
     "principal_point_far": ("share", 0.1, None),
     "pixels_distorted": ("share", 0.01, 0.05),
     "windows_elsewhere": ("shift", 3.0, None),
+    "photographs_differ": ("shift", 3.0, None),
     "windows_disagree": ("share", 0.3, 0.6),
     "second_motion": ("share", 0.01, 0.05),
     "key_points_not_measured": ("missing", 0.5, None),

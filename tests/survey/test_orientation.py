@@ -95,6 +95,7 @@ def test_unreadable_files_are_named_once_with_their_reason(
         assert [f.image for f in result.failed] == ["photo 1.png", "photo 2.png"]
         assert result.failed[0].reason.names("reason") == ("the file is empty",)
         assert result.failed[1].reason.names("reason")[0].startswith("the file is truncated")
+        assert result.images_total == 4 and "4 of 4 photographs oriented" in result.verdict.headline
     for number in (3, 4, 5):
         (folder / f"photo {number}.png").write_bytes(b"")
     with pytest.raises(GeometryError, match=r": 1 readable .*photo 1.png: Not readable: the file is empty"):

@@ -292,8 +292,10 @@ class PointNormals:
         N, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(N, point, self.N[rows])
         np.add.at(b, point, self.b[rows])
-        Q = np.linalg.pinv(N, hermitian=True)
-        return -np.einsum("nij,nj->ni", Q, b), Q, np.bincount(point, minlength=count)
+        Q: FloatArray = np.asarray(np.linalg.pinv(N, hermitian=True), dtype=float)
+        shift: FloatArray = -np.einsum("nij,nj->ni", Q, b)
+        rays: IntArray = np.bincount(point, minlength=count)
+        return shift, Q, rays
 
     def step(self, rows: IntArray) -> FloatArray:
         """Return the shift of the point when fitted to these image points alone, (3,)."""

@@ -121,7 +121,8 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
         found = replace(found, causes=(remark_of(final, cause, unit),))
     few = () if cause is not None else _calibrated_from_few(final)
     unchecked = (one for one in found.unchecked if one.kind not in OF_FREE_POINTS)
-    return replace(found, unchecked=(*few, *unchecked))
+    tested = remark("assumptions_tested", photographs=photographs, causes=len(found.causes))
+    return replace(found, unchecked=(tested, *few, *unchecked))
 
 
 def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:

@@ -112,7 +112,7 @@ SHIFTED = "{of:@} shift by up to {shift} standard deviations[[, {rms} RMS]]."
 INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
 # Kinds that follow if a camera that changed, or a plate that slipped, bends the network.
 OF_GIVEN = ("given_contradicted", "given_strained", "plate_sizes_contradict", "shape_of_control")
-ROWS = (
+ROWS: tuple[Kind, ...] = (
     Kind(
         "other_camera",
         SHIFT,
@@ -209,7 +209,7 @@ ROWS = (
         "points_moved",
         SHIFT,  # not the RMS of all points, which a few points hardly change
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
-        f"{INSTEAD}",
+        f"[[ {{left_out:point}} {{left_out:is|are}} not in the result.]]{INSTEAD}",
         "targets or parts of the object moved during the survey",
         "Adjust the two states as two surveys, or remove {points:this point|these points}.",
         short="points that moved",

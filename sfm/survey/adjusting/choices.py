@@ -2,7 +2,8 @@
 
 Copies of photographs are left out, as they are no second observation. Photographs of a rig that lose their
 points, while others of their moment fit, are adjusted free of the rig. If texture shows that photographs were
-zoomed, c is adjusted per photograph.
+zoomed, c is adjusted per photograph. Points that moved so far that their coordinates are wrong have no single
+position: they are left out, and the rest is judged without them.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.network import Mounts
-from sfm.remarks.remark import of_kind, remark
+from sfm.remarks.remark import Quantity, Remark, of_kind, remark
 from sfm.runtime.progress import report_step
 from sfm.survey.adjusting.solution import (
     SolvedSurvey,
@@ -143,6 +144,44 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     )
 
 
+def _models_without_moved_points(found: SolvedSurvey) -> Iterator[SurveyModel]:
+    """Yield the model without the points that moved, if most points did not and outliers are rejected."""
+    model, moved = found.model, _moved_points(found)
+    reasons = tuple((name, named) for named in moved for name in named.names("points"))
+    points, estimate = found.adjustment.network.points, model.matched.estimate
+    if reasons and 2 * len(reasons) < len(points) and model.survey.reject != "none":
+        report_step("adjusting without the points that moved")
+        gone = np.isin(model.matched.network.points, [name for name, _ in reasons])
+        estimate = replace(estimate, points=np.where(gone[:, None], np.nan, estimate.points))
+        failures = (*model.matched.point_failures, *reasons)
+        yield replace(model, matched=replace(model.matched, estimate=estimate, point_failures=failures))
+
+
+def _moved_points(found: SolvedSurvey) -> list[Remark]:
+    """Return the remarks on points that moved so far that the result is wrong."""
+    return [named for named in of_kind(found.remarks, "points_moved") if named.severity == "error"]
+
+
+def _gain_without_moved_points(_: SolvedSurvey, after: SolvedSurvey) -> float:
+    """Return whether the rest fits; a test has decided before that the points moved."""
+    determined = after.adjustment.converged and not after.adjustment.undetermined
+    fits = determined and not any(named.severity == "error" for named in after.remarks)
+    return float("inf") if fits else -float("inf")
+
+
+def _report_moved_points(before: SolvedSurvey, after: SolvedSurvey) -> SolvedSurvey:
+    """Return the solution with the remarks on the points that moved, which bend it no longer."""
+    moved = (
+        replace(
+            named,
+            subjects={**named.subjects, "left_out": named.names("points")},
+            numbers={**named.numbers, "wrong": Quantity(0.0)},
+        )
+        for named in _moved_points(before)
+    )
+    return replace(after, remarks=(*after.remarks, *moved))
+
+
 def _gain_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return the gain of ln likelihood."""
     if not after.adjustment.converged or after.adjustment.undetermined:
@@ -216,5 +255,6 @@ CHOICES = (
     Choice(_models_without_copies),
     FREE_OF_RIGS,
     FREE_OF_RIGS,  # others, which those found first concealed
+    Choice(_models_without_moved_points, _gain_without_moved_points, report=_report_moved_points),
     Choice(_models_with_varying_c, _gain_of_varying_c, _freed_by_varying_c, _report_varying_c),
 )

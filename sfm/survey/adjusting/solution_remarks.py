@@ -224,7 +224,11 @@ def remarks_on_left_out(
     if left_out and not named:
         return (remark("points_left_out", points=len(left_out), measured=measured),)
     groups = {
-        "points_contradicted": [one.point for one in left_out if one.reason.severity != "note"],
+        "points_contradicted": [
+            one.point
+            for one in left_out
+            if one.reason.severity != "note" and one.reason.kind != "points_moved"  # that remark names them
+        ],
         "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
     }
     return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)

@@ -1,0 +1,86 @@
+"""Points that moved between photographs: named and left out, or seen in two parts of the photographs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.camera import project
+from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.network import Estimate, Network
+from sfm.remarks.remark import of_kind
+from sfm.result import SurveyResult
+from sfm.similarity import fit_similarity
+from tests.surveys import survey_of
+from tests.synthetic import make_network, seed_of
+
+NOISE_PX = 0.05
+
+
+def moved_from(network: Network, truth: Estimate, first: int, points: FloatArray) -> Network:
+    """Return the network with the points at other places from a photograph on."""
+    seen = network.image_points
+    xy = seen.xy.copy()
+    for i in range(first, len(network.images)):
+        rows, camera = seen.image == i, truth.cameras[network.camera[i]]
+        pose = truth.position[i], truth.rotation[i]
+        before, after = (project(camera, *pose, X[seen.point[rows]]) for X in (truth.points, points))
+        xy[rows] += after - before
+    return replace(network, image_points=replace(seen, xy=xy))
+
+
+def turned(X: FloatArray, part: BoolArray, by: float, rng: np.random.Generator) -> FloatArray:
+    """Return points of which a part is turned about its middle, the farthest one by this distance."""
+    axis, middle = rng.standard_normal(3), X[part].mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    away = X[part] - middle
+    angle = by / np.linalg.norm(np.cross(away, axis), axis=1).max()
+    moved = X.copy()
+    moved[part] = middle + away @ rotation_from_vector(axis * angle).T
+    return moved
+
+
+def run(network: Network, truth: Estimate, **settings: object) -> SurveyResult:
+    return sfm.run_survey(survey_of(network, truth, **settings))
+
+
+@pytest.mark.parametrize(
+    ("images", "by", "level"), [(12, 0.7e-3, "fair"), (20, 0.7e-3, "fair"), (12, 0.0, "good")]
+)
+def test_half_of_the_points_turned_between_halves_of_the_photographs(
+    images: int, by: float, level: str
+) -> None:
+    """By 0.7 mm of 1 m: the points settle between the two states, and no residual is large."""
+    rng = seed_of(f"half turned {images}")
+    network, truth = make_network(rng, images=images, points=60, noise_px=NOISE_PX)
+    X = turned(truth.points, rng.random(60) < 0.5, by, rng)
+    result = run(moved_from(network, truth, images // 2, X), truth)
+    assert result.verdict.level == level
+    found = of_kind(result.verdict.remarks, "photographs_differ")
+    assert len(found) == (by > 0)
+    for one in found:
+        assert one.names("next") == (network.images[images // 2],) and 1.2 < one.number("times") < 4
+    (tested,) = of_kind(result.verdict.tests, "parts_tested")
+    assert tested.number("parts") == min(images - 3, 15) and tested.number("different") == (by > 0)
+
+
+@pytest.mark.parametrize(("by", "left_out"), [(4e-4, True), (0.0, False)])
+def test_points_that_moved_far_are_left_out_and_the_rest_is_right(by: float, left_out: bool) -> None:
+    rng = seed_of("three points moved")
+    network, truth = make_network(rng, images=12, points=50, noise_px=NOISE_PX, free=("c",))
+    X = truth.points.copy()
+    X[:3] += by * np.array([1.0, -1.0, 0.5])
+    result = run(moved_from(network, truth, 6, X), truth, adjust={"reject": "tau"})
+    a = result.adjustment
+    found = of_kind(result.verdict.remarks, "points_moved")
+    assert [one.names("points") for one in found] == [("1", "2", "3")] * left_out
+    assert all(one.severity == "warning" for one in found)
+    assert set(network.points) - set(a.network.points) == (set("123") if left_out else set())
+    assert result.verdict.level == ("fair" if left_out else "good")
+    true = truth.points[[network.points.index(name) for name in a.network.points]]
+    error = fit_similarity(true, a.estimate.points).apply(true) - a.estimate.points
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    assert np.abs(error / sigma).max() < 5
