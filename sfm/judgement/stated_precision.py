@@ -3,9 +3,11 @@
 Sigma0 shows whether all stated standard deviations are too small. If only those of some image points are,
 these points get too much weight, and their errors spread to the others. Classes of image points with equal
 stated standard deviations are compared by the medians of their squared standardised residuals, which gross
-errors hardly change. Rejection makes the ratio smaller than the factor by which they are too small. In 30
-networks of 8 photographs with factors of 1 to 10, it exceeded 2 in 18. Of these, 13 had a coordinate that was
-off by more than 5 standard deviations, of the others one.
+errors hardly change. Rejection makes the ratio smaller than the factor by which they are too small.
+
+The result is wrong where right image points were rejected for those. In 60 networks of 8 photographs with
+factors of 1.5 to 10, the ratio was at least 2 in 42. In 29 of these 5 % of the image points or more were
+rejected, and 28 had a coordinate that was off by more than 5 standard deviations; of the other 13, none.
 
 Source: Huber (1981), Robust Statistics, sec. 5.1 (the median as an estimate of scale, and its variance).
 """
@@ -53,6 +55,7 @@ def stated_precision_remarks(a: Adjustment) -> tuple[Remark, ...]:
             points=[a.network.points[j] for j in np.unique(seen.point[rows])],
             stated=(float(np.median(stated[rows])), "px"),
             factor=factor,
+            rejected=float(np.mean(a.rejected)),
         ),
     )
 

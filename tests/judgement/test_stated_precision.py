@@ -11,6 +11,8 @@ import sfm
 from sfm.adjustment.datum import Datum
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
+from sfm.similarity import fit_similarity
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
@@ -40,6 +42,20 @@ def test_points_stated_too_precise_are_named(factor: float, severity: tuple[str,
         assert said.severity in severity and set(said.names("points")) == set(network.points[:12])
         assert 1.5 < said.number("factor") < 1.5 * factor
         assert said.number("stated") == pytest.approx(0.1 / factor)
+
+
+@pytest.mark.parametrize(("factor", "points", "severity"), [(8.5, 12, "error"), (4.0, 16, "warning")])
+def test_they_are_an_error_if_others_were_rejected_for_them(
+    factor: float, points: int, severity: str
+) -> None:
+    """Half of the points too precise leave the others too few to contradict, and no coordinate is wrong."""
+    network, truth = stated(f"half {factor}", factor, points=points)
+    a = sfm.adjust(network, truth, datum=Datum("free"), reject="tau")
+    (said,) = of_kind(a.verdict.remarks, "image_sigmas")
+    assert said.severity == severity and said.number("factor") > 2
+    error = fit_similarity(truth.points, a.estimate.points).apply(truth.points) - a.estimate.points
+    worst = np.abs(error / np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))).max()
+    assert (worst > 5) == (severity == "error")
 
 
 @pytest.mark.parametrize("gross", [0.0, 0.05])

@@ -25,7 +25,7 @@ OTHER_PROGRAMS = (
         "warning",
         "The comparison with {what:@} failed: {reason}.",
         "the other program refused the network or the photographs",
-        "The survey is valid without it.",
+        "Correct what the reason names, or leave the comparison out of [compare]. The result is the same.",
     ),
 )
 REFINING = (

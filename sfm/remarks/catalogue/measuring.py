@@ -48,7 +48,8 @@ POINTS = (
     ),
     Kind(
         "image_sigmas",
-        Grade("factor", warning=0.0, error=2.0),  # see `sfm.judgement.stated_precision`
+        # see `sfm.judgement.stated_precision`
+        Grade("factor", warning=0.0, error=2.0, at_most=Grade("rejected", warning=0.0, error=0.05)),
         "Beside the others, {count:image point} of {points:point} {count:scatters|scatter} at least {factor} "
         "times as much as stated ({stated}): {points}.",
         "standard deviations that are those of the software alone, or in another unit",
@@ -219,7 +220,7 @@ ROWS = (
         "note",
         "Depends on the datum of a free network.",
         "nothing fixes position and attitude",
-        "Use control or an alignment.",
+        "Add control to the survey, or an alignment to the features file; lengths do not depend on it.",
     ),
     Kind(
         "lengths_lacking",

@@ -33,7 +33,7 @@ BATCHES = (
         "note",
         "Network {network}: Kolinear and {program} end at the same optimum.",
         "both adjusters are right",
-        "Nothing needs to be done.",
+        "Compare larger networks, or networks with errors, to test more than this.",
         short="same optimum",
     ),
     Kind(

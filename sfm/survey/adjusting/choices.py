@@ -18,6 +18,7 @@ from sfm.camera import base_name
 from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.alternatives import ALPHA
+from sfm.judgement.verdict import judge_adjustment
 from sfm.network import Mounts
 from sfm.remarks.remark import Quantity, Remark, of_kind, remark
 from sfm.runtime.progress import report_step
@@ -164,8 +165,8 @@ def _moved_points(found: SolvedSurvey) -> list[Remark]:
 
 def _gain_without_moved_points(_: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return whether the rest fits; a test has decided before that the points moved."""
-    determined = after.adjustment.converged and not after.adjustment.undetermined
-    fits = determined and not any(named.severity == "error" for named in after.remarks)
+    fits = judge_adjustment(after.adjustment).verdict.level != "bad"
+    fits &= not any(named.severity == "error" for named in after.remarks)
     return float("inf") if fits else -float("inf")
 
 
