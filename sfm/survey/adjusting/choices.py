@@ -165,7 +165,8 @@ def _moved_points(found: SolvedSurvey) -> list[Remark]:
 
 def _gain_without_moved_points(_: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return whether the rest fits; a test has decided before that the points moved."""
-    fits = judge_adjustment(after.adjustment).verdict.level != "bad"
+    verdict = judge_adjustment(after.adjustment).verdict
+    fits = verdict is not None and verdict.level != "bad"
     fits &= not any(named.severity == "error" for named in after.remarks)
     return float("inf") if fits else -float("inf")
 
