@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
+from functools import cached_property
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -37,6 +38,7 @@ __all__ = [
     "Network",
     "ObjectPoints",
     "ScaleBars",
+    "Source",
     "empty_estimate",
     "index_of",
     "rows_of",
@@ -46,6 +48,16 @@ __all__ = [
 
 MAX_NAMES = 10  # most names listed in a message
 MAX_PAIRS_AT_ONCE = 4_000_000  # pairs of photographs compared in one sparse product
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where image points come from, and what the adjustment must know of them."""
+
+    name: str
+    names_last: bool = True  # whether its points keep their names in later runs
+    fewest: int = 4  # image points of a photograph: three determine it, the fourth checks
+    is_exact: bool = False  # whether they were handed over as they are
 
 
 @dataclass(frozen=True)
@@ -59,14 +71,21 @@ class ImagePoints:
     # which covariances were stated with the image points, rather than set by default when they were read; all
     # if None, (k,)
     stated: BoolArray | None = None
+    source: IntArray | None = None  # index into the sources of the network; the first if None, (k,)
 
     def __len__(self) -> int:
         return len(self.image)
 
     def select(self, mask: BoolArray | IntArray) -> ImagePoints:
         """Return the image points that a mask or an array of indices selects."""
-        stated = None if self.stated is None else self.stated[mask]
-        return ImagePoints(self.image[mask], self.point[mask], self.xy[mask], self.covariance[mask], stated)
+        return ImagePoints(
+            self.image[mask],
+            self.point[mask],
+            self.xy[mask],
+            self.covariance[mask],
+            None if self.stated is None else self.stated[mask],
+            None if self.source is None else self.source[mask],
+        )
 
     @property
     def median_sigma_px(self) -> float:
@@ -117,6 +136,21 @@ class Network:
     # number of the moment of each photograph, 0, 1, ...; cameras of one rig share a pose at one moment; if
     # None, each photograph has its own, (m,)
     moment: IntArray | None = None
+    sources: tuple[Source, ...] = (Source("image points"),)  # of the image points
+
+    @property
+    def source(self) -> IntArray:
+        """Index of the source of each image point, (k,)."""
+        source = self.image_points.source
+        return np.zeros(len(self.image_points), dtype=np.int64) if source is None else source
+
+    @cached_property
+    def named(self) -> BoolArray:
+        """Which points keep their names in later runs, (n,)."""
+        lasting = np.array([source.names_last for source in self.sources])[self.source]
+        named = np.full(len(self.points), all(source.names_last for source in self.sources))
+        named[self.image_points.point[lasting]] = True
+        return named
 
     @property
     def kinds(self) -> tuple[Kind, ...]:

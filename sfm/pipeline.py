@@ -1,9 +1,9 @@
 """Pipeline: runs a survey from photographs to the result.
 
-    given data, photographs -> targets -> orientation -> correspondences -> adjustment -> comparison -> result
+    given data, photographs -> image points -> orientation -> all image points -> adjustment -> comparison
 
-Every stage is one call, the same for coded targets, natural texture and given image points. The module of a
-stage describes its method and cites the source.
+Every stage is one call, the same for all sources of image points. The module of a stage describes its method
+and cites the source.
 """
 
 from __future__ import annotations
@@ -19,16 +19,21 @@ from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
-from sfm.survey.correspondences import Correspondences, find_correspondences
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif
-from sfm.survey.inputs.measurements import Measurements, find_photographs, refuse_incomplete_cameras
-from sfm.survey.inputs.start import measurements_from_observations, refuse_unknown_photographs
+from sfm.survey.inputs.measurements import (
+    NO_PHOTOGRAPHS,
+    Measurements,
+    find_photographs,
+    refuse_incomplete_cameras,
+)
+from sfm.survey.inputs.sources import reads_photographs
+from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import separate_sizes
-from sfm.survey.measuring.tie_points import tie_photographs
 from sfm.survey.orientation import Oriented, orient_survey
-from sfm.survey.target_network import measure_targets
+from sfm.survey.sources.joined import complete_sources, measure_sources
+from sfm.survey.sources.source import Correspondences
 from sfm.survey.unfinished import UnfinishedSurveyError, unfinished_survey
 
 
@@ -63,7 +68,7 @@ def run_survey(
             oriented = orient_survey(survey, measured)
         reached.oriented = oriented
         with clock.stage("matching"):
-            reached.matched = matched = find_correspondences(oriented, jobs=jobs)
+            reached.matched = matched = complete_sources(oriented, jobs=jobs)
         with clock.stage("adjustment"):
             solution = solve_survey(oriented.survey, matched)
         compared = compare_solution(solution, others, clock, files=measured.files)
@@ -84,8 +89,8 @@ def _measure(
     survey: Survey, images_dir: Path | None, jobs: int, store: MeasuredStore | None, clock: StageClock
 ) -> tuple[Survey, Measurements]:
     """Return the survey, with one camera for each size of photographs, and its image points."""
-    if survey.observations is not None:
-        return survey, measurements_from_observations(survey)
+    if not reads_photographs(survey):
+        return survey, measure_sources(survey, NO_PHOTOGRAPHS, jobs=jobs, store=store, clock=clock)
     files = find_photographs(survey, images_dir=images_dir)
     survey, clocks = moments_from_exif(survey, files)
     survey, positions = exterior_from_exif(survey, files)
@@ -94,15 +99,10 @@ def _measure(
     survey = sizes.survey
     if survey.start_cameras is None:
         refuse_incomplete_cameras(survey.cameras, survey.source, sizes.files)
-    if survey.tie_points is not None:
-        with clock.stage("tie points", len(sizes.files)):
-            measured = tie_photographs(survey, sizes.files, jobs=jobs, store=store, progress=clock.progress)
-    else:
-        with clock.stage("targets", len(sizes.files)):
-            measured = measure_targets(survey, sizes.files, jobs=jobs, store=store, progress=clock.progress)
+    measured = measure_sources(survey, sizes.files, jobs=jobs, store=store, clock=clock)
     return survey, replace(
         measured,
-        images=files.names,
+        images=tuple(dict.fromkeys((*files.names, *measured.images))),
         failed=sizes.left_out + measured.failed,
         remarks=clocks + positions + sizes.remarks + measured.remarks,
     )

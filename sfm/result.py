@@ -91,6 +91,23 @@ class PhotographTargets:
     blur: FloatArray | None = None  # standard deviation of their edges, px; NaN where unknown, (k,)
     camera: str = ""  # name of the camera; each camera has photographs of one size
 
+    def with_more(self, other: PhotographTargets) -> PhotographTargets:
+        """Return the overlay with the image points of another source as well."""
+        drawn = (self, other)
+        flags = [np.zeros(len(part.xy), np.int64) if part.flag is None else part.flag for part in drawn]
+        blurs = [np.full(len(part.xy), np.nan) if part.blur is None else part.blur for part in drawn]
+        return replace(
+            self,
+            xy=np.concatenate([self.xy, other.xy]),
+            semi_axes=np.concatenate([self.semi_axes, other.semi_axes]),
+            angle=np.concatenate([self.angle, other.angle]),
+            rejected_xy=np.concatenate([self.rejected_xy, other.rejected_xy]),
+            rejected_flag=np.concatenate([self.rejected_flag, other.rejected_flag]),
+            flag=np.concatenate(flags),
+            stored=self.stored and other.stored,
+            blur=np.concatenate(blurs),
+        )
+
     def reasons(self) -> list[tuple[str, int]]:
         """Return (reason, number of candidates) of this photograph, most frequent first."""
         return [(in_words(name), count) for name, count in count_flags(self.rejected_flag)]
@@ -189,7 +206,6 @@ class SurveyResult:
     orientation_correlations: tuple[OrientationCorrelation, ...] = ()
     seconds: tuple[StageTime, ...] = ()  # computing time of each stage, in order
     settings: tuple[tuple[str, str], ...] = ()  # (table of the survey file, its content)
-    automatic_points: bool = False  # whether all points are of natural texture, which nobody names
     weights: str = "components"  # weighting of image points and other observations: components | stated
     reject: str = "tau"  # how the survey treats gross errors: tau | huber | tukey | none
 

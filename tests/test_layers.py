@@ -57,7 +57,7 @@ STAGES = (  # of a survey, in the order of `sfm.pipeline`
     ("sfm.survey.inputs",),
     ("sfm.survey.measuring", "sfm.survey.target_network"),
     ("sfm.survey.orientation", "sfm.survey.board_turns"),
-    ("sfm.survey.correspondences",),
+    ("sfm.survey.sources.joined", "sfm.survey.sources.target_matching"),
     ("sfm.survey.adjusting",),
     ("sfm.survey.assembly",),
 )

@@ -14,7 +14,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -43,11 +43,11 @@ from sfm.runtime.faults import error_in_words, is_fault
 from sfm.runtime.progress import Silent
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.survey import Survey, read_survey, survey_family
+from sfm.survey.inputs.sources import reads_photographs
+from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import Measured, MeasuredStore
-from sfm.survey.measuring.targets import measure_photograph
-from sfm.survey.measuring.tie_points import natural_points_of
+from sfm.survey.sources.joined import sources_of
 from sfm.survey.unfinished import UnfinishedSurvey, UnfinishedSurveyError
 
 LOCK = ".lock"  # of the batch
@@ -81,12 +81,16 @@ class PhotographNote:
     """Outcome of a photograph, for the log."""
 
     image: str
-    targets: int = 0
-    rejected: int = 0  # candidates
-    features: int = 0  # of natural texture
+    counts: dict[str, int] = field(default_factory=dict)  # of targets, rejected candidates, features
     stored: bool = False  # measured in an earlier run
     seconds: float = 0.0
     failed: str = ""  # why it could not be read
+
+    def entry(self) -> dict[str, Any]:
+        """Return the line of the log."""
+        entry = asdict(self)
+        counts: dict[str, Any] = entry.pop("counts")
+        return entry | counts
 
 
 @dataclass(frozen=True)
@@ -141,13 +145,12 @@ def measure_one(survey: SurveyFile, image: str, path: Path, *, send: Send) -> Me
 
 
 def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
-    """Measure the targets or texture of a photograph as the survey requests, and store them."""
-    if survey.tie_points is not None:
-        natural, stored = natural_points_of(path, survey.tie_points, store)
-        return PhotographNote(image, features=len(natural), stored=stored)
-    family = survey_family(survey.targets, survey.codes)
-    targets, stored = measure_photograph(path, survey.targets, family, store)
-    return PhotographNote(image, len(targets), len(targets.rejected_xy), stored=stored)
+    """Measure a photograph for each source of the survey, and store what is found."""
+    counts, stored = dict[str, int](), True
+    for _, source in sources_of(survey):
+        of_source, was_stored = source.count(survey, path, store)
+        counts, stored = counts | of_source, stored and was_stored
+    return PhotographNote(image, counts, stored=stored)
 
 
 def reconstruct(
@@ -174,7 +177,7 @@ def reconstruct(
     with SurveyLog(live, watch=_Sending(send)) as log, when_compiling(lambda: send({"compiling": True})):
         log.start(name, job.file, inputs=job.inputs)
         for photograph in photographs:
-            log.note("photograph", **asdict(photograph.note))
+            log.note("photograph", **photograph.note.entry())
         before = sum(photograph.note.seconds for photograph in photographs)
         held = {key: found for photograph in photographs for key, found in photograph.held.items()}
         try:
@@ -218,7 +221,7 @@ def fingerprint(survey: SurveyFile) -> str:
         if table.is_file():  # an unreadable table is reported by its reader; a pipe would never end
             with table.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
-    if survey.observations is None:
+    if reads_photographs(survey):
         found = find_photographs(survey)
         for name, path in zip(found.names, found.paths, strict=True):
             status = path.stat() if path.exists() else path.lstat()  # a link that leads nowhere

@@ -42,6 +42,7 @@ from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_l
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
 from sfm.survey.inputs.measurements import find_photographs
+from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
@@ -202,7 +203,7 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     for file in files:
         with suppress(Exception):  # the run reports errors
             survey = read_survey_file(file, allow_outside=allow_outside)
-            calls += len(find_photographs(survey)) if survey.observations is None else 1
+            calls += len(find_photographs(survey)) if reads_photographs(survey) else 1
     return max(1, calls)
 
 
@@ -317,7 +318,7 @@ def _run(
 def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     """Return a survey as work for the engine: a part for each photograph, and the whole."""
     parts: tuple[Call, ...] = ()
-    if survey.observations is None:
+    if reads_photographs(survey):
         given = read_survey(job.file, allow_outside=job.allow_outside)
         found = find_photographs(survey)
         refuse_unknown_photographs(given, found.names)  # before the photographs are measured

@@ -83,7 +83,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *residual_remarks(longest_residual(a)),
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
-        *consistency_remarks(consistency, int(a.rejected.sum()), named=not result.automatic_points),
+        *consistency_remarks(consistency, int(a.rejected.sum()), named=bool(a.network.named.all())),
         *(() if result.photographs else stated_precision_remarks(a)),  # only given image points state theirs
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
@@ -214,7 +214,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
     }
     right, mirrored = len(result.adjustment.network.images), len(single) + sum(map(len, groups))
     decided: dict[str, tuple[str, ...]] = {}
-    unknown = result.automatic_points or any(
+    unknown = not result.adjustment.network.named.all() or any(
         one.kind == "handedness_unchecked" for one in result.stage_remarks
     )
     if not unknown:

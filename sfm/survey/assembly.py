@@ -23,12 +23,13 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
-from sfm.survey.correspondences import Correspondences
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import Oriented
+from sfm.survey.sources.joined import sources_of
+from sfm.survey.sources.source import Correspondences
 from sfm.targets.codes.plates import points_of_plates
 
 Adjuster = Callable[[Network, Estimate], BackendAdjustment]
@@ -45,7 +46,6 @@ def assemble_result(
     """Return the judged result of a survey; each argument is what the stage of that name returned."""
     survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     adjustment, naming = solution.adjustment, matched.naming
-    points = adjustment.network.points
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
     reasons: dict[str, Remark] = {}  # of a photograph placed by its rig: that of its orientation
     for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
@@ -53,7 +53,7 @@ def assemble_result(
             reasons.setdefault(name, reason)
     failed = (*measured.failed, *(FailedImage(*one) for one in reasons.items()))
     correlations = exterior_correlations(adjustment)
-    code = np.full(len(points), -1) if naming is None else naming.codes(adjustment.network)
+    code = naming.codes(adjustment.network)
     result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -70,7 +70,7 @@ def assemble_result(
             *start.remarks,
             *matched.remarks,
             *solution.remarks,
-            *(() if naming is None else plates_not_in_result(survey.family, code)),
+            *plates_not_in_result(survey.family, code),
             *compared.remarks,
         ),
         eccentricity=matched.eccentricity,
@@ -82,7 +82,6 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
         reject=survey.reject,
         weights=survey.adjust.weights,
-        automatic_points=survey.tie_points is not None,
         plates=_plates(survey, code),
         check_points=_check_points(survey),
         equipment=survey.equipment,
@@ -123,27 +122,18 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         survey: the survey that was run.
     """
     sections: list[tuple[str, Section]] = [(f"camera {one.name}", one) for one in survey.cameras]
-    if survey.observations is None:
-        sections.append(("targets", survey.targets))
-        sections += [(f"plate {k}", one) for k, one in enumerate(survey.plates, 2)]
-    if survey.tie_points is not None:
-        sections.append(("tie_points", survey.tie_points))
+    sections += [section for _, source in sources_of(survey) for section in source.settings(survey)]
     sections += [("datum", survey.datum), ("adjust", survey.adjust), ("compare", survey.compare)]
     rows = [(name, _format_values(section.model_dump())) for name, section in sections]
-    given = [
-        (one, len(values.names))
-        for one, values in (
-            ("control points", survey.control),
-            ("photographs of [exterior]", survey.exterior),
-        )
-        if values is not None
-    ]
-    if survey.scale_bars:
-        given.append(("scale bars", len(survey.scale_bars)))
-    if survey.observations is not None:
-        given.append(("image points", len(survey.observations.xy)))
-    if given:
-        rows.append(("given", ", ".join(f"{count} {name}" for name, count in given)))
+    given = (
+        ("control points", survey.control and survey.control.names),
+        ("photographs of [exterior]", survey.exterior and survey.exterior.names),
+        ("scale bars", survey.scale_bars),
+        ("image points", survey.observations and survey.observations.point),
+    )
+    stated = [f"{len(values)} {name}" for name, values in given if values]
+    if stated:
+        rows.append(("given", ", ".join(stated)))
     return tuple(rows)
 
 

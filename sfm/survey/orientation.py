@@ -128,7 +128,7 @@ def _orient_model(model: Model) -> Oriented:
     """Return the orientation of a survey with one model of its lenses, clocks and turns."""
     survey, measured = model
     refuse_too_large(measured.network)
-    if survey.tie_points is not None:
+    if not measured.network.named.all():
         refuse_no_base(measured.network, measured.cameras)
     # left out here: the adjustment judges these first
     network = replace(
@@ -143,7 +143,7 @@ def _orient_model(model: Model) -> Oriented:
         of_pair = {"pair": ("c",)}
         wrong_c = tuple(replace(one, subjects={**one.subjects, **of_pair}) for one in wrong_c)
     found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
-    if survey.tie_points:
+    if not network.named.all():
         moving = find_second_motion(network, found, _orient_strongest)
         found = replace(found, remarks=(*found.remarks, *moving))
     elif not wrong_c:
@@ -155,7 +155,7 @@ def _orient_model(model: Model) -> Oriented:
         estimate = place_on_observations(measured.network, estimate)
     found = replace(found, estimate=estimate)
     return Oriented(
-        survey, measured, explain_lost_photographs(network, found, named=survey.tie_points is None)
+        survey, measured, explain_lost_photographs(network, found, named=bool(network.named.all()))
     )
 
 
@@ -167,11 +167,10 @@ def _orient_with_best_c(
     given = survey.start_orientations is not None or survey.start_points is not None
 
     def orient_from(values: Estimate) -> Orientation:
-        if survey.tie_points:
+        if not network.named.all():
             return _orient_strongest(network, values)
-        return _orient_on_control(
-            network, values, given=survey.observations is not None, judge=_circle_judge(measured)
-        )
+        exact = all(source.is_exact for source in network.sources)
+        return _orient_on_control(network, values, given=exact, judge=_circle_judge(measured))
 
     found, failure = None, None
     try:
@@ -267,7 +266,7 @@ def _hold_cameras_of_two(
 def _circle_judge(measured: Measurements) -> Judge | None:
     """Return a function for the misfit of the outlines as circles; None without circular targets."""
     photographs, naming = measured.photographs, measured.naming
-    if photographs is None or naming is None or naming.corners:
+    if photographs is None or naming.corners:
         return None
 
     def misfit(estimate: Estimate) -> float:

@@ -16,10 +16,10 @@ from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, PhotographTargets, StageTime
 from sfm.runtime.progress import StageClock
 from sfm.survey.assembly import settings_by_table
-from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import Oriented
+from sfm.survey.sources.source import Correspondences
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
 from sfm.network import Estimate, Network, rows_of
 from sfm.report.phrases import describe_neighbours, significant
 from sfm.survey.adjusting.choices import solve_survey
-from sfm.survey.correspondences import Correspondences
-from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.sources import TEXTURE
+from sfm.survey.sources.source import Correspondences
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
@@ -199,7 +199,9 @@ def test_surveys_of_texture_have_common_errors_in_their_covariance(scene: tuple[
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(len(network.points), 3))
     of_targets = solve_survey(survey, matched).adjustment
-    textured = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).adjustment
+    textured = solve_survey(
+        survey, replace(matched, network=replace(matched.network, sources=(TEXTURE,)))
+    ).adjustment
     assert of_targets.error_correlation is None and describe_neighbours(of_targets) == ""
     assert textured.error_correlation is not None
     assert sigma_of_centres(textured) > 1.5 * sigma_of_centres(of_targets)
@@ -287,7 +289,9 @@ def test_given_coordinates_are_judged_with_common_errors(scene: tuple[Network, E
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(len(network.points), 3))
     of_targets, *_ = solve_survey(survey, matched).given_tests
-    textured, *_ = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).given_tests
+    textured, *_ = solve_survey(
+        survey, replace(matched, network=replace(matched.network, sources=(TEXTURE,)))
+    ).given_tests
     assert of_targets.what == textured.what == "control"
     assert of_targets.probability < 0.01 and textured.probability > 0.1
     assert textured.statistic == pytest.approx(textured.dof, rel=0.15)

@@ -486,11 +486,8 @@ def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() 
 def test_survey_file_refuses_contradictions(tmp_path: Path) -> None:
     text = (Path(render.__file__).parent / "survey.toml").read_text(encoding="utf-8")
     survey = tmp_path / "survey.toml"
-    survey.write_text(text.replace('codes = "none"', 'codes = "arcs"'), encoding="utf-8")
-    with pytest.raises(SurveyFileError, match=r"tie_points.*replace targets"):
-        read_survey(survey)
     survey.write_text(text.replace('detector = "foerstner"', "window_px = 14"), encoding="utf-8")
-    with pytest.raises(SurveyFileError, match="window_px = 14, needed an odd number"):
+    with pytest.raises(SurveyFileError, match="window_px: found 14, needed an odd number"):
         read_survey(survey)
     survey.write_text(text.replace('"foerstner"', '"orb"'), encoding="utf-8")
     with pytest.raises(SurveyFileError, match="detector"):
@@ -581,7 +578,7 @@ def test_batch_of_a_survey_without_targets_is_that_survey(
         log = {e["image"]: e for e in read_log(out / "small" / "log.jsonl") if e["event"] == "photograph"}
         assert sorted(log) == ["1.png", "2.png", "3.png", "broken.png", "copy.png"]
         for name, entry in log.items():
-            found = entry["features"] > 0 and entry["stored"] == (stored or name == "copy.png")
+            found = entry.get("features", 0) > 0 and entry["stored"] == (stored or name == "copy.png")
             assert entry["failed"] if name == "broken.png" else found
     assert row.status == "done" and row.photographs == 3 and row.photographs_total == 4
     alone = run_survey(read_survey(survey)).adjustment

@@ -20,7 +20,6 @@ from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity
-from sfm.survey.correspondences import restore_strayed
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.cameras import start_cameras
@@ -28,6 +27,7 @@ from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import FISHEYE, orient_survey
+from sfm.survey.sources.target_matching import restore_strayed
 from tests.findings import findings_of
 from tests.survey.faults import planted
 from tests.survey.texture_scenes import Plane, upright, wall

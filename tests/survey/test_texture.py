@@ -16,9 +16,9 @@ from sfm.similarity import fit_similarity
 from sfm.survey.adjusting import solution
 from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
 from sfm.survey.adjusting.solution import SolvedSurvey
-from sfm.survey.correspondences import Correspondences
-from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.sources import TEXTURE
 from sfm.survey.inputs.survey import CameraSetup, Survey
+from sfm.survey.sources.source import Correspondences
 from tests.survey.texture_scenes import KINDS, NUMBERS, SHARE, WRONG, outcome_of, study, water, write_scene
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
@@ -40,36 +40,40 @@ def noisy() -> tuple[Network, Estimate]:
     return replace(network, image_points=replace(seen, xy=xy)), truth
 
 
-def texture(network: Network, truth: Estimate, reject: str) -> Survey:
-    """Return a survey of texture that rejects gross errors, or does not."""
+def textured(network: Network, truth: Estimate) -> Correspondences:
+    """Return image points of texture."""
+    return Correspondences(replace(network, sources=(TEXTURE,)), truth, np.full(len(network.points), 3))
+
+
+def rejecting(network: Network, truth: Estimate, reject: str) -> Survey:
+    """Return a survey that rejects gross errors, or does not."""
     survey = survey_of(network, truth)
-    settings = survey.adjust.model_copy(update={"reject": reject})
-    return replace(survey, tie_points=TiePointSettings(), adjust=settings)
+    return replace(survey, adjust=survey.adjust.model_copy(update={"reject": reject}))
 
 
 def test_texture_loses_them_and_targets_are_named(noisy: tuple[Network, Estimate]) -> None:
     network, truth = noisy
     names = {network.points[j] for j in SPOILED}
-    survey, matched = texture(network, truth, "tau"), Correspondences(network, truth, np.full(150, 3))
-    of_targets = solve_survey(replace(survey, tie_points=None), matched)
+    survey = rejecting(network, truth, "tau")
+    of_targets = solve_survey(survey, Correspondences(network, truth, np.full(150, 3)))
     assert set(of_targets.adjustment.network.points) == set(network.points)
-    textured = solve_survey(survey, matched)
-    assert set(network.points) - set(textured.adjustment.network.points) == names
-    assert {one.point for one in textured.left_out} == names
+    of_texture = solve_survey(survey, textured(network, truth))
+    assert set(network.points) - set(of_texture.adjustment.network.points) == names
+    assert {one.point for one in of_texture.left_out} == names
 
 
 def test_what_control_names_stays(noisy: tuple[Network, Estimate]) -> None:
     network, truth = noisy
     given = [*SPOILED[:1], 10, 60, 120]
     network = network.with_control([network.points[j] for j in given], truth.points[given], 1.0)
-    found = solve_survey(texture(network, truth, "tau"), Correspondences(network, truth, np.full(150, 3)))
+    found = solve_survey(rejecting(network, truth, "tau"), textured(network, truth))
     left = set(network.points) - set(found.adjustment.network.points)
     assert left == {network.points[j] for j in SPOILED[1:]}
 
 
 def test_a_survey_that_rejects_nothing_loses_nothing(noisy: tuple[Network, Estimate]) -> None:
     network, truth = noisy
-    found = solve_survey(texture(network, truth, "none"), Correspondences(network, truth, np.full(150, 3)))
+    found = solve_survey(rejecting(network, truth, "none"), textured(network, truth))
     assert set(found.adjustment.network.points) == set(network.points)
 
 
@@ -87,10 +91,12 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(POINTS, 2))
     assert of_kind(solve_survey(survey, matched).remarks, "points_moved") == tuple(moved)
-    textured = solve_survey(replace(survey, tie_points=TiePointSettings()), matched).remarks
-    found = of_kind(textured, "windows_elsewhere")
+    of_texture = solve_survey(survey, textured(network, truth)).remarks
+    found = of_kind(of_texture, "windows_elsewhere")
     assert [one.names("points") for one in found] == [("7",), ("17",)]
-    assert [one.severity for one in found] == ["warning", "warning"] and not of_kind(textured, "points_moved")
+    assert [one.severity for one in found] == ["warning", "warning"] and not of_kind(
+        of_texture, "points_moved"
+    )
 
 
 @pytest.mark.parametrize(("left", "stays"), [(9, False), (30, True)])
@@ -105,8 +111,7 @@ def test_a_photograph_needs_more_tie_points_than_it_would_need_targets(left: int
     matched = Correspondences(network, truth, np.full(len(network.points), 3))
     of_targets = solve_survey(survey, matched)
     assert len(of_targets.adjustment.network.images) == 10
-    textured = replace(survey, tie_points=TiePointSettings())
-    found = solve_survey(textured, matched)
+    found = solve_survey(survey, textured(network, truth))
     assert len(found.adjustment.network.images) == (10 if stays else 9)
     told = [("image 10", remark("photograph_with_few_fitting", needed=15))]
     assert list(found.dropped_images) == ([] if stays else told)
@@ -119,8 +124,7 @@ def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
     few = seen.point < 9
     keep = np.where(seen.image == 9, few, ~few | (seen.image < 2))
     network = replace(network, image_points=seen.select(keep))
-    survey = replace(survey_of(network, truth), tie_points=TiePointSettings())
-    found = solve_survey(survey, Correspondences(network, truth, np.full(len(network.points), 3)))
+    found = solve_survey(survey_of(network, truth), textured(network, truth))
     reasons = {(one.reason.kind, one.reason.number("least")) for one in found.left_out}
     assert reasons == {("point_not_determined", 3)}
 
@@ -151,8 +155,9 @@ def solved(change: float, *, textured: bool = True, **settings: object) -> tuple
         name="zoom", images="*", size_px=camera.size_px, pixel_mm=tuple(camera.pixel_mm.tolist()),
         c_mm=camera.value("c"), **settings,
     )  # fmt: skip
-    survey = Survey(name="s", cameras=(setup,), tie_points=TiePointSettings() if textured else None)
+    survey = Survey(name="s", cameras=(setup,))
     start = replace(truth, cameras=(replace(camera, name="zoom"),))
+    network = replace(network, sources=(TEXTURE,)) if textured else network
     found = solve_survey(survey, Correspondences(network, start, np.full(POINTS, 3)))
     centres = found.adjustment.estimate.position
     away = fit_similarity(centres, truth.position).apply(centres) - truth.position

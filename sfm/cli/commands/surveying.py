@@ -240,6 +240,7 @@ def _run_survey(
         from sfm.survey.drafting.draft import SUFFIXES
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
+        from sfm.survey.inputs.sources import reads_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
@@ -252,12 +253,12 @@ def _run_survey(
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=allow_outside)
     if from_photographs is None:
-        from_photographs = described.observations is None
-    if from_photographs and described.observations is not None:
+        from_photographs = reads_photographs(described)
+    if from_photographs and not reads_photographs(described):
         raise KolinearError(
             f"{survey_file}: has [observations] instead of photographs; run kolinear adjust {survey_file}"
         )
-    if not from_photographs and described.observations is None:
+    if not from_photographs and reads_photographs(described):
         raise KolinearError(
             f"{survey_file}: has no [observations]; with photographs, run kolinear run {survey_file}"
         )

@@ -28,9 +28,9 @@ from sfm.survey.adjusting.solution import (
     log_likelihood_of_all,
     solve_model,
 )
-from sfm.survey.correspondences import Correspondences
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.sources.source import Correspondences
 
 POSE = 6  # parameters of the pose of a photograph
 OF_CAMERAS = ("other_camera", "camera_varies", "camera_drift")
@@ -80,7 +80,7 @@ def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
     survey = found.model.survey
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     varying = frozenset(one.name for one in survey.cameras if not one.states_free)
-    if differs and varying and survey.tie_points is not None and not survey.rigs:
+    if differs and varying and not found.adjustment.network.named.all() and not survey.rigs:
         report_step("adjusting c of each photograph")
         yield replace(found.model, varying=varying)
 

@@ -32,7 +32,7 @@ from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
-from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network
+from sfm.reduced_network import merge_estimate, reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.result import ControlCheck, GivenTest, LeftOutPoint
 from sfm.runtime.progress import report_step
@@ -57,7 +57,6 @@ from sfm.survey.adjusting.solution_remarks import (
     unused_image_points,
     windows_elsewhere,
 )
-from sfm.survey.correspondences import Correspondences
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
@@ -65,7 +64,6 @@ from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.tie_points import MIN_TIE_POINTS
 from sfm.survey.placing import (
     MIN_CONTROL,
     hold_fixed,
@@ -78,6 +76,7 @@ from sfm.survey.placing import (
     scale_to_bars,
 )
 from sfm.survey.rigs import hold_mounts, split_blocks
+from sfm.survey.sources.source import Correspondences
 from sfm.targets.codes.plates import points_of_plates
 
 PAIR_TOLERANCE = 10.0  # standard deviations within which image points fit another orientation of a pair
@@ -128,7 +127,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     report_step("adjusting all observations")
     found = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
-    if survey.tie_points is not None:
+    if not whole.named.all():
         report_step("estimating the errors that neighbours have in common")
         final = with_neighbours(final)
     left_out = left_out_points(
@@ -140,7 +139,8 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     )
     known = set(np.array(whole.points, dtype=object)[start.estimate.determined])
     # Natural texture has very many points; only those that had approximate values are worth a line.
-    listed = left_out if survey.tie_points is None else tuple(one for one in left_out if one.point in known)
+    known |= set(np.array(whole.points, dtype=object)[whole.named])
+    listed = tuple(point for point in left_out if point.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     stated = None if model.stated_moment is None else model.stated_moment[settled.images]
     report_step("testing the assumptions")
@@ -157,14 +157,14 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
             *given.remarks,
             *found.remarks,
             *settled.held,
-            *remarks_on_solution(start.task.survey, listed, len(whole.points), final),
+            *remarks_on_solution(start.task.survey, listed, whole, final),
             *posed_by_rigs(final, start.of_its_own[settled.images]),
             *remarks_on_uncalibrated(survey, final.estimate),
-            *handedness_unchecked(survey, checked=given.checks_handedness),
-            *windows_elsewhere(survey, judged.causes),
+            *handedness_unchecked(whole, checked=given.checks_handedness),
+            *windows_elsewhere(whole, judged.causes),
             *judged.unchecked,
             *bump_remarks(final, unit, stated),
-            *windows_elsewhere(survey, explain_rejections(final, unit=unit)),
+            *windows_elsewhere(whole, explain_rejections(final, unit=unit)),
             *remarks_on_held_c(found.c_held, judged.causes),
         ),
         left_out,
@@ -174,10 +174,8 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     )
 
 
-def _points_of_plates(survey: Survey, naming: Naming | None, network: Network) -> tuple[tuple[str, ...], ...]:
+def _points_of_plates(survey: Survey, naming: Naming, network: Network) -> tuple[tuple[str, ...], ...]:
     """Return the names of the points of each plate; empty without plates."""
-    if naming is None:
-        return ()
     plates = points_of_plates(survey.family, naming.codes(network))
     return tuple(tuple(network.points[j] for j in one) for one in plates)
 
@@ -259,8 +257,7 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
-    fewest = MIN_IMAGE_POINTS if survey.tie_points is None else MIN_TIE_POINTS
-    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, fewest)
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, _needed(network))
     of_its_own = least
     if network.moment is not None:  # the other photographs of a moment determine its pose
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
@@ -272,6 +269,15 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         frame,
         (*unused, *chosen.remarks),
     )
+
+
+def _needed(network: Network) -> IntArray:
+    """Return how many image points each photograph needs: those of a source that gives it enough, (m,)."""
+    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
+    for k, source in enumerate(network.sources):
+        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
+        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
+    return needed
 
 
 def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
@@ -319,7 +325,7 @@ def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork |
         return None
     adjustment, network = free.adjustment, start.task.network
     given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
-    if start.task.survey.tie_points is not None and (given_any or network.observations):
+    if not network.named.all() and (given_any or network.observations):
         adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
     return FreeNetwork(adjustment)
 

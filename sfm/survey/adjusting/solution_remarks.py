@@ -35,21 +35,21 @@ MIN_SIDE_DIFFERENCE = (
 
 
 def remarks_on_solution(
-    survey: Survey, left_out: tuple[LeftOutPoint, ...], measured: int, adjustment: Adjustment
+    survey: Survey, left_out: tuple[LeftOutPoint, ...], whole: Network, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
     """Return the remarks on a solution that a person must know beside the numbers.
 
     Args:
         survey: settings of the survey.
         left_out: measured points that are not in the result.
-        measured: number of measured points.
+        whole: network of all measured points.
         adjustment: the final adjustment.
     """
     sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     return (
         *adjustment.remarks,
-        *remarks_on_left_out(left_out, measured, named=survey.tie_points is None),
+        *remarks_on_left_out(left_out, whole),
         *([remark("names_missing", of="datum", names=absent)] if absent else []),
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
@@ -88,25 +88,27 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
     )
 
 
-def windows_elsewhere(survey: Survey, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return the remarks; points of texture did not move, but are seen at other positions."""
-    if survey.tie_points is None:
-        return tuple(remarks)
+    texture = {name for name, named in zip(network.points, network.named, strict=True) if not named}
     return tuple(
-        replace(one, kind="windows_elsewhere") if one.kind == "points_moved" else one for one in remarks
+        replace(said, kind="windows_elsewhere")
+        if said.kind == "points_moved" and texture.issuperset(said.names("points"))
+        else said
+        for said in remarks
     )
 
 
-def handedness_unchecked(survey: Survey, *, checked: bool) -> tuple[Remark, ...]:
+def handedness_unchecked(network: Network, *, checked: bool) -> tuple[Remark, ...]:
     """Return the note that given image points would also fit the mirror image of the object.
 
     The mirror image of an object in mirrored photographs has the same residuals as the object.
 
     Args:
-        survey: settings of the survey.
+        network: knows the sources of its image points.
         checked: whether given values exclude the mirror image.
     """
-    if survey.observations is None or checked:
+    if checked or not all(source.is_exact for source in network.sources):
         return ()
     return (remark("handedness_unchecked"),)
 
@@ -211,27 +213,30 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
-def remarks_on_left_out(
-    left_out: tuple[LeftOutPoint, ...], measured: int, *, named: bool
-) -> tuple[Remark, ...]:
+def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> tuple[Remark, ...]:
     """Return the remarks on points that are not in the result: contradicted, or only not determined.
 
     Args:
         left_out: measured points that are not in the result, with the reason.
-        measured: number of measured points.
-        named: whether a person named the points and can correct them; those of natural texture are a test.
+        whole: network of all measured points. A person can correct those that keep their names; those of
+            natural texture are a test.
     """
-    if left_out and not named:
-        return (remark("points_left_out", points=len(left_out), measured=measured),)
+    texture = {name for name, named in zip(whole.points, whole.named, strict=True) if not named}
+    automatic = [point for point in left_out if point.point in texture]
+    listed = [point for point in left_out if point.point not in texture]
     groups = {
         "points_contradicted": [
-            one.point
-            for one in left_out
-            if one.reason.severity != "note" and one.reason.kind != "points_moved"  # that remark names them
+            point.point
+            for point in listed
+            if point.reason.severity != "note" and point.reason.kind != "points_moved"  # that remark names them
         ],
-        "points_not_determined": [one.point for one in left_out if one.reason.severity == "note"],
+        "points_not_determined": [point.point for point in listed if point.reason.severity == "note"],
     }
-    return tuple(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names)
+    measured = len(whole.points)
+    return (
+        *([remark("points_left_out", points=len(automatic), measured=measured)] if automatic else []),
+        *(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names),
+    )
 
 
 def remarks_on_principal_distances(

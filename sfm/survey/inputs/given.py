@@ -145,6 +145,9 @@ class Observations:
     table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
 
+    def __len__(self) -> int:
+        return len(self.point)
+
     @classmethod
     def from_arrays(
         cls,

@@ -52,6 +52,9 @@ class PhotographList:
         return len(self.names)
 
 
+NO_PHOTOGRAPHS = PhotographList((), (), np.zeros(0, dtype=np.int64), Path())
+
+
 @dataclass(frozen=True)
 class MeasuredPhotographs:
     """The readable photographs of a survey with their targets, and those that could not be read."""
@@ -104,7 +107,10 @@ class Naming:
         """Return the code number or tag of each point of a network, -1 if uncoded, (n,)."""
         per_code = len(CORNERS) if self.corners else 1
         code = dict(zip(self.names, self.code // per_code, strict=True))
-        return np.array([code[name] for name in network.points], dtype=np.int64)
+        return np.array([code.get(name, -1) for name in network.points], dtype=np.int64)
+
+
+NO_NAMES = Naming((), np.zeros(0, dtype=np.int64), ())  # without targets
 
 
 @dataclass(frozen=True)
@@ -119,9 +125,10 @@ class Measurements:
     overlays: tuple[PhotographTargets, ...] = ()  # drawn into each photograph of the report
     files: PhotographList | None = None  # None with observations
     photographs: MeasuredPhotographs | None = None  # with all targets, coded or not; None without targets
-    naming: Naming | None = None  # of these targets
+    naming: Naming = NO_NAMES  # of these targets
     remarks: tuple[Remark, ...] = ()  # on the given and measured values
     left_out: tuple[LeftOutPoint, ...] = ()  # image points that contradict one another
+    parts: tuple[Measurements, ...] = ()  # of each source; empty with one source
 
 
 def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:

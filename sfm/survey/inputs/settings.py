@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
@@ -41,6 +41,12 @@ def _pairs(value: Any) -> Any:
 def _as_list(value: Any) -> Any:
     """Turn a single text into a list."""
     return (value,) if isinstance(value, str) else value
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError(f"found {value}, needed an odd number")
+    return value
 
 
 def _plain(value: str) -> str:
@@ -210,7 +216,7 @@ class TiePointSettings(Section):
     """[tie_points]: natural texture in place of targets."""
 
     detector: Literal["foerstner", "sift"] = "foerstner"  # detector of the interest points
-    window_px: Annotated[int, Field(ge=7, le=101)] = 15  # odd side of the matched windows
+    window_px: Annotated[int, Field(ge=7, le=101), AfterValidator(_odd)] = 15  # odd side of windows
     max_features: Annotated[int, Field(ge=100, le=20_000)] = 2000  # in each photograph, spread over it
     max_points: Annotated[int, Field(ge=100, le=100_000)] = (
         6000  # in each photograph, spread over its texture

@@ -60,6 +60,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
+from sfm.survey.inputs.sources import descriptions, reads_photographs
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table
 from sfm.targets.codes.plates import TargetFamily, code_family, is_table
@@ -137,7 +138,7 @@ class Survey:
         cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
         if not cameras:
             raise SurveyFileError(f"{where}: no cameras, at least one is needed")
-        if self.observations is not None:  # given image points are adjusted with the stated camera
+        if not reads_photographs(self):  # given image points are adjusted with the stated camera
             said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
             cameras = tuple(said)
         datum: object = self.datum
@@ -164,8 +165,9 @@ class Survey:
         if self.exif_sigma_m is not None:
             given = {"exif_sigma_m": self.exif_sigma_m}
             values["exif_sigma_m"] = _section(ExteriorSettings, given, f"{where}: exterior").exif_sigma_m
-        if self.tie_points is not None:
-            values["tie_points"] = _section(TiePointSettings, self.tie_points, f"{where}: tie_points")
+        texture = self.tie_points
+        if texture is not None:
+            values["tie_points"] = _section(TiePointSettings, texture, f"{where}: tie_points")
         for name, value in values.items():
             object.__setattr__(self, name, value)
         self._place_plate(where)
@@ -194,7 +196,13 @@ class Survey:
     @property
     def reject(self) -> str:
         """Treatment of gross errors; the default is "tau", and "none" for given observations."""
-        return self.adjust.reject or ("tau" if self.observations is None else "none")
+        return self.adjust.reject or ("tau" if reads_photographs(self) else "none")
+
+    @property
+    def texture(self) -> TiePointSettings:
+        """Settings of natural texture; those of a survey that states none if it has none."""
+        texture = self.tie_points
+        return TiePointSettings() if texture is None else texture
 
     @property
     def codes(self) -> str:
@@ -225,12 +233,7 @@ class Survey:
     def __repr__(self) -> str:
         count = len(self.cameras)
         what = [counted(count, "camera")]
-        if self.observations is not None:
-            what.append(counted(len(self.observations.xy), "image point"))
-        elif self.tie_points is not None:
-            what.append("tie points of natural texture")
-        else:
-            what.append(f"targets of codes {self.targets.codes}")
+        what += descriptions(self)
         if self.control is not None:
             what.append(counted(len(self.control.names), "control point"))
         if self.rigs:

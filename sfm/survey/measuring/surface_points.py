@@ -84,8 +84,9 @@ def cover_photographs(
         nowhere plane over them, or if no tie point fits the orientation. Points are named t00001, t00002 ...
         in the order in which they are found. Control and scale bars of the survey refer to these names.
     """
-    network, estimate, files, settings = measured.network, start.estimate, measured.files, survey.tie_points
-    if files is None or settings is None:
+    network, estimate, files = measured.network, start.estimate, measured.files
+    settings = survey.texture
+    if files is None:
         return None
     seen = network.image_points
     fits = _fitting_rays(network, estimate)

@@ -41,8 +41,6 @@ NONE = -1  # no photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
 # their errors: errors alone give 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
-# Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
-MIN_TIE_POINTS = 15
 # A photograph with fewer image points is searched for more features. Three photographs of a portal, taken
 # while walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
@@ -53,7 +51,7 @@ MIN_RAYS = 3
 
 def tie_photographs(
     survey: Survey,
-    photographs: PhotographList,
+    files: PhotographList,
     *,
     jobs: int = 1,
     store: MeasuredStore | None = None,
@@ -66,7 +64,7 @@ def tie_photographs(
 
     Args:
         survey: states detector and windows, camera data, and the sigma of an image coordinate.
-        photographs: files of the photographs.
+        files: files of the photographs.
         jobs: number of photographs processed in parallel.
         store: store of features of single photographs; None to detect all features anew.
         progress: receives every photograph.
@@ -76,22 +74,22 @@ def tie_photographs(
         PhotographError: photographs of different sizes have the same camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
-    settings = survey.tie_points or TiePointSettings()
+    settings = survey.texture
     found, failed = each_photograph(
-        photographs,
+        files,
         lambda path: _read(path, settings, store),
         picture=lambda one: one[1],
         jobs=jobs,
         progress=progress,
     )
     read = sorted(found)
-    names = tuple(photographs.names[k] for k in read)
-    camera: IntArray = photographs.camera[read]
+    names = tuple(files.names[k] for k in read)
+    camera: IntArray = files.camera[read]
     metadata = [found[k][0] for k in read]
     cameras = start_cameras(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
-    pictures = PhotographFiles([photographs.paths[k] for k in read])
+    pictures = PhotographFiles([files.paths[k] for k in read])
     natural = [found[k][2] for k in read]
 
     neighbours = (
@@ -117,7 +115,7 @@ def tie_photographs(
     if scarce and "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
         for a in reported("photographs searched for more features", scarce, len(scarce)):
-            natural[a] = natural_points_of(photographs.paths[read[a]], more, store)[0]
+            natural[a] = natural_points_of(files.paths[read[a]], more, store)[0]
         for pair in [pair for pair in matches if not set(pair).isdisjoint(scarce)]:
             del matches[pair]
     if scarce:
@@ -132,16 +130,16 @@ def tie_photographs(
     covariance = tied.covariance + survey.adjust.sigma_px**2 * np.eye(2)
     image_points = ImagePoints(tied.image, tied.point, tied.xy, covariance)
     network = network_of(survey, names, camera, points, image_points)
-    paths = tuple(photographs.paths[k] for k in read)
+    paths = tuple(files.paths[k] for k in read)
     drawn = drawn_windows(network, paths, settings.window_px)
     return Measurements(
         network,
         cameras,
-        photographs.names,
+        files.names,
         needed_rays(network),
         failed,
         tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
-        photographs,
+        files,
         remarks=_remarks_on_pairs(len(matches), neighbours),
     )
 

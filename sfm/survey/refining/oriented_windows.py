@@ -26,12 +26,12 @@ from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import Similarity, fit_similarity
 from sfm.survey.circles import check_circles
-from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.targets import targets_in
 from sfm.survey.placing import MIN_CONTROL, object_scale
 from sfm.survey.refining.windows import MIN_RAYS, Windows, photograph_paths, read_of_size
+from sfm.survey.sources.target_matching import TOLERANCE_FACTOR
 from sfm.survey.target_network import build_network, min_rays, name_coded
 
 PREFIX = "target "  # of the names of targets, since points of the model may have the same numbers
@@ -268,10 +268,9 @@ def measure_model_targets(
             among the targets.
     """
     family = survey.family
-    if family is None or survey.tie_points is not None or survey.observations is not None:
+    if family is None:
         raise SurveyFileError(
-            f"{survey.source}: refine needs a survey of coded targets, [targets] with codes, and neither "
-            "tie points nor observations"
+            f"{survey.source}: refine needs a survey of coded targets, [targets] with codes"
         )
     oriented = np.flatnonzero(estimate.oriented)
     paths = photograph_paths(network, estimate, images_dir)

@@ -33,7 +33,6 @@ from sfm.network import Estimate, Network, without_given
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
-from sfm.survey.correspondences import TOLERANCE_FACTOR
 from sfm.survey.refining.oriented_windows import (
     ModelTargets,
     OrientedKeyPoints,
@@ -58,6 +57,7 @@ from sfm.survey.refining.windows import (
     match_windows,
     outside_masks,
 )
+from sfm.survey.sources.target_matching import TOLERANCE_FACTOR
 
 # Sides of windows that are tried. Larger windows that cover a photograph gain nothing. On a curved surface
 # they measure its mean depth, with the same error in all photographs, and no residual shows it.

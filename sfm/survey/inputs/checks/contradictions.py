@@ -27,6 +27,7 @@ from sfm.survey.inputs.settings import (
     RigSettings,
     TargetSettings,
 )
+from sfm.survey.inputs.sources import declared, reads_photographs
 from sfm.targets.codes.concentric import WIDTHS
 from sfm.targets.codes.plates import FAMILIES, PLATES, TAGGED, is_table
 from sfm.targets.codes.tags import DICTIONARIES
@@ -42,34 +43,25 @@ CALIBRATION_KEYS = {"calibration", "calibration_use"}
 def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     """Raise SurveyFileError if settings of a survey contradict each other."""
     where = survey.source
-    if survey.tie_points is not None:
-        if survey.targets.codes != "none":
-            raise SurveyFileError(
-                f"{where}: [tie_points] replace targets, but codes = '{survey.targets.codes}' asks for "
-                "targets; needed codes = 'none', or no [tie_points]"
-            )
-        if survey.tie_points.window_px % 2 == 0:
-            raise SurveyFileError(
-                f"{where}: tie_points.window_px = {survey.tie_points.window_px}, needed an odd number"
-            )
-        if survey.start_points is not None:
-            raise SurveyFileError(
-                f"{where}: [approximate] points are start values of targets, and tie points differ in every "
-                "run; with [tie_points] give start values of the photographs, [approximate] images"
-            )
+    from_photographs = reads_photographs(survey)
+    if survey.start_points is not None and not any(row.source.names_last for row in declared(survey)):
+        raise SurveyFileError(
+            f"{where}: [approximate] points are start values of targets, and tie points differ in every "
+            "run; with [tie_points] give start values of the photographs, [approximate] images"
+        )
     names = [camera.name for camera in survey.cameras]
     for name in names:
         if names.count(name) > 1:
             raise SurveyFileError(f"{where}: two cameras are named '{name}'")
     for camera in survey.cameras:
         _refuse_contradictions_of_camera(camera, f"{where}: camera {camera.name}")
-        if camera.images is None and (survey.observations is None or len(survey.cameras) > 1):
+        if camera.images is None and (from_photographs or len(survey.cameras) > 1):
             raise SurveyFileError(
                 f"{where}: camera {camera.name}: images is missing, the glob of its photographs is needed"
             )
     _refuse_contradictions_of_rigs(survey.rigs, survey.cameras, where)
     for rig in survey.rigs:
-        if rig.moment == "exif" and survey.observations is not None:
+        if rig.moment == "exif" and not from_photographs:
             raise SurveyFileError(
                 f"{where}: rig {rig.name}: moment = 'exif' needs photographs, [observations] have none; "
                 "name the moments by an expression, 'order' or a table"
@@ -77,7 +69,7 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
     globs = sum(len(camera.images or ()) for camera in survey.cameras)
     if globs > MAX_GLOBS:
         raise SurveyFileError(f"{where}: {globs} globs of photographs, at most {MAX_GLOBS} are searched")
-    if survey.compare.baseline != "none" and survey.observations is not None:
+    if survey.compare.baseline != "none" and not from_photographs:
         raise SurveyFileError(
             f"{where}: compare.baseline = '{survey.compare.baseline}' needs photographs, the survey has "
             "[observations]; leave it out"
@@ -123,7 +115,7 @@ def _refuse_contradicting_exterior(survey: Survey | SurveyFile) -> None:
         raise SurveyFileError(
             f"{survey.source}: [exterior]: file and exif_sigma_m, {found} given, one is needed"
         )
-    if survey.exif_sigma_m is not None and survey.observations is not None:
+    if survey.exif_sigma_m is not None and not reads_photographs(survey):
         raise SurveyFileError(
             f"{survey.source}: exterior.exif_sigma_m needs photographs, the survey has [observations]; "
             "give exterior.file"

@@ -1,8 +1,6 @@
-"""Correspondences of a survey: all points of its network, and approximate values.
+"""Uncoded targets of a survey, matched with the oriented photographs and checked as circles.
 
-Uncoded targets are matched with the oriented photographs, and checked as circles. Photographs of another
-object are removed by their contradicting codes. In a survey of texture, windows cover the photographs
-instead.
+Photographs of another object are removed by their contradicting codes.
 """
 
 from __future__ import annotations
@@ -15,14 +13,13 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, IntArray
+from sfm.conventions import MAD_TO_SIGMA, BoolArray
 from sfm.network import Estimate, Network, rows_of, without_given
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark
-from sfm.result import Eccentricity, PhotographTargets
 from sfm.runtime.progress import reported
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
@@ -32,11 +29,9 @@ from sfm.survey.diagnosis.contradicting_codes import (
     remarks_on_contested,
 )
 from sfm.survey.diagnosis.photograph_cameras import find_photograph_cameras
-from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.surface_points import cover_photographs
-from sfm.survey.measuring.tie_points import needed_rays
-from sfm.survey.orientation import Oriented
+from sfm.survey.sources.source import Correspondences
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
 ROUNDS = 3  # of matching: with the given orientation, with the adjusted one, and once more to confirm
@@ -45,50 +40,22 @@ MIN_TOLERANCE_PX = 1.0  # the statistical test judges smaller differences, not t
 TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 
 
-@dataclass(frozen=True)
-class Correspondences:
-    """The network of a survey with all its points, and approximate values."""
-
-    network: Network
-    estimate: Estimate  # NaN for points that were removed
-    min_rays: IntArray  # photographs that each point needs, (n,)
-    naming: Naming | None = None  # of the targets; None without targets
-    eccentricity: Eccentricity | None = None  # of the corrections; None without corrections
-    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
-    remarks: tuple[Remark, ...] = ()
-    point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
-    given: bool = False  # whether the orientation started from approximate values of the survey
-    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
-    suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
-    overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
-
-
-def find_correspondences(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
-    """Return the network with uncoded targets, or with the texture that covers the photographs.
-
-    Given image points do not change.
+def match_targets_of(
+    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+) -> Correspondences:
+    """Return the network of all targets, the uncoded ones too.
 
     Args:
-        oriented: the named image points and all targets, and the orientation with its final tolerance.
-        jobs: number of photographs of texture processed in parallel.
+        survey: settings of the survey.
+        measured: the coded targets, and all others without a name.
+        start: orientation of the photographs, with its final tolerance.
+        jobs: not used, the targets are measured already.
 
     Raises:
         GeometryError: fewer than two photographs keep enough points.
     """
-    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     photographs, naming = measured.photographs, measured.naming
-    if photographs is None or naming is None:
-        surface = cover_photographs(survey, measured, start, jobs=jobs)
-        network = measured.network if surface is None else surface.network
-        return Correspondences(
-            network,
-            start.estimate if surface is None else surface.estimate,
-            measured.min_rays if surface is None else needed_rays(network),
-            point_failures=start.point_failures,
-            given=start.kind == "given",
-            remarks=() if surface is None else surface.remarks,
-            overlays=None if surface is None else surface.overlays,
-        )
+    assert photographs is not None
     matched, left_out, contested = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate
     circles = check_circles(survey, photographs, naming, network, estimate)

@@ -1,0 +1,58 @@
+"""The sources of image points that a survey may state; several may stand side by side.
+
+A source is a row here and a module of `sfm.survey.sources` of the same name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from sfm.display import counted
+from sfm.network import Source
+
+# Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
+MIN_TIE_POINTS = 15
+TARGETS = Source("targets")
+GIVEN = Source("given", is_exact=True)
+TEXTURE = Source("texture", names_last=False, fewest=MIN_TIE_POINTS)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """A source as surveys state it."""
+
+    source: Source
+    table: str  # of the survey file
+    describe: Callable[[Any], str]  # the settings of the table in a few words
+    stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
+    is_stated: Callable[[Any], bool] = lambda settings: settings is not None
+
+
+ROWS = (  # in the order of their points in a network; the first is that of a survey that states none
+    Declared(
+        TARGETS,
+        "targets",
+        lambda targets: f"targets of codes {targets.codes}",
+        "targets",
+        lambda targets: targets.codes != "none",
+    ),
+    Declared(GIVEN, "observations", lambda table: counted(len(table), "image point")),
+    Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
+)
+
+
+def declared(survey: object) -> tuple[Declared, ...]:
+    """Return the sources of the image points of a survey or its file."""
+    return tuple(row for row in ROWS if row.is_stated(getattr(survey, row.table))) or ROWS[:1]
+
+
+def descriptions(survey: object) -> list[str]:
+    """Return the sources of a survey in a few words each."""
+    return [row.describe(getattr(survey, row.table)) for row in declared(survey)]
+
+
+def reads_photographs(survey: object) -> bool:
+    """Return whether a survey measures photographs, or has given image points alone."""
+    return any(row.stage for row in declared(survey))

@@ -1,0 +1,248 @@
+"""The image points of all sources of a survey as one network, before and after its orientation.
+
+Photographs and points are joined by their names. A point that several sources measure is one point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+from typing import cast
+
+import numpy as np
+
+from sfm.conventions import IntArray
+from sfm.network import ImagePoints, Network, ScaleBars
+from sfm.orientation.image_rays import intersect_image_points
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.result import PhotographTargets
+from sfm.runtime.progress import StageClock
+from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
+from sfm.survey.inputs.sources import Declared, declared
+from sfm.survey.inputs.start import network_of, scale_bars
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey_file import SurveyFile
+from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.orientation import Oriented
+from sfm.survey.sources.source import Correspondences, SurveySource
+
+
+def sources_of(survey: Survey | SurveyFile) -> tuple[tuple[Declared, SurveySource], ...]:
+    """Return the sources of a survey, each with its row."""
+    return tuple((row, _module_of(row)) for row in declared(survey))
+
+
+def _module_of(row: Declared) -> SurveySource:
+    return cast(SurveySource, import_module(f"sfm.survey.sources.{row.source.name}").SOURCE)
+
+
+def measure_sources(
+    survey: Survey, files: PhotographList, *, jobs: int, store: MeasuredStore | None, clock: StageClock
+) -> Measurements:
+    """Return the image points of all sources of a survey.
+
+    Args:
+        survey: settings of the survey.
+        files: its photographs; none if it measures nothing.
+        jobs: number of photographs measured at the same time.
+        store: keeps the measurements; None to measure all anew.
+        clock: times the stages.
+    """
+    parts = []
+    for row, source in sources_of(survey):
+        if row.stage:
+            with clock.stage(row.stage, len(files)):
+                parts.append(source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress))
+        else:
+            parts.append(source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress))
+    return _joined_measurements(survey, parts)
+
+
+def complete_sources(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
+    """Return the network of a survey with all its image points, and approximate values.
+
+    Args:
+        oriented: the image points so far, and the orientation with its final tolerance.
+        jobs: number of photographs processed in parallel.
+
+    Raises:
+        GeometryError: fewer than two photographs keep enough points.
+    """
+    survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
+    sources = [source for _, source in sources_of(survey)]
+    if len(sources) == 1:
+        completed = [sources[0].complete(survey, measured, start, jobs=jobs)]
+    else:
+        completed = [
+            source.complete(survey, part, _orientation_of(start, measured, k), jobs=jobs)
+            for k, (source, part) in enumerate(zip(sources, measured.parts, strict=True))
+        ]
+    return _joined_correspondences(survey, measured, start, completed)
+
+
+def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measurements:
+    """Return the measurements of all sources as those of one network."""
+    network = _joined(survey, [part.network for part in parts])
+    first = parts[0]
+    if len(parts) == 1:
+        return replace(first, network=network)
+    index = {name: j for j, name in enumerate(network.points)}
+    min_rays = np.full(len(network.points), np.iinfo(np.int64).max)
+    for part in parts:
+        np.minimum.at(min_rays, [index[name] for name in part.network.points], part.min_rays)
+    seen = set(network.images)
+    failed = {lost.image: lost for part in parts for lost in part.failed if lost.image not in seen}
+    return Measurements(
+        network,
+        first.cameras,
+        tuple(dict.fromkeys(name for part in parts for name in part.images)),
+        min_rays,
+        tuple(failed.values()),
+        _joined_overlays([part.overlays for part in parts]),
+        next((part.files for part in parts if part.files is not None), None),
+        next((part.photographs for part in parts if part.photographs is not None), None),
+        next((part.naming for part in parts if part.naming.names), NO_NAMES),
+        tuple(dict.fromkeys(remark for part in parts for remark in part.remarks)),
+        tuple(point for part in parts for point in part.left_out),
+        tuple(parts),
+    )
+
+
+def _joined(survey: Survey, networks: Sequence[Network]) -> Network:
+    """Return the network of the image points of all sources, with everything else that the survey gives."""
+    sources = tuple(row.source for row in declared(survey))
+    first = networks[0]
+    if len(networks) == 1:
+        return replace(first, sources=sources)
+    images = tuple(dict.fromkeys(name for network in networks for name in network.images))
+    points = tuple(dict.fromkeys(name for network in networks for name in network.points))
+    image, point = ({name: k for k, name in enumerate(names)} for names in (images, points))
+    camera = np.zeros(len(images), dtype=np.int64)
+    parts, bars = [], [scale_bars(survey.scale_bars, points)]
+    for k, network in enumerate(networks):
+        of_image = np.array([image[name] for name in network.images], dtype=np.int64)
+        of_point = np.array([point[name] for name in network.points], dtype=np.int64)
+        camera[of_image] = network.camera
+        seen = network.image_points
+        source = np.full(len(seen), k)
+        parts.append(replace(seen, image=of_image[seen.image], point=of_point[seen.point], source=source))
+        stated = len(scale_bars(survey.scale_bars, network.points))
+        bars.append(
+            network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
+        )
+    return replace(
+        network_of(survey, images, camera, points, _concatenated(parts), bars=_all_bars(bars)),
+        sources=sources,
+    )
+
+
+def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
+    stated = [np.ones(len(part), dtype=bool) if part.stated is None else part.stated for part in parts]
+    return ImagePoints(
+        np.concatenate([part.image for part in parts]),
+        np.concatenate([part.point for part in parts]),
+        np.concatenate([part.xy for part in parts]),
+        np.concatenate([part.covariance for part in parts]),
+        np.concatenate(stated),
+        np.concatenate([part.source for part in parts if part.source is not None]),
+    )
+
+
+def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
+    table = [some.table if len(some.table) else np.zeros(len(some), dtype=np.int64) for some in bars]
+    return ScaleBars(
+        np.concatenate([some.start for some in bars]),
+        np.concatenate([some.end for some in bars]),
+        np.concatenate([some.length for some in bars]),
+        np.concatenate([some.sigma for some in bars]),
+        np.concatenate(table),
+    )
+
+
+def _joined_overlays(overlays: Sequence[Sequence[PhotographTargets]]) -> tuple[PhotographTargets, ...]:
+    """Return one overlay of each photograph, in the order of their first source."""
+    by_name: dict[str, PhotographTargets] = {}
+    for drawn in (drawn for some in overlays for drawn in some):
+        before = by_name.get(drawn.image)
+        by_name[drawn.image] = drawn if before is None else before.with_more(drawn)
+    return tuple(by_name.values())
+
+
+def _indices(names: Sequence[str], of: Sequence[str]) -> IntArray:
+    index = {name: k for k, name in enumerate(of)}
+    return np.array([index[name] for name in names], dtype=np.int64)
+
+
+def _orientation_of(start: Orientation, measured: Measurements, source: int) -> Orientation:
+    """Return the orientation of the photographs and points of a source."""
+    whole, part, estimate = measured.network, measured.parts[source], start.estimate
+    images, points = _indices(part.network.images, whole.images), _indices(part.network.points, whole.points)
+    known = set(part.network.points)
+    return replace(
+        start,
+        estimate=replace(
+            estimate,
+            position=estimate.position[images],
+            rotation=estimate.rotation[images],
+            points=estimate.points[points],
+        ),
+        point_failures=tuple(failure for failure in start.point_failures if failure[0] in known),
+        fits=start.fits[whole.source == source],
+    )
+
+
+def _joined_correspondences(
+    survey: Survey, measured: Measurements, start: Orientation, completed: Sequence[Correspondences]
+) -> Correspondences:
+    """Return the image points of all sources in the orientation of all photographs."""
+    network = _joined(survey, [matched.network for matched in completed])
+    first = completed[0]
+    if len(completed) == 1:
+        return replace(first, network=network)
+    images = _indices(network.images, measured.network.images)
+    position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
+    elsewhere = {
+        name: reason
+        for matched in completed
+        for name, reason in matched.left_out
+        if reason.kind != "photograph_with_few_fitting"
+    }
+    out = np.isin(network.images, list(elsewhere))
+    position[out], rotation[out] = np.nan, np.nan
+    estimate = replace(start.estimate, position=position, rotation=rotation)
+    points = np.full((len(network.points), 3), np.nan)
+    min_rays = np.full(len(points), np.iinfo(np.int64).max)
+    for matched in completed:
+        rows = _indices(matched.network.points, network.points)
+        unknown = ~np.isfinite(points[rows]).all(axis=1)
+        points[rows[unknown]] = matched.estimate.points[unknown]
+        np.minimum.at(min_rays, rows, matched.min_rays)
+    rays = intersect_image_points(
+        network.image_points,
+        network.camera,
+        estimate,
+        n_points=len(points),
+        tolerance_px=float(start.tolerance_px.max()),
+    )
+    again = np.isfinite(points).all(axis=1) & np.isfinite(rays.points).all(axis=1)
+    points[again] = rays.points[again]
+    return Correspondences(
+        network,
+        replace(estimate, points=points),
+        min_rays,
+        next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
+        next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
+        tuple(name for matched in completed for name in matched.no_circles),
+        tuple(dict.fromkeys(remark for matched in completed for remark in matched.remarks)),
+        start.point_failures,
+        start.kind == "given",
+        tuple(elsewhere.items()),
+        tuple(dict.fromkeys(name for matched in completed for name in matched.suspected)),
+        _joined_overlays(
+            [
+                part.overlays if matched.overlays is None else matched.overlays
+                for part, matched in zip(measured.parts, completed, strict=True)
+            ]
+        ),
+    )

@@ -1,0 +1,108 @@
+"""What a source of image points does: a first measurement, and a second one in oriented photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from sfm.conventions import IntArray
+from sfm.network import Estimate, Network
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.remarks.remark import Remark
+from sfm.result import Eccentricity, PhotographTargets
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
+from sfm.survey.inputs.settings import Section
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey_file import SurveyFile
+from sfm.survey.measuring.measured_store import MeasuredStore
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """The network of a survey with all its points, and approximate values."""
+
+    network: Network
+    estimate: Estimate  # NaN for points that were removed
+    min_rays: IntArray  # photographs that each point needs, (n,)
+    naming: Naming = NO_NAMES  # of the targets
+    eccentricity: Eccentricity | None = None  # of the corrections; None without corrections
+    no_circles: tuple[str, ...] = ()  # uncoded points left out: their outlines are not images of one circle
+    remarks: tuple[Remark, ...] = ()
+    point_failures: tuple[tuple[str, Remark], ...] = ()  # points without approximate values, with the reason
+    given: bool = False  # whether the orientation started from approximate values of the survey
+    left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
+    suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
+    overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
+
+
+class Measure(Protocol):
+    """Returns the image points of photographs before these are oriented.
+
+    Args:
+        survey: settings of the survey.
+        files: photographs; none for a source that measures nothing.
+        jobs: number of photographs measured at the same time.
+        store: keeps the measurements; None to measure all anew.
+        progress: receives every photograph.
+    """
+
+    def __call__(  # noqa: D102
+        self,
+        survey: Survey,
+        files: PhotographList,
+        *,
+        jobs: int = 1,
+        store: MeasuredStore | None = None,
+        progress: Progress = SILENT,
+    ) -> Measurements: ...
+
+
+class Complete(Protocol):
+    """Returns all image points once the photographs are oriented.
+
+    Args:
+        survey: settings of the survey.
+        measured: what the first measurement returned.
+        start: orientation of these photographs and points.
+        jobs: number of photographs processed in parallel.
+    """
+
+    def __call__(  # noqa: D102
+        self, survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+    ) -> Correspondences: ...
+
+
+def _no_settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
+    return ()
+
+
+def _no_count(survey: SurveyFile, path: Path, store: MeasuredStore | None) -> tuple[dict[str, int], bool]:
+    return {}, True
+
+
+@dataclass(frozen=True)
+class SurveySource:
+    """What a source of image points does."""
+
+    measure: Measure
+    complete: Complete
+    # (table of the survey file, its settings)
+    settings: Callable[[Survey], tuple[tuple[str, Section], ...]] = _no_settings
+    # measures and stores one photograph; returns counts by name, and whether they were read from the store
+    count: Callable[[SurveyFile, Path, MeasuredStore | None], tuple[dict[str, int], bool]] = _no_count
+
+
+def complete_as_measured(
+    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+) -> Correspondences:
+    """Return the image points as they were first measured."""
+    return Correspondences(
+        measured.network,
+        start.estimate,
+        measured.min_rays,
+        point_failures=start.point_failures,
+        given=start.kind == "given",
+    )

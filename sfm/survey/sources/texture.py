@@ -1,0 +1,43 @@
+"""Natural texture of a survey: tie points; once photographs are oriented, windows that cover them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sfm.orientation.incremental.sequence import Orientation
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.settings import Section, TiePointSettings
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey_file import SurveyFile
+from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.measuring.surface_points import cover_photographs
+from sfm.survey.measuring.tie_points import natural_points_of, needed_rays, tie_photographs
+from sfm.survey.sources.source import Correspondences, SurveySource, complete_as_measured
+
+
+def _cover(survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1) -> Correspondences:
+    """Return the windows that cover the photographs, or the tie points if these have more rays."""
+    surface = cover_photographs(survey, measured, start, jobs=jobs)
+    if surface is None:
+        return complete_as_measured(survey, measured, start)
+    return Correspondences(
+        surface.network,
+        surface.estimate,
+        needed_rays(surface.network),
+        point_failures=start.point_failures,
+        given=start.kind == "given",
+        remarks=surface.remarks,
+        overlays=surface.overlays,
+    )
+
+
+def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
+    return (("tie_points", survey.texture),)
+
+
+def _count(survey: SurveyFile, path: Path, store: MeasuredStore | None) -> tuple[dict[str, int], bool]:
+    natural, stored = natural_points_of(path, survey.tie_points or TiePointSettings(), store)
+    return {"features": len(natural)}, stored
+
+
+SOURCE = SurveySource(tie_photographs, _cover, _settings, _count)
