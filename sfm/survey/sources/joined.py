@@ -103,7 +103,7 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
         next((part.files for part in parts if part.files is not None), None),
         next((part.photographs for part in parts if part.photographs is not None), None),
         next((part.naming for part in parts if part.naming.names), NO_NAMES),
-        tuple(dict.fromkeys(remark for part in parts for remark in part.remarks)),
+        tuple(remark for part in parts for remark in part.remarks),
         tuple(point for part in parts for point in part.left_out),
         tuple(parts),
     )
@@ -234,7 +234,7 @@ def _joined_correspondences(
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
         tuple(name for matched in completed for name in matched.no_circles),
-        tuple(dict.fromkeys(remark for matched in completed for remark in matched.remarks)),
+        tuple(remark for matched in completed for remark in matched.remarks),
         start.point_failures,
         start.kind == "given",
         tuple(elsewhere.items()),
