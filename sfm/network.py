@@ -58,6 +58,7 @@ class Source:
     names_last: bool = True  # whether its points keep their names in later runs
     fewest: int = 4  # image points of a photograph: three determine it, the fourth checks
     is_exact: bool = False  # whether they were handed over as they are
+    has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,12 @@ class Network:
         """Index of the source of each image point, (k,)."""
         source = self.image_points.source
         return np.zeros(len(self.image_points), dtype=np.int64) if source is None else source
+
+    @property
+    def with_common_errors(self) -> BoolArray:
+        """Which image points a correlation of the errors of neighbours is about, (k,)."""
+        common = np.array([source.has_common_errors for source in self.sources])
+        return common[self.source] if common.any() else np.ones(len(self.image_points), dtype=bool)
 
     @cached_property
     def named(self) -> BoolArray:

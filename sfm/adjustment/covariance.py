@@ -77,7 +77,8 @@ class Marginal:
         a = self.adjustment
         if a.error_correlation is None:
             return None
-        return correlated_part(self.influence, a.error_correlation, a.usual_px)
+        which = a.network.with_common_errors[self.layout.order]
+        return correlated_part(self.influence, a.error_correlation, a.usual_px, which)
 
     def of_independent_errors(self) -> Covariance:
         """Return the covariance of points, exterior and interior orientation without the correlated part."""

@@ -85,6 +85,7 @@ def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -
         or not plate.is_ambiguous
         or photographs is None
         or len(cameras) < 2
+        or measured.parts  # other sources of image points show which turn is right
     ):
         return AgreedTurns(None, None)
     codes = [target.code for target in photographs.targets]
@@ -117,7 +118,7 @@ def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -
     targets = tuple(replace(target, code=code) for target, code in pairs_of_codes)
     photographs = replace(photographs, targets=targets)
     naming = name_coded(photographs)
-    network = build_network(survey, photographs, naming)
+    network = replace(build_network(survey, photographs, naming), sources=measured.network.sources)
     return AgreedTurns(replace(measured, network=network, photographs=photographs, naming=naming), uncertain)
 
 

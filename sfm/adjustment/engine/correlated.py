@@ -169,6 +169,7 @@ class CorrelatedPart:
     influence: Influence
     correlation: ErrorCorrelation
     relative: FloatArray  # whitening of each image point relative to a usual one, (k, 2, 2)
+    which: BoolArray  # image points with correlated errors, (k,)
     middle: FloatArray  # S'(R - I) S of the scores S, (reduced + d, reduced + d)
     points: FloatArray  # covariance of each object point, (n, 3, 3)
 
@@ -186,7 +187,7 @@ class CorrelatedPart:
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
         of_all = np.zeros((3 * p, C.shape[1]))
-        for one in _photographs(o.image, o.xy, self.relative, self.correlation):
+        for one in _photographs(o.image, o.xy, self.relative, self.correlation, self.which):
             rows = one.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
             columns, S = influence.scores_of(rows)
@@ -220,19 +221,22 @@ class CorrelatedPart:
         )
 
 
-def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_px: float) -> CorrelatedPart:
+def correlated_part(
+    influence: Influence, correlation: ErrorCorrelation, usual_px: float, which: BoolArray
+) -> CorrelatedPart:
     """Return the addition to the cofactors of all unknowns due to correlated errors.
 
     Args:
         influence: effect of errors on the unknowns.
         correlation: correlation of the errors.
         usual_px: a priori standard deviation of a usual image coordinate, px.
+        which: image points with correlated errors, (k,).
     """
     linear, r = influence.linear, len(influence.unknowns)
     relative = usual_px * linear.whitening
     o, n = linear.layout.observations, len(linear.layout.point_free)
     middle, added = np.zeros((r, r)), np.zeros((n, 3, 3))
-    for one in _photographs(o.image, o.xy, relative, correlation):
+    for one in _photographs(o.image, o.xy, relative, correlation, which):
         rows = one.rows
         columns, S = influence.scores_of(rows)
         KS = one.times(S)
@@ -248,11 +252,16 @@ def correlated_part(influence: Influence, correlation: ErrorCorrelation, usual_p
         C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
         through = np.einsum("rpa,rpb->pab", C.reshape(r, -1, 3), (D @ C).reshape(r, -1, 3))
         added[first : first + POINTS_AT_ONCE] += through
-    return CorrelatedPart(influence, correlation, relative, middle, added)
+    return CorrelatedPart(influence, correlation, relative, which, middle, added)
 
 
 def correlated_sum(
-    image: IntArray, xy: FloatArray, relative: FloatArray, Z: FloatArray, correlation: ErrorCorrelation
+    image: IntArray,
+    xy: FloatArray,
+    relative: FloatArray,
+    Z: FloatArray,
+    correlation: ErrorCorrelation,
+    which: BoolArray,
 ) -> FloatArray:
     """Return Z'(R - I) Z, the addition to the covariance of functions of errors, for sigma0 = 1.
 
@@ -262,9 +271,10 @@ def correlated_sum(
         relative: whitening of each image point relative to a usual one, (k, 2, 2).
         Z: derivatives of the functions by the errors in units of their standard deviations, (k, 2, u).
         correlation: correlation of the errors.
+        which: image points with correlated errors, (k,).
     """
     total = np.zeros((Z.shape[2], Z.shape[2]))
-    for one in _photographs(image, xy, relative, correlation):
+    for one in _photographs(image, xy, relative, correlation, which):
         of_photograph = Z[one.rows]
         total += np.tensordot(of_photograph, one.times(of_photograph), axes=((0, 1), (0, 1)))
     return total
@@ -311,10 +321,11 @@ class _Photograph:
 
 
 def _photographs(
-    image: IntArray, xy: FloatArray, relative: FloatArray, correlation: ErrorCorrelation
+    image: IntArray, xy: FloatArray, relative: FloatArray, correlation: ErrorCorrelation, which: BoolArray
 ) -> Iterator[_Photograph]:
-    """Yield R - I of the image points of each photograph."""
-    for rows in rows_of(image, int(image.max(initial=-1)) + 1):
+    """Yield R - I of the image points of each photograph; it is 0 for those without correlated errors."""
+    for of_photograph in rows_of(image, int(image.max(initial=-1)) + 1):
+        rows = of_photograph[which[of_photograph]]
         yield _Photograph(rows, xy[rows], relative[rows], correlation)
 
 

@@ -58,6 +58,7 @@ class Reduced:
     photographs: int
     redundancy: int
     xy: FloatArray  # measured position of each image point, px, (k, 2)
+    with_common_errors: BoolArray  # image points that the correlation is about, (k,)
     correlation: ErrorCorrelation | None  # correlation of the errors of neighbours
     sigma0_px: float  # a posteriori standard deviation of a usual image coordinate, px
 
@@ -107,8 +108,14 @@ class Reduced:
         if self.correlation is None:
             return 1.0
         H, _, squares = self.project(D)
-        left = self.absorb(D)[2]
-        correlated = correlated_sum(self.image, self.xy, self.sigma0_px * self.F, left, self.correlation)
+        correlated = correlated_sum(
+            self.image,
+            self.xy,
+            self.sigma0_px * self.F,
+            self.absorb(D)[2],
+            self.correlation,
+            self.with_common_errors,
+        )
         effects = determined_inverse(H, squares) @ (H + correlated)
         first = float(np.trace(effects))
         return max(float((effects * effects.T).sum()) / first, 1.0) if first > 0 else 1.0
@@ -216,7 +223,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
-        *(seen.xy[used], a.error_correlation, a.sigma0_px),
+        *(seen.xy[used], network.with_common_errors[used], a.error_correlation, a.sigma0_px),
     )
 
 

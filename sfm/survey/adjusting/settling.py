@@ -226,8 +226,8 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(is_observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
     others = len(part.scale_bars) or len(part.interior) or len(part.observations) or weighted
-    if others and task.survey.adjust.weights == "components":
-        return _adjust_with_component(adjust_part, len(part.image_points), task.factor)
+    if (others or len(part.sources) > 1) and task.survey.adjust.weights == "components":
+        return _adjust_with_components(adjust_part, part, task.factor)
     return adjust_part(np.ones(len(part.image_points)))
 
 
@@ -317,10 +317,10 @@ def on_points(task: Task, network: Network, estimate: Estimate) -> Datum:
     return replace(datum, points=on)
 
 
-def _adjust_with_component(
-    adjust_part: Callable[[FloatArray], Adjustment], count: int, start: float
+def _adjust_with_components(
+    adjust_part: Callable[[FloatArray], Adjustment], part: Network, start: float
 ) -> Adjustment:
-    """Return the adjustment with the image points weighted by their variance component.
+    """Return the adjustment with the image points of each source weighted by their variance component.
 
     Lengths and control keep their stated standard deviations. Without the component, sigma0 a posteriori,
     which the image points determine, would scale these too. The component is estimated from the image points
@@ -328,10 +328,10 @@ def _adjust_with_component(
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
-    group = np.zeros(count, dtype=np.int64)
-    final, _, settled = estimate_components(adjust_part, group, (IMAGE_POINTS,), start=start)
+    names = (IMAGE_POINTS,) if len(part.sources) == 1 else tuple(source.name for source in part.sources)
+    final, _, settled = estimate_components(adjust_part, part.source, names, start=start)
     if not settled:
-        unsettled = remark("rejection_not_converging", groups=IMAGE_POINTS)
+        unsettled = remark("rejection_not_converging", groups=names)
         final = replace(final, remarks=(*final.remarks, unsettled))
     return final
 

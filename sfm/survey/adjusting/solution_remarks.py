@@ -228,7 +228,8 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> t
         "points_contradicted": [
             point.point
             for point in listed
-            if point.reason.severity != "note" and point.reason.kind != "points_moved"  # that remark names them
+            if point.reason.severity != "note"
+            and point.reason.kind != "points_moved"  # that remark names them
         ],
         "points_not_determined": [point.point for point in listed if point.reason.severity == "note"],
     }

@@ -16,7 +16,7 @@ from sfm.network import Source
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets")
 GIVEN = Source("given", is_exact=True)
-TEXTURE = Source("texture", names_last=False, fewest=MIN_TIE_POINTS)
+TEXTURE = Source("texture", names_last=False, fewest=MIN_TIE_POINTS, has_common_errors=True)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,17 @@ from typing import cast
 
 import numpy as np
 
-from sfm.conventions import IntArray
-from sfm.network import ImagePoints, Network, ScaleBars
+from sfm.adjustment.quality.statistics import level_of_single
+from sfm.adjustment.quality.variance_components import estimate_components
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.conventions import FloatArray, IntArray
+from sfm.distributions import FALSE_ALARM
+from sfm.errors import GeometryError
+from sfm.network import Estimate, ImagePoints, Network, ScaleBars, without_given
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.reduced_network import reduce_network, select_determined
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
@@ -24,6 +31,7 @@ from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.measuring.surface_points import RAYS_OF_NOISE
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.source import Correspondences, SurveySource
 
@@ -227,9 +235,10 @@ def _joined_correspondences(
     )
     again = np.isfinite(points).all(axis=1) & np.isfinite(rays.points).all(axis=1)
     points[again] = rays.points[again]
+    estimate = replace(estimate, points=points)
     return Correspondences(
-        network,
-        replace(estimate, points=points),
+        _balanced(network, estimate, min_rays, survey.adjust.sigma_px),
+        estimate,
         min_rays,
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
@@ -246,3 +255,37 @@ def _joined_correspondences(
             ]
         ),
     )
+
+
+def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px: float) -> Network:
+    """Return the network with the weights of its sources relative to one another, from their residuals.
+
+    The covariances of the first source stay. Of very many points only some take part.
+    """
+    seen = network.image_points
+    step = np.ones(len(network.points), dtype=np.int64)
+    for k in range(len(network.sources)):
+        of_source = network.source == k
+        step[seen.point[of_source]] = max(1, int(of_source.sum()) // RAYS_OF_NOISE)
+    some = estimate.determined & (np.arange(len(step)) % step == 0)
+    rays = np.ones(len(seen), dtype=bool)
+    try:
+        images, points = select_determined(
+            network,
+            replace(estimate, points=np.where(some[:, None], estimate.points, np.nan)),
+            rays,
+            min_rays,
+        )
+        part, start = reduce_network(without_given(network), estimate, images, points, rays)
+
+        def adjust_with(factor: FloatArray) -> Adjustment:
+            alpha = level_of_single(FALSE_ALARM, 2 * len(factor))
+            return adjust(part, start, sigma_px=sigma_px, image_sigma_factor=factor, alpha=alpha)
+
+        names = tuple(source.name for source in network.sources)
+        _, factors, _ = estimate_components(adjust_with, part.source, names)
+    except GeometryError:  # the adjustment of the survey reports or repairs it
+        return network
+    scale = (factors / factors[0])[network.source]
+    covariance = scale[:, None, None] ** 2 * seen.covariance
+    return replace(network, image_points=replace(seen, covariance=covariance))
