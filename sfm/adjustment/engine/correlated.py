@@ -190,6 +190,8 @@ class CorrelatedPart:
         for one in _photographs(o.image, o.xy, self.relative, self.correlation, self.which):
             rows = one.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
+            if not len(chosen):
+                continue
             columns, S = influence.scores_of(rows)
             O, at = by_ray[rows[chosen]], place[o.point[rows[chosen]]]
             lines = (3 * at[:, None] + np.arange(3)).ravel()
