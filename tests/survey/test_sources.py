@@ -1,0 +1,133 @@
+"""Several sources of image points in one survey: targets and texture, and a source of one's own."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.conventions import AnyArray
+from sfm.network import Source
+from sfm.pipeline import run_survey
+from sfm.rendering.render import render_photographs
+from sfm.rendering.scene import Optics, join_marks, rectangles
+from sfm.result import SurveyResult
+from sfm.similarity import fit_similarity
+from sfm.survey.inputs import sources
+from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.sources import Declared, declared
+from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.sources.source import SurveySource, complete_as_measured
+from tests.places import ROOT
+from tests.surveys import SURVEY, camera, code_centres, plates, stations, survey_of
+from tests.synthetic import make_network, seed_of
+
+NOISE = 2.0  # grey values
+SWITCH = re.compile(
+    r"\.tie_points\b(?: is (?:not )?None|:| and| or)|\.observations is (?:not )?None"
+    r"|if (?:not )?survey\.tie_points"
+)
+
+
+@lru_cache
+def pictures() -> tuple[AnyArray, ...]:
+    """Render photographs of plates with coded targets on texture, without noise."""
+    scene = plates()
+    faces, targets = replace(scene.faces, texture=np.full(2, 0.2), grain=np.full(2, 2.0)), scene.targets
+    paper = [  # without texture, which would move the centres of printed dots
+        rectangles(face, xy[None], np.full((1, 2), 24.0), np.zeros(1), np.full(1, 0.8))
+        for face, xy in zip(targets.face.tolist(), targets.centre, strict=True)
+    ]
+    scene = replace(scene, faces=faces, marks=join_marks([*paper, scene.marks]))
+    position, rotation = stations(6)
+    optics = Optics(blur_px=0.7, exposure=0.9)
+    found, _ = render_photographs(scene, camera(), position, rotation, optics=optics, seed=1)
+    return tuple(found)
+
+
+def write(folder: Path, more: str = "", targets: bool = True) -> Path:
+    """Write photographs and their survey file, with further tables; return the file."""
+    rng = seed_of("sources")
+    for number, picture in enumerate(pictures(), 1):
+        noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
+        cv2.imwrite(str(folder / f"photo {number}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
+    text = SURVEY.format(name="sources", backend="none")
+    if not targets:
+        text = text.replace('codes = "ring14"', 'codes = "none"')
+    path = folder / "survey.toml"
+    path.write_text(text + more, "utf-8")
+    return path
+
+
+def error_of_codes(result: SurveyResult) -> float:
+    """Return the root mean square of errors of coded targets over their standard deviations."""
+    a, truth = result.adjustment, code_centres()
+    rows = [j for j, name in enumerate(a.network.points) if name.isdigit()]
+    X = np.array([truth[int(a.network.points[j])] for j in rows])
+    placing = fit_similarity(a.estimate.points[rows], X)
+    error = placing.apply(a.estimate.points[rows]) - X
+    variance = placing.scale**2 * np.einsum("nii->n", a.covariance.points[rows])
+    return float(np.sqrt((error**2).sum() / variance.sum()))
+
+
+def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
+    both = run_survey(read_survey(write(tmp_path, "[tie_points]\n")))
+    alone = run_survey(read_survey(write(tmp_path)))
+    network = both.adjustment.network
+    assert [source.name for source in network.sources] == ["targets", "texture"]
+    named = set(np.array(network.points)[network.named])
+    assert named == set(alone.adjustment.network.points)
+    assert (network.source[network.named[network.image_points.point]] == 0).all()
+    assert len(network.points) > 3 * len(named)
+    assert both.verdict.level == "good" and len(network.images) == 6
+    assert 0.6 < error_of_codes(both) < 1.4
+    assert both.adjustment.error_correlation is None or network.with_common_errors.sum() < len(network.source)
+    tables = dict(both.settings)
+    assert "targets" in tables and "tie_points" in tables
+    (first, *_) = both.photographs
+    assert len(first.xy) > len(alone.photographs[0].xy)
+
+
+def test_no_module_asks_which_source_a_survey_has() -> None:
+    asking = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in (ROOT / "sfm").rglob("*.py")
+        if "sources" not in path.parts
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1)
+        if SWITCH.search(line)
+    ]
+    assert asking == []
+
+
+def test_a_new_source_is_one_module_and_one_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Image points that every survey of the test has beside its own, whose points have no lasting names."""
+    network, truth = make_network(seed_of("a source"), images=6, points=40, free=("c",))
+    seen = network.image_points
+    first = replace(network, image_points=seen.select(seen.point < 25))
+    second = replace(network, image_points=seen.select(seen.point >= 25))
+
+    def measure(survey: Survey, files: object, **_: object) -> Measurements:
+        points = tuple(f"s{name}" for name in second.points)
+        return Measurements(
+            replace(second, points=points), truth.cameras, second.images, np.full(len(points), 2)
+        )
+
+    row = Declared(Source("sensor", names_last=False), "name", lambda _: "a sensor")
+    monkeypatch.setattr(sources, "ROWS", (*sources.ROWS, row))
+    module = SimpleNamespace(SOURCE=SurveySource(measure, complete_as_measured))  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "sfm.survey.sources.sensor", module)  # type: ignore[arg-type]
+    survey = survey_of(first, truth)
+    assert [one.source.name for one in declared(survey)] == ["given", "sensor"]
+    result = run_survey(survey)
+    joined = result.adjustment.network
+    assert {name for name, named in zip(joined.points, joined.named, strict=True) if not named} == {
+        f"s{j + 1}" for j in range(25, 40)
+    }
+    assert len(joined.points) == 40 and result.verdict.level == "good"
