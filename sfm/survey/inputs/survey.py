@@ -138,6 +138,7 @@ class Survey:
         cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
         if not cameras:
             raise SurveyFileError(f"{where}: no cameras, at least one is needed")
+        object.__setattr__(self, "targets", _section(TargetSettings, self.targets, f"{where}: targets"))
         if not reads_photographs(self):  # given image points are adjusted with the stated camera
             said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
             cameras = tuple(said)
@@ -156,7 +157,6 @@ class Survey:
             "tables": tuple(table for table in self.tables if table.kind != DISTANCE),
             "folder": Path(self.folder),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
-            "targets": _section(TargetSettings, self.targets, f"{where}: targets"),
             "rigs": tuple(_section(RigSettings, one, f"{where}: rig") for one in self.rigs),
             "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
