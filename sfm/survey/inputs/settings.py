@@ -213,7 +213,7 @@ class TargetSettings(PlateSettings):
 
 
 class TiePointSettings(Section):
-    """[tie_points]: natural texture in place of targets."""
+    """[tie_points]: natural texture, alone or beside coded targets."""
 
     detector: Literal["foerstner", "sift"] = "foerstner"  # detector of the interest points
     window_px: Annotated[int, Field(ge=7, le=101), AfterValidator(_odd)] = 15  # odd side of windows
@@ -290,7 +290,7 @@ class EquipmentSettings(Section):
 
 
 class ObservationSettings(Section):
-    """[observations]: measured image points in place of photographs."""
+    """[observations]: measured image points, in place of photographs or beside them."""
 
     file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
 

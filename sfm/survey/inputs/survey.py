@@ -107,7 +107,7 @@ class Survey:
     unit: str = "m"  # object unit, for people and reports
     targets: TargetSettings = field(default_factory=TargetSettings)
     plates: tuple[PlateSettings, ...] = ()  # calibration plates besides the plate of the targets
-    tie_points: TiePointSettings | None = None  # natural texture in place of targets
+    tie_points: TiePointSettings | None = None  # natural texture, beside targets if these have codes
     datum: DatumSettings = field(default_factory=DatumSettings)  # or a `Datum` with points by name
     adjust: AdjustSettings = field(default_factory=AdjustSettings)  # the stochastic model
     compare: CompareSettings = field(default_factory=CompareSettings)  # other programs to compare with
@@ -122,7 +122,7 @@ class Survey:
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     copied: tuple[str, ...] = ()  # observations that a table has more than once
     equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
-    observations: Observations | None = None  # measured image points in place of photographs
+    observations: Observations | None = None  # measured image points, alone or beside photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
