@@ -13,7 +13,6 @@ def kolinear(*arguments: object) -> int:
     """Run the command as the shell does and return its exit code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["kolinear", *map(str, arguments)])
-        patch.setenv("PYTHONSAFEPATH", "1")  # which the command sets; it ends with the test
         try:
             cli.main()
         except SystemExit as end:

@@ -33,6 +33,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> Path:
     """
     folder = Path(tempfile.mkdtemp(dir=CACHES))
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    monkeypatch.setenv("PYTHONSAFEPATH", "")  # commands set it for their processes: not beyond a test
     return folder
 
 

@@ -63,7 +63,7 @@ def _row_wrong(scene: Equipped) -> None:
     size = np.exp(scene.rng.uniform(np.log(50), np.log(1000))) * scene.rng.choice([-1.0, 1.0])
     values[row, axis] += size * kind.sigma[row, axis]
     scene.tables[word] = [kind.with_values(values)]
-    scene.causes, scene.names = ("observations_wrong",), (kind.name,)
+    scene.causes, scene.names = ("observations_wrong", "scale_left_out"), (kind.single, "bar")
 
 
 def _table_mistaken(scene: Equipped) -> None:
