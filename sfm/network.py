@@ -146,7 +146,7 @@ class Network:
         return np.zeros(len(self.image_points), dtype=np.int64) if source is None else source
 
     @property
-    def with_common_errors(self) -> BoolArray:
+    def may_correlate(self) -> BoolArray:
         """Which image points a correlation of the errors of neighbours is about, (k,)."""
         common = np.array([source.has_common_errors for source in self.sources])
         return common[self.source] if common.any() else np.ones(len(self.image_points), dtype=bool)

@@ -77,7 +77,7 @@ class Marginal:
         a = self.adjustment
         if a.error_correlation is None:
             return None
-        which = a.network.with_common_errors[self.layout.order]
+        which = a.network.may_correlate[self.layout.order]
         return correlated_part(self.influence, a.error_correlation, a.usual_px, which)
 
     def of_independent_errors(self) -> Covariance:

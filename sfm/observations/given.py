@@ -184,6 +184,11 @@ class ScaleBars(Kind):
     def __len__(self) -> int:
         return len(self.start)
 
+    @property
+    def is_one_scale(self) -> bool:
+        """Whether all have one scale: a single bar, or those of one table."""
+        return len(self) == 1 or bool(len(self.table) and self.table[0] and np.ptp(self.table) == 0)
+
     def covariances(self) -> FloatArray:
         """Return the variance of each length, object unit^2, (b, 1, 1)."""
         return self.sigma[:, None, None] ** 2

@@ -75,9 +75,7 @@ def unequal(scene: tuple[Network, Estimate]) -> tuple[Network, Estimate]:
 
 
 @pytest.mark.parametrize("name", ["scene", "unequal"])
-def test_covariance_with_common_errors_is_what_repetition_shows(
-    request: pytest.FixtureRequest, name: str
-) -> None:
+def test_covariance_may_correlate_is_what_repetition_shows(request: pytest.FixtureRequest, name: str) -> None:
     """Of centres, points and c; the covariance of independent errors states centres far too precise.
 
     Neighbours are moved alike, also where one is much more precise than the other.
@@ -120,7 +118,7 @@ def test_every_covariance_has_the_common_errors(unequal: tuple[Network, Estimate
     o, relative = m.layout.observations, found.usual_px * m.influence.linear.whitening
     correlation = found.error_correlation
     assert correlation is not None
-    whole = correlated_sum(o.image, o.xy, relative, Z, correlation)
+    whole = correlated_sum(o.image, o.xy, relative, Z, correlation, np.ones(len(o.image), dtype=bool))
     whole += np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
     scale = np.sqrt(np.outer(np.diagonal(joint), np.diagonal(joint)))
     assert joint / scale == pytest.approx(found.sigma0**2 * whole / scale, abs=1e-6)
@@ -279,7 +277,7 @@ def _gain(reduced: Reduced, D: FloatArray) -> float:
     return float(g[0] ** 2 / H[0, 0])
 
 
-def test_given_coordinates_are_judged_with_common_errors(scene: tuple[Network, Estimate]) -> None:
+def test_given_coordinates_are_judged_may_correlate(scene: tuple[Network, Estimate]) -> None:
     """True ones are confirmed by texture; taken as independent its errors contradict them."""
     network, truth = scene
     seen, some = network.image_points, np.arange(0, len(network.points), 5)

@@ -52,15 +52,13 @@ def pictures() -> tuple[AnyArray, ...]:
     return tuple(found)
 
 
-def write(folder: Path, more: str = "", targets: bool = True) -> Path:
+def write(folder: Path, more: str = "") -> Path:
     """Write photographs and their survey file, with further tables; return the file."""
     rng = seed_of("sources")
     for number, picture in enumerate(pictures(), 1):
         noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
         cv2.imwrite(str(folder / f"photo {number}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
     text = SURVEY.format(name="sources", backend="none")
-    if not targets:
-        text = text.replace('codes = "ring14"', 'codes = "none"')
     path = folder / "survey.toml"
     path.write_text(text + more, "utf-8")
     return path
@@ -88,7 +86,8 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert len(network.points) > 3 * len(named)
     assert both.verdict.level == "good" and len(network.images) == 6
     assert 0.6 < error_of_codes(both) < 1.4
-    assert both.adjustment.error_correlation is None or network.with_common_errors.sum() < len(network.source)
+    assert both.adjustment.error_correlation is not None
+    assert (network.may_correlate == (network.source == 1)).all()
     tables = dict(both.settings)
     assert "targets" in tables and "tie_points" in tables
     (first, *_) = both.photographs
@@ -120,7 +119,8 @@ def test_a_new_source_is_one_module_and_one_row(monkeypatch: pytest.MonkeyPatch)
         )
 
     row = Declared(Source("sensor", names_last=False), "name", lambda _: "a sensor")
-    monkeypatch.setattr(sources, "ROWS", (*sources.ROWS, row))
+    beside = tuple(replace(other, is_alone=False) for other in sources.ROWS)
+    monkeypatch.setattr(sources, "ROWS", (*beside, row))
     module = SimpleNamespace(SOURCE=SurveySource(measure, complete_as_measured))  # type: ignore[arg-type]
     monkeypatch.setitem(sys.modules, "sfm.survey.sources.sensor", module)  # type: ignore[arg-type]
     survey = survey_of(first, truth)

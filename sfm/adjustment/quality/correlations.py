@@ -178,7 +178,7 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
     o = m.layout.observations
     weight = np.ascontiguousarray(adjustment.weights[m.layout.order])
     linear = linearise(m.optimum, m.layout, weight)
-    used = (weight > 0) & adjustment.network.with_common_errors[m.layout.order]
+    used = (weight > 0) & adjustment.network.may_correlate[m.layout.order]
     size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
     cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
     v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]

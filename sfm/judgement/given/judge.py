@@ -32,8 +32,9 @@ from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.tables import Table, as_judged, judge_tables
 from sfm.judgement.given.values import NONCENTRALITY, GivenModel
-from sfm.network import ExteriorObservations, Network, ObjectPoints
+from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.kind import CoordinateKind
+from sfm.observations.point_pairs import Distances
 from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
@@ -144,12 +145,25 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     if in_control and given.placing is not None:
         place = partial(_unchanged, given.placing)
     wrong = judge_tables(tables, part, reference, place, settings.level)
+    there, bars = task.in_free(network.scale_bars)
+    if not in_control and bars.is_one_scale and len({one.kind for one in wrong if one.whole}) > 1:
+        # several kinds contradict the one scale that the bars have: which of them is wrong is open
+        distances = Distances(bars.start, bars.end, bars.values, bars.sigma[:, None])
+        table = Table(distances, len(network.observations), there)
+        part = replace(part, scale_bars=ScaleBars())
+        wrong = judge_tables([*tables, table], part, reference, place, settings.level)
+        kept = [row for left in as_judged([table], wrong) for row in left.parts.tolist()]
+        out = np.setdiff1d(there, kept)
+        in_use = np.isin(np.arange(len(network.scale_bars)), out, invert=True)
+        network = replace(network, scale_bars=network.scale_bars.select(in_use))
+        part = replace(part, scale_bars=task.in_free(network.scale_bars)[1])
     part = replace(part, observations=tuple(table.kind for table in as_judged(tables, wrong)))
     of_mounts: tuple[Remark, ...] = ()
     if mounts is not None and len(mounts):
         mounts, of_mounts = judge_mount_scales(mounts, part, reference, place, settings.level)
     estimate = task.free.adjustment.estimate
-    names = [kind.parts(network, estimate) for kind in network.observations]
+    kinds = [*network.observations, given.network.scale_bars]
+    names = [kind.parts(network, estimate) for kind in kinds]
     every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.observations)]
     observations = tuple(table.kind for table in as_judged(every, wrong))
     remarks = (*(one.remark(names) for one in wrong), *of_mounts)

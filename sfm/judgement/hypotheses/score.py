@@ -58,7 +58,7 @@ class Reduced:
     photographs: int
     redundancy: int
     xy: FloatArray  # measured position of each image point, px, (k, 2)
-    with_common_errors: BoolArray  # image points that the correlation is about, (k,)
+    may_correlate: BoolArray  # image points that the correlation is about, (k,)
     correlation: ErrorCorrelation | None  # correlation of the errors of neighbours
     sigma0_px: float  # a posteriori standard deviation of a usual image coordinate, px
 
@@ -114,7 +114,7 @@ class Reduced:
             self.sigma0_px * self.F,
             self.absorb(D)[2],
             self.correlation,
-            self.with_common_errors,
+            self.may_correlate,
         )
         effects = determined_inverse(H, squares) @ (H + correlated)
         first = float(np.trace(effects))
@@ -223,7 +223,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
-        *(seen.xy[used], network.with_common_errors[used], a.error_correlation, a.sigma0_px),
+        *(seen.xy[used], network.may_correlate[used], a.error_correlation, a.sigma0_px),
     )
 
 

@@ -340,7 +340,7 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     """Return which points have residuals that are together larger than chance explains, (n,).
 
     A window of texture that is slightly wrong in several photographs passes the tests of its single rays.
-    Points of control or scale bars stay, so that people can examine them.
+    Points with lasting names, and those of control or scale bars, stay, so that people can examine them.
     """
     network, used = adjustment.network, ~adjustment.rejected
     seen, v, n = network.image_points.select(used), adjustment.residuals[used], len(network.points)
@@ -348,7 +348,7 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     vPv = np.bincount(seen.point, np.einsum("ka,kab,kb->k", v, P, v), minlength=n)
     redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # with cameras held: slightly too cautious
     limit = chi2_isf(level_of_single(adjustment.false_alarm, n), np.maximum(redundancy, 1))
-    large = (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
+    large = ~network.named & (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
     bars = network.scale_bars
     large[np.concatenate([network.control.point, bars.start, bars.end])] = False
     return np.asarray(large)

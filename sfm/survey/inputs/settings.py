@@ -290,7 +290,7 @@ class EquipmentSettings(Section):
 
 
 class ObservationSettings(Section):
-    """[observations]: measured image points, in place of photographs or beside them."""
+    """[observations]: measured image points in place of photographs."""
 
     file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
 

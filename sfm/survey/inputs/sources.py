@@ -28,6 +28,7 @@ class Declared:
     describe: Callable[[Any], str]  # the settings of the table in a few words
     stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
     is_stated: Callable[[Any], bool] = lambda settings: settings is not None
+    is_alone: bool = False  # whether it leaves no place for others
 
 
 ROWS = (  # in the order of their points in a network; the first is that of a survey that states none
@@ -38,14 +39,17 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
         "targets",
         lambda targets: targets.codes != "none",
     ),
-    Declared(GIVEN, "observations", lambda table: counted(len(table), "image point")),
+    Declared(
+        GIVEN, "observations", lambda table: counted(len(table), "image point"), is_alone=True
+    ),  # measured elsewhere, in photographs that are not here
     Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
 )
 
 
 def declared(survey: object) -> tuple[Declared, ...]:
     """Return the sources of the image points of a survey or its file."""
-    return tuple(row for row in ROWS if row.is_stated(getattr(survey, row.table))) or ROWS[:1]
+    stated = tuple(row for row in ROWS if row.is_stated(getattr(survey, row.table))) or ROWS[:1]
+    return tuple(row for row in stated if row.is_alone)[:1] or stated
 
 
 def descriptions(survey: object) -> list[str]:

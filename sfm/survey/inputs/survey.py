@@ -122,7 +122,7 @@ class Survey:
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     copied: tuple[str, ...] = ()  # observations that a table has more than once
     equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
-    observations: Observations | None = None  # measured image points, alone or beside photographs
+    observations: Observations | None = None  # measured image points in place of photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None

@@ -6,6 +6,7 @@ Photographs and points are joined by their names. A point that several sources m
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib import import_module
 from typing import cast
@@ -59,10 +60,7 @@ def measure_sources(
     """
     parts = []
     for row, source in sources_of(survey):
-        if row.stage:
-            with clock.stage(row.stage, len(files)):
-                parts.append(source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress))
-        else:
+        with clock.stage(row.stage, len(files)) if row.stage else nullcontext():
             parts.append(source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress))
     return _joined_measurements(survey, parts)
 
@@ -219,25 +217,22 @@ def _joined_correspondences(
     out = np.isin(network.images, list(elsewhere))
     position[out], rotation[out] = np.nan, np.nan
     estimate = replace(start.estimate, position=position, rotation=rotation)
-    points = np.full((len(network.points), 3), np.nan)
-    min_rays = np.full(len(points), np.iinfo(np.int64).max)
+    min_rays = np.full(len(network.points), np.iinfo(np.int64).max)
     for matched in completed:
         rows = _indices(matched.network.points, network.points)
-        unknown = ~np.isfinite(points[rows]).all(axis=1)
-        points[rows[unknown]] = matched.estimate.points[unknown]
         np.minimum.at(min_rays, rows, matched.min_rays)
     rays = intersect_image_points(
         network.image_points,
         network.camera,
         estimate,
-        n_points=len(points),
+        n_points=len(network.points),
         tolerance_px=float(start.tolerance_px.max()),
     )
-    again = np.isfinite(points).all(axis=1) & np.isfinite(rays.points).all(axis=1)
-    points[again] = rays.points[again]
-    estimate = replace(estimate, points=points)
+    estimate = replace(estimate, points=rays.points)
+    if survey.adjust.weights == "components":
+        network = _balanced(network, estimate, min_rays, survey.adjust.sigma_px)
     return Correspondences(
-        _balanced(network, estimate, min_rays, survey.adjust.sigma_px),
+        network,
         estimate,
         min_rays,
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
