@@ -55,7 +55,9 @@ UNCHECKED = {
     *("assumptions_untested", "photographs_untested", "too_many_to_test"),
 }
 OF_GIVEN = {row.name for row in given_values.ROWS}
-CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED | {"camera_per_photograph"}
+CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED - {"photographs_differ"} | {
+    "camera_per_photograph"
+}
 ALIKE = {  # kinds that say the same of a fault
     "two_places": "points_moved",
     "camera_drift": "other_camera",

@@ -33,7 +33,7 @@ def test_all_that_is_missing_of_all_cameras_is_said_before_anything_is_measured(
 ) -> None:
     for name in ("a1", "a2", "b1", "b2"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((40, 60), 200, dtype=np.uint8))
-    monkeypatch.setattr("sfm.pipeline.measure_targets", lambda *a, **k: pytest.fail("measured"))
+    monkeypatch.setattr("sfm.pipeline.measure_sources", lambda *a, **k: pytest.fail("measured"))
     cameras = [
         CameraSetup(name="a", images="a*.png"),
         CameraSetup(name="b", images="b*.png", sensor_mm=(36, 24)),

@@ -39,6 +39,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood
@@ -136,7 +137,7 @@ def try_other_principal_distances(
     estimate: Estimate,
     found: Orientation | None,
     orient: Callable[[Estimate], Orientation],
-    false_alarm: float,
+    false_alarm: float = FALSE_ALARM,
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
     """Return the orientation with another principal distance if that orients more photographs, and remarks.
 
