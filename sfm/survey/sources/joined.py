@@ -255,7 +255,8 @@ def _joined_correspondences(
 def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px: float) -> Network:
     """Return the network with the weights of its sources relative to one another, from their residuals.
 
-    The covariances of the first source stay. Of very many points only some take part.
+    The median covariance does not change: sigma0 still shows how much worse the image points are than
+    expected. Of very many points only some take part.
     """
     seen = network.image_points
     step = np.ones(len(network.points), dtype=np.int64)
@@ -283,4 +284,6 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px
         return network
     scale = (factors / factors[0])[network.source]
     covariance = scale[:, None, None] ** 2 * seen.covariance
+    usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))
+    covariance *= usual / np.median(np.trace(covariance, axis1=1, axis2=2))
     return replace(network, image_points=replace(seen, covariance=covariance))
