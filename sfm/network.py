@@ -20,7 +20,7 @@ from scipy.sparse import csc_matrix, csr_matrix, triu
 
 from sfm.arguments import checked_arguments
 from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
 from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
@@ -88,6 +88,27 @@ class ImagePoints:
             None if self.source is None else self.source[mask],
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[ImagePoints]) -> ImagePoints:
+        """Return the image points of several sets, one set after the other."""
+
+        def optional(values: Sequence[AnyArray | None], otherwise: float) -> AnyArray | None:
+            if all(array is None for array in values):
+                return None
+            missing = [np.full(len(part), otherwise) for part in parts]
+            return np.concatenate([m if a is None else a for a, m in zip(values, missing, strict=True)])
+
+        stated = optional([part.stated for part in parts], True)
+        source = optional([part.source for part in parts], 0)
+        return cls(
+            np.concatenate([part.image for part in parts]),
+            np.concatenate([part.point for part in parts]),
+            np.concatenate([part.xy for part in parts]),
+            np.concatenate([part.covariance for part in parts]),
+            stated,
+            source,
+        )
+
     @property
     def median_sigma_px(self) -> float:
         """Median standard deviation of the coordinates, px."""
@@ -150,6 +171,11 @@ class Network:
         """Which image points a correlation of the errors of neighbours is about, (k,)."""
         common = np.array([source.has_common_errors for source in self.sources])
         return common[self.source] if common.any() else np.ones(len(self.image_points), dtype=bool)
+
+    @property
+    def automatic_points(self) -> frozenset[str]:
+        """Names of the points that may have other names in later runs."""
+        return frozenset(name for name, named in zip(self.points, self.named, strict=True) if not named)
 
     @cached_property
     def named(self) -> BoolArray:

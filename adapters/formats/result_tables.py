@@ -160,7 +160,9 @@ def write_content(folder: Path, content: Content) -> None:
     ):
         for k in np.flatnonzero(~placed)[:1]:
             raise OutputError(f"{folder}: {kind} {names[k]} has no coordinates, which tables require of all")
-    seen = joined_image_points(network.image_points, content.rejected)
+    seen = network.image_points
+    if len(content.rejected):
+        seen = ImagePoints.joined([seen, content.rejected])
     summary: dict[str, Any] = {
         "survey": result.name,
         "redundancy": result.redundancy,
@@ -192,20 +194,6 @@ def write_content(folder: Path, content: Content) -> None:
         write_given(folder, network, estimate, result.unit)
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
-
-
-def joined_image_points(first: ImagePoints, second: ImagePoints) -> ImagePoints:
-    """Return the image points of two sets, the first set first."""
-    if not len(second):
-        return first
-    stated = [np.ones(len(one), dtype=bool) if one.stated is None else one.stated for one in (first, second)]
-    return ImagePoints(
-        np.concatenate([first.image, second.image]),
-        np.concatenate([first.point, second.point]),
-        np.concatenate([first.xy, second.xy]),
-        np.concatenate([first.covariance, second.covariance]),
-        np.concatenate(stated),
-    )
 
 
 def read_content(folder: Path) -> Content:

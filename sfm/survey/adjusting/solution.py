@@ -137,9 +137,8 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
         accepted_rays=settled.rays,
         needed=matched.min_rays,
     )
-    known = set(np.array(whole.points, dtype=object)[start.estimate.determined])
     # Natural texture has very many points; only those that had approximate values are worth a line.
-    known |= set(np.array(whole.points, dtype=object)[whole.named])
+    known = set(np.array(whole.points, dtype=object)[start.estimate.determined | whole.named])
     listed = tuple(point for point in left_out if point.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     stated = None if model.stated_moment is None else model.stated_moment[settled.images]

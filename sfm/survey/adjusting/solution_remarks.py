@@ -90,7 +90,7 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
 
 def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return the remarks; points of texture did not move, but are seen at other positions."""
-    texture = {name for name, named in zip(network.points, network.named, strict=True) if not named}
+    texture = network.automatic_points
     return tuple(
         replace(said, kind="windows_elsewhere")
         if said.kind == "points_moved" and texture.issuperset(said.names("points"))
@@ -221,7 +221,7 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> t
         whole: network of all measured points. A person can correct those that keep their names; those of
             natural texture are a test.
     """
-    texture = {name for name, named in zip(whole.points, whole.named, strict=True) if not named}
+    texture = whole.automatic_points
     automatic = [point for point in left_out if point.point in texture]
     listed = [point for point in left_out if point.point not in texture]
     groups = {

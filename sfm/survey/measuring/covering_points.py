@@ -249,12 +249,12 @@ def _match_squares(
 
     measure(first, squares.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
-        _concatenate_image_points(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
+        ImagePoints.joined(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
     ).points
     measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
     some = number > 0
     parts[0].covariance[some] = in_reference[some] / number[some, None, None]
-    seen = _concatenate_image_points(parts)
+    seen = ImagePoints.joined(parts)
     some = some[seen.point]
     return _Rays(seen.select(some), np.concatenate(scales)[some])
 
@@ -295,16 +295,6 @@ def _points_that_meet(
     return CoveringPoints(image_points, met.points[kept], residuals, matched), used
 
 
-def _concatenate_image_points(parts: Sequence[ImagePoints]) -> ImagePoints:
-    """Concatenate image points."""
-    return ImagePoints(
-        np.concatenate([one.image for one in parts]),
-        np.concatenate([one.point for one in parts]),
-        np.concatenate([one.xy for one in parts]),
-        np.concatenate([one.covariance for one in parts]),
-    )
-
-
 def _concatenate_points(found: Sequence[CoveringPoints]) -> CoveringPoints:
     """Concatenate points and renumber them consecutively."""
     first = np.cumsum([0, *(len(one.points) for one in found)])
@@ -313,7 +303,7 @@ def _concatenate_points(found: Sequence[CoveringPoints]) -> CoveringPoints:
         for one, start in zip(found, first.tolist(), strict=False)
     ]
     return CoveringPoints(
-        _concatenate_image_points(moved),
+        ImagePoints.joined(moved),
         np.concatenate([one.points for one in found]),
         np.concatenate([one.residuals for one in found]),
         sum(one.matched for one in found),

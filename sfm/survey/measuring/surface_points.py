@@ -166,9 +166,20 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     shown = factor**2 * matching + common_px**2 * np.eye(2)
+    return with_weights(network, shown)
+
+
+def with_weights(network: Network, shown: FloatArray) -> Network:
+    """Return the network with other covariances of its image points, scaled to the median of those it has.
+
+    Args:
+        network: network of k image points.
+        shown: covariances whose common factor means nothing, (k, 2, 2).
+    """
+    seen = network.image_points
     usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))
-    shown *= usual / np.median(np.trace(shown, axis1=1, axis2=2))
-    return replace(network, image_points=replace(seen, covariance=shown))
+    covariance = shown * (usual / np.median(np.trace(shown, axis1=1, axis2=2)))
+    return replace(network, image_points=replace(seen, covariance=covariance))
 
 
 def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:

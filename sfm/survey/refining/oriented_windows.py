@@ -326,12 +326,7 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
     """Return a model with targets appended to its points, and with their control and scale bars."""
     n, added = len(network.points), targets.network
     first, second, control, bars = network.image_points, added.image_points, added.control, added.scale_bars
-    joined = ImagePoints(
-        np.concatenate([first.image, second.image]),
-        np.concatenate([first.point, n + second.point]),
-        np.concatenate([first.xy, second.xy]),
-        np.concatenate([first.covariance, second.covariance]),
-    )
+    joined = ImagePoints.joined([first, replace(second, point=n + second.point)])
     return replace(
         network,
         points=network.points + added.points,

@@ -32,7 +32,7 @@ from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.measuring.surface_points import RAYS_OF_NOISE
+from sfm.survey.measuring.surface_points import RAYS_OF_NOISE, with_weights
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.source import Correspondences, SurveySource
 
@@ -93,17 +93,13 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
     first = parts[0]
     if len(parts) == 1:
         return replace(first, network=network)
-    index = {name: j for j, name in enumerate(network.points)}
-    min_rays = np.full(len(network.points), np.iinfo(np.int64).max)
-    for part in parts:
-        np.minimum.at(min_rays, [index[name] for name in part.network.points], part.min_rays)
     seen = set(network.images)
     failed = {lost.image: lost for part in parts for lost in part.failed if lost.image not in seen}
     return Measurements(
         network,
         first.cameras,
         tuple(dict.fromkeys(name for part in parts for name in part.images)),
-        min_rays,
+        _fewest_rays(network, parts),
         tuple(failed.values()),
         _joined_overlays([part.overlays for part in parts]),
         next((part.files for part in parts if part.files is not None), None),
@@ -123,12 +119,10 @@ def _joined(survey: Survey, networks: Sequence[Network]) -> Network:
         return replace(first, sources=sources)
     images = tuple(dict.fromkeys(name for network in networks for name in network.images))
     points = tuple(dict.fromkeys(name for network in networks for name in network.points))
-    image, point = ({name: k for k, name in enumerate(names)} for names in (images, points))
     camera = np.zeros(len(images), dtype=np.int64)
     parts, bars = [], [scale_bars(survey.scale_bars, points)]
     for k, network in enumerate(networks):
-        of_image = np.array([image[name] for name in network.images], dtype=np.int64)
-        of_point = np.array([point[name] for name in network.points], dtype=np.int64)
+        of_image, of_point = _indices(network.images, images), _indices(network.points, points)
         camera[of_image] = network.camera
         seen = network.image_points
         source = np.full(len(seen), k)
@@ -138,20 +132,8 @@ def _joined(survey: Survey, networks: Sequence[Network]) -> Network:
             network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
         )
     return replace(
-        network_of(survey, images, camera, points, _concatenated(parts), bars=_all_bars(bars)),
+        network_of(survey, images, camera, points, ImagePoints.joined(parts), bars=_all_bars(bars)),
         sources=sources,
-    )
-
-
-def _concatenated(parts: Sequence[ImagePoints]) -> ImagePoints:
-    stated = [np.ones(len(part), dtype=bool) if part.stated is None else part.stated for part in parts]
-    return ImagePoints(
-        np.concatenate([part.image for part in parts]),
-        np.concatenate([part.point for part in parts]),
-        np.concatenate([part.xy for part in parts]),
-        np.concatenate([part.covariance for part in parts]),
-        np.concatenate(stated),
-        np.concatenate([part.source for part in parts if part.source is not None]),
     )
 
 
@@ -178,6 +160,14 @@ def _joined_overlays(overlays: Sequence[Sequence[PhotographTargets]]) -> tuple[P
 def _indices(names: Sequence[str], of: Sequence[str]) -> IntArray:
     index = {name: k for k, name in enumerate(of)}
     return np.array([index[name] for name in names], dtype=np.int64)
+
+
+def _fewest_rays(network: Network, parts: Sequence[Measurements | Correspondences]) -> IntArray:
+    """Return how many rays each point needs, by the source that asks for the fewest, (n,)."""
+    fewest = np.full(len(network.points), np.iinfo(np.int64).max)
+    for part in parts:
+        np.minimum.at(fewest, _indices(part.network.points, network.points), part.min_rays)
+    return fewest
 
 
 def _orientation_of(start: Orientation, measured: Measurements, source: int) -> Orientation:
@@ -217,10 +207,7 @@ def _joined_correspondences(
     out = np.isin(network.images, list(elsewhere))
     position[out], rotation[out] = np.nan, np.nan
     estimate = replace(start.estimate, position=position, rotation=rotation)
-    min_rays = np.full(len(network.points), np.iinfo(np.int64).max)
-    for matched in completed:
-        rows = _indices(matched.network.points, network.points)
-        np.minimum.at(min_rays, rows, matched.min_rays)
+    min_rays = _fewest_rays(network, completed)
     rays = intersect_image_points(
         network.image_points,
         network.camera,
@@ -282,8 +269,4 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px
         _, factors, _ = estimate_components(adjust_with, part.source, names)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
-    scale = (factors / factors[0])[network.source]
-    covariance = scale[:, None, None] ** 2 * seen.covariance
-    usual = np.median(np.trace(seen.covariance, axis1=1, axis2=2))
-    covariance *= usual / np.median(np.trace(covariance, axis1=1, axis2=2))
-    return replace(network, image_points=replace(seen, covariance=covariance))
+    return with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
