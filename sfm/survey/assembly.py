@@ -26,6 +26,7 @@ from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import Section
+from sfm.survey.inputs.sources import tables_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.joined import sources_of
@@ -129,7 +130,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         ("control points", survey.control and survey.control.names),
         ("photographs of [exterior]", survey.exterior and survey.exterior.names),
         ("scale bars", survey.scale_bars),
-        ("image points", survey.observations and survey.observations.point),
+        ("image points", [name for given in tables_of(survey.observations) for name in given.point]),
     )
     stated = [f"{len(values)} {name}" for name, values in given if values]
     if stated:

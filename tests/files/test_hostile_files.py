@@ -25,9 +25,9 @@ from sfm.files.csv_tables import read_header, read_table
 from sfm.inspection.planned_survey import read_plan
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.refining.refinement import refine_model
+from sfm.survey.sources.given import measure_given
 from tests.findings import findings_of
 from tests.inspection.benches import one_bench
 from tests.synthetic import make_network, seed_of
@@ -335,7 +335,7 @@ def test_very_many_photographs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         SurveyFileError, match=r"obs\.csv: 20001 photographs, at most 20000 are adjusted together"
     ):
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))
     assert time.process_time() - begun < SECONDS
 
 
@@ -345,7 +345,7 @@ def test_pixels_that_no_sensor_has_are_refused(tmp_path: Path, pixel: str) -> No
     path = write_survey(tmp_path, ["i1", "i2"])
     path.write_text(path.read_text().replace("[0.005, 0.005]", pixel))
     with pytest.raises(SurveyFileError, match=r"camera c: a pixel of .* mm, expected sides of at most 1000"):
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))
 
 
 @pytest.mark.parametrize(

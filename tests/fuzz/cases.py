@@ -35,8 +35,8 @@ from sfm.survey.inputs.given import (
     read_points,
 )
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.sources.given import measure_given
 from sfm.targets.codes.rings import read_code_table
 from sfm.targets.detect import find_targets
 from tests.fuzz.mutate import mutate_bytes, mutate_text
@@ -197,7 +197,7 @@ def _read_folder(folder: Path, rng: random.Random) -> None:
         cameras = tuple(camera.model_copy(update={"images": (pattern,)}) for camera in survey.cameras)
         found = replace(survey, cameras=cameras)
         if rng.random() < 0.3:
-            measurements_from_observations(found)
+            measure_given(found)
         for path in find_photographs(found).paths:
             assert path.resolve().is_relative_to(inner.resolve())
 
@@ -293,7 +293,7 @@ def _read_survey(folder: Path, rng: random.Random) -> None:
     if survey.observations is None:
         find_photographs(survey)
         return
-    measurements_from_observations(survey)
+    measure_given(survey)
     if rng.random() < SOLVED_SHARE:
         run_survey(survey)
 

@@ -18,10 +18,10 @@ from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics
 from sfm.report.survey_report import text_report
 from sfm.survey.clock_offsets import rotation_spread
-from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.orientation import orient_survey
 from sfm.survey.rigs import with_moments
+from sfm.survey.sources.given import measure_given
 from tests.findings import findings_of
 from tests.rigs import make_rig
 from tests.survey.test_rigs import written
@@ -36,7 +36,7 @@ def test_the_offset_at_which_cameras_keep_their_mounts_is_taken(wrong: bool, tmp
     """One camera misses the first photograph, and its clock is one interval off."""
     network, truth = make_rig(seed_of("clocks"), moments=8)
     survey = read_survey(written(tmp_path, network, truth))
-    measured = measurements_from_observations(survey)
+    measured = measure_given(survey)
     camera, moment = measured.network.camera, measured.network.moment
     assert moment is not None
     names = np.array(measured.network.images)

@@ -31,9 +31,9 @@ from sfm.survey.inputs.given import (
     read_points,
     read_start_cameras,
 )
-from sfm.survey.inputs.start import measurements_from_observations
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.placing import place_on_control
+from sfm.survey.sources.given import measure_given
 from tests.findings import findings_of
 from tests.places import DATASETS, SHARED
 from tests.surveys import remarks_on_given, survey_of
@@ -220,9 +220,9 @@ def test_start_values_of_distortion_are_where_the_adjustment_begins() -> None:
     network, truth = make_network(seed_of("lens"), images=6, points=20)
     survey = survey_of(network, truth, free=("c", "K1", "K2"))
     camera = survey.cameras[0].model_copy(update={"start": (("K1", 8e-4), ("K2", -4e-6))})
-    measured = measurements_from_observations(replace(survey, cameras=(camera,)))
+    measured = measure_given(replace(survey, cameras=(camera,)))
     assert measured.cameras[0].value("K1") == 8e-4 and measured.cameras[0].value("K2") == -4e-6
-    assert measurements_from_observations(survey).cameras[0].value("K1") == 0.0
+    assert measure_given(survey).cameras[0].value("K1") == 0.0
 
 
 def test_start_orientations_alone_are_enough() -> None:
@@ -336,7 +336,7 @@ def test_covariances_of_image_coordinates_are_weights(unit: str, expected: float
     own = f"{0.1 * size},{0.1 * size},{0.005 * size**2}"
     rows = [f"{i},{p},{x},{y},{own}" for i, p, (x, y) in zip(given.image, given.point, places, strict=True)]
     path.write_text(header + "\n".join(rows) + "\n", encoding="utf-8")
-    measured = measurements_from_observations(replace(survey, observations=read_image_points(path)))
+    measured = measure_given(replace(survey, observations=read_image_points(path)))
     np.testing.assert_allclose(measured.network.image_points.covariance[:, 0, 1], expected)
     path.write_text(header + rows[0].rsplit(",", 1)[0] + ",1\n", encoding="utf-8")
     with pytest.raises(SurveyFileError, match="a correlation below 1"):

@@ -20,8 +20,8 @@ from sfm.report.output import write_result
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.settling import datum_carriers
-from sfm.survey.inputs.start import MARGIN_PX, MAX_OUTSIDE, measurements_from_observations, outside_photograph
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.sources.given import MARGIN_PX, MAX_OUTSIDE, measure_given, outside_photograph
 from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey
 from tests.synthetic import PIXEL_MM, SIZE_PX, add_narrow_points, make_network, observed_anew, seed_of
@@ -224,7 +224,7 @@ def spread(rows: Rows) -> Rows:
 
 def refused(path: Path, match: str) -> None:
     with pytest.raises(SurveyFileError, match=match) as error:
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))
     assert "\n" not in str(error.value)
 
 
@@ -264,7 +264,7 @@ def test_another_unit_is_named(tmp_path: Path) -> None:
 
 
 def test_single_points_outside_are_left_out_by_name(tmp_path: Path) -> None:
-    found = measurements_from_observations(
+    found = measure_given(
         read_survey(rewritten(tmp_path, lambda rows: [*rows, ["image 1", "new", "250000", "12"]]))
     )
     assert kinds_of(found.remarks) == ("image_points_outside",)
@@ -283,7 +283,7 @@ def test_the_share_of_gross_errors_that_is_left_out(tmp_path: Path, share: float
     if is_refused:
         refused(path, "is outside its photograph")
     else:
-        assert measurements_from_observations(read_survey(path)).left_out
+        assert measure_given(read_survey(path)).left_out
 
 
 def test_the_border_of_the_photograph() -> None:
@@ -300,4 +300,4 @@ def test_the_limits_of_the_field_of_view(tmp_path: Path, c_mm: float, is_refused
     if is_refused:
         refused(path, "field of view")
     else:
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))

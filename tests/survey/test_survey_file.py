@@ -15,9 +15,10 @@ from sfm.photographs.exif import Metadata
 from sfm.survey.adjusting.solution_remarks import datum_remarks
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.start import measurements_from_observations, start_values
+from sfm.survey.inputs.start import start_values
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import read_survey_file
+from sfm.survey.sources.given import measure_given
 
 FULL = """\
 [survey]
@@ -89,7 +90,7 @@ def write(folder: Path, text: str, **tables: str) -> Path:
 def network_of(path: Path) -> tuple[Network, Estimate]:
     """Return the network of a survey with observations, and its start values."""
     survey = read_survey(path)
-    measured = measurements_from_observations(survey)
+    measured = measure_given(survey)
     return measured.network, start_values(survey, measured.network, measured.cameras)
 
 

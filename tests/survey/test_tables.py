@@ -22,8 +22,9 @@ from sfm.report.tables.csv_files import write_tables as write_result_tables
 from sfm.solution import Solution
 from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.start import measurements_from_observations, merge_repeated
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.sources.given import measure_given
+from sfm.survey.sources.repeated import merge_repeated
 from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
@@ -125,7 +126,7 @@ def test_unknown_images_of_start_values_are_refused(tmp_path: Path) -> None:
     path.write_text(text + '[approximate]\nimages = "start.csv"\n', encoding="utf-8")
     assert len(read_exterior(path.parent / "start.csv").names) == 2
     with pytest.raises(SurveyFileError, match=r"start\.csv, line 3: image 'image 99' has no observations"):
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))
 
 
 @pytest.mark.parametrize("name", ["../outside.csv", "/etc/hostname", "link.csv", "a/../../outside.csv"])
@@ -137,9 +138,9 @@ def test_tables_outside_the_folder_are_refused_unless_allowed(tmp_path: Path, na
     text = path.read_text(encoding="utf-8").replace('"image_points.csv"', f'"{name}"')
     path.write_text(text, encoding="utf-8")
     with pytest.raises(SurveyFileError, match=r"leaves the survey's folder; --allow-outside allows"):
-        measurements_from_observations(read_survey(path))
+        measure_given(read_survey(path))
     if name != "/etc/hostname":
-        measured = measurements_from_observations(read_survey(path, allow_outside=True))
+        measured = measure_given(read_survey(path, allow_outside=True))
         assert len(measured.images) == 6
 
 

@@ -128,7 +128,7 @@ class StartCameras:
 
 @dataclass(frozen=True)
 class Observations:
-    """Measured image points in place of photographs.
+    """Measured image points, in place of photographs or beside them.
 
     Example:
         >>> import sfm
@@ -144,6 +144,7 @@ class Observations:
     unit: str  # px | mm
     table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
+    sigma_px: float | None = None  # of rows without standard deviations; None: that of the survey
 
     def __len__(self) -> int:
         return len(self.point)

@@ -209,6 +209,15 @@ def refuse_many(where: str, images: Sequence[str]) -> None:
         )
 
 
+def readable_photographs(photographs: PhotographList) -> tuple[IntArray, tuple[Metadata, ...]]:
+    """Return the indices of the photographs whose metadata can be read, and these."""
+    found = {}
+    for k, path in enumerate(photographs.paths):
+        with suppress(PhotographError, OSError):  # the others are reported when they are measured
+            found[k] = read_metadata(path)
+    return np.array(list(found), dtype=np.int64), tuple(found.values())
+
+
 def _describe_files(folder: Path) -> str:
     """Return a short description of the files in a folder."""
     files = sorted(path.name for path in folder.iterdir() if path.is_file())

@@ -290,9 +290,10 @@ class EquipmentSettings(Section):
 
 
 class ObservationSettings(Section):
-    """[observations]: measured image points in place of photographs."""
+    """[observations]: measured image points in place of photographs; [[observations]]: beside them."""
 
     file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
+    sigma_px: Length | None = None  # standard deviation of rows that state none; else that of [adjust]
 
 
 class ObservationTableSettings(Section):

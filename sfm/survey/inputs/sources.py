@@ -28,7 +28,7 @@ class Declared:
     describe: Callable[[Any], str]  # the settings of the table in a few words
     stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
     is_stated: Callable[[Any], bool] = lambda settings: settings is not None
-    is_alone: bool = False  # whether it leaves no place for others
+    is_alone: Callable[[Any], bool] = lambda settings: False  # whether it leaves no place for others
 
 
 ROWS = (  # in the order of their points in a network; the first is that of a survey that states none
@@ -40,8 +40,12 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
         lambda targets: targets.codes != "none",
     ),
     Declared(
-        GIVEN, "observations", lambda table: counted(len(table), "image point"), is_alone=True
-    ),  # measured elsewhere, in photographs that are not here
+        GIVEN,
+        "observations",
+        lambda given: counted(sum(map(len, tables_of(given))), "image point"),
+        is_stated=lambda given: bool(tables_of(given)),
+        is_alone=lambda given: not isinstance(given, tuple),  # one table, in place of photographs
+    ),
     Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
 )
 
@@ -49,7 +53,15 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
 def declared(survey: object) -> tuple[Declared, ...]:
     """Return the sources of the image points of a survey or its file."""
     stated = tuple(row for row in ROWS if row.is_stated(getattr(survey, row.table))) or ROWS[:1]
-    return tuple(row for row in stated if row.is_alone)[:1] or stated
+    alone = tuple(row for row in stated if row.is_alone(getattr(survey, row.table)))
+    return alone[:1] or stated
+
+
+def tables_of(given: Any) -> tuple[Any, ...]:
+    """Return the tables of given image points of a survey: those beside photographs, or the one alone."""
+    if given is None:
+        return ()
+    return given if isinstance(given, tuple) else (given,)
 
 
 def descriptions(survey: object) -> list[str]:

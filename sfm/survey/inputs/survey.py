@@ -60,7 +60,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
-from sfm.survey.inputs.sources import descriptions, reads_photographs
+from sfm.survey.inputs.sources import descriptions, reads_photographs, tables_of
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table
 from sfm.targets.codes.plates import TargetFamily, code_family, is_table
@@ -91,8 +91,8 @@ class CameraSetup(CameraSettings):
 class Survey:
     """A survey: photographs to measure and adjust, and all values known beforehand.
 
-    Given observations may replace the photographs. Settings may be dictionaries with the keys of the survey
-    file, such as `targets={"codes": "ring14"}`.
+    Given image points may replace the photographs, or stand beside them. Settings may be dictionaries with
+    the keys of the survey file, such as `targets={"codes": "ring14"}`.
 
     Example:
         >>> import sfm
@@ -122,7 +122,8 @@ class Survey:
     tables: tuple[ObservationTable, ...] = ()  # of survey observations: tape, level, GNSS
     copied: tuple[str, ...] = ()  # observations that a table has more than once
     equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
-    observations: Observations | None = None  # measured image points in place of photographs
+    # measured image points: one table in place of photographs, or tables beside them
+    observations: Observations | tuple[Observations, ...] | None = None
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
@@ -143,6 +144,8 @@ class Survey:
             said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
             cameras = tuple(said)
         datum: object = self.datum
+        if isinstance(self.observations, list):
+            object.__setattr__(self, "observations", tuple(self.observations))
         if isinstance(datum, Datum):
             datum = {"kind": datum.kind, "points": () if datum.points is None else datum.points}
         values = {
@@ -311,7 +314,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
             *(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
             *equipment.bars,
         ),
-        observations=read(read_image_points, file.observations.file if file.observations else None),
+        observations=_given_image_points(file),
         diameters=read(read_diameters, file.targets.diameters),
         start_orientations=read(read_exterior, file.approximate.images),
         start_points=read(read_points, file.approximate.points),
@@ -320,6 +323,19 @@ def survey_of_file(file: SurveyFile) -> Survey:
         allow_outside=file.allow_outside,
         source=file.source,
     )
+
+
+def _given_image_points(file: SurveyFile) -> Observations | tuple[Observations, ...] | None:
+    """Return the image points that a survey file gives, in place of photographs or beside them.
+
+    Raises:
+        SurveyFileError: a table is unreadable.
+    """
+    tables = tuple(
+        replace(read_image_points(file.beside(one.file)), sigma_px=one.sigma_px)
+        for one in tables_of(file.observations)
+    )
+    return tables if isinstance(file.observations, tuple) else next(iter(tables), None)
 
 
 def _given_by_equipment(file: SurveyFile) -> GivenEquipment:

@@ -38,6 +38,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
+from sfm.survey.inputs.sources import tables_of
 from sfm.targets.codes.plates import is_table
 
 
@@ -57,7 +58,9 @@ class SurveyFile(Section):
     rigs: Annotated[tuple[RigSettings, ...], Field(strict=False, max_length=MAX_RIGS, alias="rig")] = ()
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
     equipment: Annotated[tuple[EquipmentSettings, ...], Field(strict=False, max_length=MAX_TABLES)] = ()
-    observations: ObservationSettings | None = None
+    observations: (
+        ObservationSettings | Annotated[tuple[ObservationSettings, ...], Field(strict=False)] | None
+    ) = None  # [observations] in place of photographs, or [[observations]] beside them
     observation_tables: Annotated[
         tuple[ObservationTableSettings, ...],
         Field(strict=False, max_length=MAX_TABLES, alias="survey_observations"),
@@ -132,7 +135,6 @@ class SurveyFile(Section):
         names = [
             self.control.file if self.control else None,
             self.exterior.file if self.exterior else None,
-            self.observations.file if self.observations else None,
             self.approximate.images,
             self.approximate.points,
             self.approximate.cameras,
@@ -140,7 +142,7 @@ class SurveyFile(Section):
             self.targets.diameters,
         ]
         names += [name for rig in self.rigs for name in (rig.mounts, rig.table)]
-        names += [table.file for table in self.observation_tables]
+        names += [table.file for table in (*tables_of(self.observations), *self.observation_tables)]
         if self.head.equipment is not None:
             path = self.beside(self.head.equipment)
             found = read_equipment(path, allow_outside=self._allow_outside)

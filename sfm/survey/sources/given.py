@@ -1,8 +1,257 @@
-"""Given image points of a survey, of another program or measured by hand; they do not change."""
+"""Given image points of a survey, of another program or measured by hand, in photographs or in their place.
+
+Image points outside their photograph mean that a value or a setting is wrong. A few are gross errors and are
+left out. If there are more, the survey is refused, and the message states what would bring them inside: x and
+y exchanged, another unit, or a larger photograph.
+"""
 
 from __future__ import annotations
 
-from sfm.survey.inputs.start import measurements_from_observations
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from sfm.camera import Camera
+from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
+from sfm.display import listed
+from sfm.errors import SurveyFileError
+from sfm.network import ImagePoints, Network, rows_of
+from sfm.remarks.remark import remark
+from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
+from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
+from sfm.survey.inputs.checks.copies import same_photographs
+from sfm.survey.inputs.given import Observations
+from sfm.survey.inputs.measurements import (
+    NO_PHOTOGRAPHS,
+    Measurements,
+    PhotographList,
+    readable_photographs,
+    refuse_many,
+)
+from sfm.survey.inputs.sources import tables_of
+from sfm.survey.inputs.start import network_of, refuse_unknown_photographs
+from sfm.survey.inputs.survey import Survey
+from sfm.survey.sources.repeated import merge_repeated
 from sfm.survey.sources.source import SurveySource, complete_as_measured
 
-SOURCE = SurveySource(lambda survey, files, **_: measurements_from_observations(survey), complete_as_measured)
+MARGIN_PX = 1.0  # difference to programs that count pixels from 1 or from corners
+MAX_OUTSIDE = 0.05  # of the image points; measuring never makes more gross errors
+MIN_RAYS = 2  # photographs that a point with a name needs
+DRAWN_PX = 8.0  # radius of the circles around given image points in the report
+
+
+def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: object) -> Measurements:
+    """Return the network of the image points that a survey gives.
+
+    Photographs and points are numbered in the order in which the tables first name them. The control is
+    part of the network in every datum. The adjustment uses it only if the datum is `control`.
+
+    Args:
+        survey: a survey with given image points.
+        files: its photographs; none if the image points stand in their place. A table may name a photograph
+            without its folder, and photographs that are not here.
+
+    Raises:
+        SurveyFileError: there are no observations, image points are outside their photographs, or the start
+            values of a camera are incomplete.
+        PhotographError: photographs of different sizes have the same camera.
+    """
+    tables: tuple[Observations, ...] = tables_of(survey.observations)
+    if not tables:
+        raise SurveyFileError(f"{survey.source}: [observations] with a file of image points is needed")
+    readable, metadata = readable_photographs(files)
+    cameras = start_cameras(
+        survey.cameras,
+        survey.source,
+        metadata,
+        files.camera[readable],
+        tuple(files.names[k] for k in readable),
+        survey.start_cameras,
+    )
+    full = _full_names(files)
+    images, image = _numbered([full.get(name, name) for table in tables for name in table.image])
+    refuse_many(str(tables[0].table.path), images)
+    points, point = _numbered([name for table in tables for name in table.point])
+    of_file = dict(zip(files.names, files.camera.tolist(), strict=True))
+    owner = np.array(
+        [
+            of_file[name] if name in of_file else camera_of_image(survey.cameras, name, survey.source)
+            for name in images
+        ],
+        dtype=np.int64,
+    )
+    refuse_ungrouped(survey.cameras, images, owner, survey.source)
+    parts, outside_parts, first = [], [], 0
+    for table in tables:
+        rows = slice(first, first + len(table))
+        first = rows.stop
+        camera = owner[image[rows]]
+        xy, covariance = _in_pixels(table, cameras, camera, table.sigma_px or survey.adjust.sigma_px)
+        outside_parts.append(refuse_outside(table, xy, cameras, camera))
+        sigma = np.full(xy.shape, np.nan) if table.sigma is None else table.sigma
+        stated = np.asarray(np.isfinite(sigma).all(axis=1)) | (table.sigma_px is not None)
+        parts.append(ImagePoints(image[rows], point[rows], xy, covariance, stated))
+    seen, outside = ImagePoints.joined(parts), np.concatenate(outside_parts)
+    gross = [f"{points[seen.point[k]]} in {images[seen.image[k]]}" for k in np.flatnonzero(outside)]
+    refuse_unknown_photographs(survey, (*files.names, *images))
+    every = images
+    copies = same_photographs(seen.image, seen.point, seen.xy, owner)
+    distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
+    number = np.cumsum(distinct) - 1
+    failed = tuple(
+        FailedImage(every[i], remark("copies", original=every[j], same="image points"))
+        for i, j in copies.items()
+    )
+    images, owner = tuple(name for name, keep in zip(images, distinct, strict=True) if keep), owner[distinct]
+    kept = seen.select(distinct[seen.image] & ~outside)
+    merged = merge_repeated(replace(kept, image=number[kept.image]))
+    if len(files):  # what the survey gives besides is part of the network of all sources
+        network = Network(images, owner, points, merged.image_points)
+    else:
+        network = network_of(survey, images, owner, points, merged.image_points)
+    times = Counter(zip(number[kept.image].tolist(), kept.point.tolist(), strict=True))
+    contradicting = tuple(
+        LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
+        for i, j in merged.dropped
+        for name in [f"{points[j]} in {images[i]}"]
+    )
+    outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
+    return Measurements(
+        network,
+        cameras,
+        every,
+        np.full(len(points), MIN_RAYS),
+        failed,
+        _overlays(network, files, readable),
+        remarks=(*merged.remarks(images, points), *outside_remark),
+        left_out=(
+            *contradicting,
+            *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
+        ),
+    )
+
+
+def _full_names(files: PhotographList) -> dict[str, str]:
+    """Return the name of each photograph whose name without folders is that of no other, by that name."""
+    count = Counter(PurePosixPath(name).name for name in files.names)
+    known = set(files.names)
+    return {
+        short: name
+        for name in files.names
+        for short in [PurePosixPath(name).name]
+        if count[short] == 1 and short not in known
+    }
+
+
+def _numbered(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
+    """Return the unique names in order of first appearance, and the index of each entry."""
+    number: dict[str, int] = {}
+    index = np.array([number.setdefault(name, len(number)) for name in names], dtype=np.int64)
+    return tuple(number), index
+
+
+def _overlays(network: Network, files: PhotographList, readable: IntArray) -> tuple[PhotographTargets, ...]:
+    """Return circles around the given image points of each photograph that can be read."""
+    index = {name: i for i, name in enumerate(network.images)}
+    of_image = rows_of(network.image_points.image, len(network.images))
+    drawn = []
+    for k in readable.tolist():
+        if files.names[k] in index:
+            xy = network.image_points.xy[of_image[index[files.names[k]]]]
+            circles = np.full((len(xy), 2), DRAWN_PX), np.zeros(len(xy))
+            none = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+            drawn.append(PhotographTargets(files.names[k], files.paths[k], xy, *circles, *none))
+    return tuple(drawn)
+
+
+def _in_pixels(
+    given: Observations, cameras: tuple[Camera, ...], camera: IntArray, sigma_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return positions, px, (k, 2), and their covariance, px^2, (k, 2, 2), of rows in px or mm."""
+    xy, sigma = given.xy, given.sigma
+    between = np.zeros(len(xy)) if given.covariance is None else given.covariance.copy()
+    xy_px = xy.copy()
+    s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
+    if given.unit == "mm":
+        for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+            xy_px[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
+            if sigma is not None:
+                s[rows] = sigma[rows] / one.pixel_mm
+                between[rows] /= -one.pixel_mm.prod()  # y is up in the image frame, down in px
+    s = np.where(np.isnan(s), sigma_px, s)
+    covariance = np.zeros((len(xy), 2, 2))
+    covariance[:, range(2), range(2)] = s**2
+    covariance[:, 0, 1] = covariance[:, 1, 0] = between
+    return xy_px, covariance
+
+
+def outside_photograph(xy: FloatArray, size: FloatArray) -> BoolArray:
+    """Return whether image points are outside their photographs, (k,).
+
+    Args:
+        xy: image points, px, (k, 2).
+        size: width and height of each image point's photograph, px, (k, 2).
+    """
+    return np.asarray(((xy < -0.5 - MARGIN_PX) | (xy > size - 0.5 + MARGIN_PX)).any(axis=1))
+
+
+def refuse_outside(
+    given: Observations, xy: FloatArray, cameras: Sequence[Camera], camera: IntArray
+) -> BoolArray:
+    """Return which image points are outside their photographs, (k,).
+
+    Args:
+        given: image points as given.
+        xy: image points, px, (k, 2).
+        cameras: cameras of the survey.
+        camera: camera index of each image point, (k,).
+
+    Raises:
+        SurveyFileError: so many are outside that a setting is wrong, or all are inside with x and y
+            exchanged.
+    """
+    size = np.array([one.size_px for one in cameras], dtype=float)[camera]
+    outside = outside_photograph(xy, size)
+    count, allowed = int(outside.sum()), MAX_OUTSIDE * len(xy)
+    if not count:
+        return outside
+    reasons = [
+        words
+        for words, other, other_size in _alternatives(given, xy, size, cameras, camera)
+        if outside_photograph(other, other_size).sum() <= (allowed if count > allowed else 0)
+    ]
+    if count <= allowed and not (reasons and reasons[0] == EXCHANGED):
+        return outside
+    k = int(np.argmax(outside))
+    names = listed(dict.fromkeys(cameras[a].name for a in camera[outside].tolist()))
+    width, height = size[k].astype(int)
+    x, y = given.xy[k]
+    needed = np.ceil(xy[outside].max(axis=0)).astype(int)
+    larger = f"size_px must be {needed[0]} x {needed[1]} or more, or the unit is another"
+    raise SurveyFileError(
+        f"{given.table.place(k)}: image point {x:g}, {y:g} {given.unit} is outside its photograph of {width} "
+        f"x {height} px (camera {names}), as are {count} of {len(xy)}: {reasons[0] if reasons else larger}"
+    )
+
+
+EXCHANGED = "with x and y exchanged, or width and height in size_px, they are inside"
+
+
+def _alternatives(
+    given: Observations, xy: FloatArray, size: FloatArray, cameras: Sequence[Camera], camera: IntArray
+) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Yield (possible mistake, image points and photograph sizes without it, px)."""
+    yield EXCHANGED, xy, size[:, ::-1]
+    if given.unit == "mm":
+        yield "read as px in place of mm they are inside", given.xy, size
+        return
+    read = xy.copy()
+    for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+        read[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
+    yield "read as mm in place of px they are inside", read, size
+
+
+SOURCE = SurveySource(measure_given, complete_as_measured)
