@@ -76,6 +76,14 @@ POINTS = (
         "Correct the names.",
     ),
     Kind(
+        "sources_offset",
+        "warning",
+        "{sources:@} differ by {x:+} in x and {y:+} in y at {common:image point} that both have; the first "
+        "were left out there.",
+        "another origin of pixels: the corner of the first pixel is half a pixel from its centre",
+        "Correct the table of image points, or leave it out; the others in it are off as well.",
+    ),
+    Kind(
         "codes_at_several_places",
         "warning",
         "{codes:code} {codes:has|have} rays that do not meet at one position: {codes}, in "

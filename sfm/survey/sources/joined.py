@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import cast
 
@@ -17,14 +17,15 @@ from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, without_given
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.reduced_network import reduce_network, select_determined
-from sfm.result import PhotographTargets
+from sfm.remarks.remark import Remark, remark
+from sfm.result import LeftOutPoint, PhotographTargets
 from sfm.runtime.progress import StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
 from sfm.survey.inputs.sources import Declared, declared
@@ -34,6 +35,7 @@ from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.surface_points import RAYS_OF_NOISE, with_weights
 from sfm.survey.orientation import Oriented
+from sfm.survey.sources.repeated import merge_sources
 from sfm.survey.sources.source import Correspondences, SurveySource
 
 
@@ -89,15 +91,15 @@ def complete_sources(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
 
 def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measurements:
     """Return the measurements of all sources as those of one network."""
-    network = _joined(survey, [part.network for part in parts])
-    first = parts[0]
     if len(parts) == 1:
-        return replace(first, network=network)
+        return replace(parts[0], network=_of_one_source(survey, parts[0].network))
+    parts = [replace(part, network=network) for part, network in zip(parts, _renamed(parts), strict=True)]
+    network, repeated = _joined(survey, [part.network for part in parts])
     seen = set(network.images)
     failed = {lost.image: lost for part in parts for lost in part.failed if lost.image not in seen}
     return Measurements(
         network,
-        first.cameras,
+        parts[0].cameras,
         tuple(dict.fromkeys(name for part in parts for name in part.images)),
         _fewest_rays(network, parts),
         tuple(failed.values()),
@@ -105,18 +107,51 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
         next((part.files for part in parts if part.files is not None), None),
         next((part.photographs for part in parts if part.photographs is not None), None),
         next((part.naming for part in parts if part.naming.names), NO_NAMES),
-        tuple(remark for part in parts for remark in part.remarks),
-        tuple(point for part in parts for point in part.left_out),
+        (*(remark for part in parts for remark in part.remarks), *repeated.remarks),
+        (*(point for part in parts for point in part.left_out), *repeated.left_out),
         tuple(parts),
     )
 
 
-def _joined(survey: Survey, networks: Sequence[Network]) -> Network:
+def _of_one_source(survey: Survey, network: Network) -> Network:
+    return replace(network, sources=tuple(row.source for row in declared(survey)))
+
+
+def _renamed(parts: Sequence[Measurements | Correspondences]) -> list[Network]:
+    """Return the networks of all sources, where running names of points are those of no other point.
+
+    A code, or a name that was given, is the same point in all sources. A number that a source gives to a
+    point without a name, such as u001, may be that of a point of an earlier run in another.
+    """
+    given = [{name for name in part.network.points if name not in _running(part)} for part in parts]
+    networks = []
+    for k, part in enumerate(parts):
+        others = set().union(*(names for j, names in enumerate(given) if j != k))
+        double = others & _running(part)
+        points = tuple(f"{name} (2)" if name in double else name for name in part.network.points)
+        networks.append(replace(part.network, points=points))
+    return networks
+
+
+def _running(part: Measurements | Correspondences) -> set[str]:
+    """Return the names of the points of a source that were numbered in this run."""
+    names = part.naming.names
+    if names:
+        return {name for name, code in zip(names, part.naming.code.tolist(), strict=True) if code < 0}
+    return set() if part.network.sources[0].names_last else set(part.network.points)
+
+
+@dataclass(frozen=True)
+class _Repeated:
+    """Image points that several sources measured."""
+
+    remarks: tuple[Remark, ...]  # on sources and image points that contradict one another
+    left_out: tuple[LeftOutPoint, ...]
+
+
+def _joined(survey: Survey, networks: Sequence[Network]) -> tuple[Network, _Repeated]:
     """Return the network of the image points of all sources, with everything else that the survey gives."""
     sources = tuple(row.source for row in declared(survey))
-    first = networks[0]
-    if len(networks) == 1:
-        return replace(first, sources=sources)
     images = tuple(dict.fromkeys(name for network in networks for name in network.images))
     points = tuple(dict.fromkeys(name for network in networks for name in network.points))
     camera = np.zeros(len(images), dtype=np.int64)
@@ -131,10 +166,15 @@ def _joined(survey: Survey, networks: Sequence[Network]) -> Network:
         bars.append(
             network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
         )
-    return replace(
-        network_of(survey, images, camera, points, ImagePoints.joined(parts), bars=_all_bars(bars)),
-        sources=sources,
+    merged, offsets = merge_sources(ImagePoints.joined(parts), sources)
+    contradicting = tuple(f"{points[j]} in {images[i]}" for i, j in merged.dropped)
+    remarks = (remark("image_points_contradicting", image_points=contradicting),) if contradicting else ()
+    left_out = tuple(
+        LeftOutPoint(name, 2, remark("image_points_contradicting", image_points=name))
+        for name in contradicting
     )
+    network = network_of(survey, images, camera, points, merged.image_points, bars=_all_bars(bars))
+    return replace(network, sources=sources), _Repeated((*offsets, *remarks), left_out)
 
 
 def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
@@ -184,18 +224,36 @@ def _orientation_of(start: Orientation, measured: Measurements, source: int) -> 
             points=estimate.points[points],
         ),
         point_failures=tuple(failure for failure in start.point_failures if failure[0] in known),
-        fits=start.fits[whole.source == source],
+        fits=_rows_of(part.network, images, points, start.fits, whole),
     )
+
+
+def _rows_of(part: Network, images: IntArray, points: IntArray, fits: BoolArray, whole: Network) -> BoolArray:
+    """Return which image points of a source fit, (k,); those that another source has in their place do not.
+
+    Args:
+        part: network of the source.
+        images: index of its photographs in the whole network, (m,).
+        points: index of its points, (n,).
+        fits: which image points of the whole network fit.
+        whole: network of all sources.
+    """
+    n = len(whole.points)
+    seen = whole.image_points.select(fits)
+    fitting = np.unique(seen.image * n + seen.point)
+    return np.isin(images[part.image_points.image] * n + points[part.image_points.point], fitting)
 
 
 def _joined_correspondences(
     survey: Survey, measured: Measurements, start: Orientation, completed: Sequence[Correspondences]
 ) -> Correspondences:
     """Return the image points of all sources in the orientation of all photographs."""
-    network = _joined(survey, [matched.network for matched in completed])
-    first = completed[0]
     if len(completed) == 1:
-        return replace(first, network=network)
+        return replace(completed[0], network=_of_one_source(survey, completed[0].network))
+    completed = [
+        replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
+    ]
+    network, _ = _joined(survey, [matched.network for matched in completed])
     images = _indices(network.images, measured.network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
     elsewhere = {
@@ -265,8 +323,11 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px
             alpha = level_of_single(FALSE_ALARM, 2 * len(factor))
             return adjust(part, start, sigma_px=sigma_px, image_sigma_factor=factor, alpha=alpha)
 
-        names = tuple(source.name for source in network.sources)
-        _, factors, _ = estimate_components(adjust_with, part.source, names)
+        present, group = np.unique(part.source, return_inverse=True)
+        names = tuple(network.sources[k].name for k in present)
+        _, found, _ = estimate_components(adjust_with, group, names)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
+    factors = np.ones(len(network.sources))
+    factors[present] = found
     return with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)

@@ -1,6 +1,7 @@
 """Image points that were measured several times in one photograph, in a table or by several sources.
 
-Agreeing measurements are averaged, and contradicting ones are left out.
+Agreeing measurements are averaged, and contradicting ones are left out. Two sources may state sigmas that are
+too small, so theirs are enlarged by what the differences of all their common image points show.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import BoolArray
-from sfm.distributions import LEVEL, chi2_ppf
-from sfm.network import ImagePoints, rows_of
-from sfm.remarks.remark import Remark, remark
+from sfm.conventions import BoolArray, FloatArray
+from sfm.distributions import LEVEL, chi2_isf, chi2_ppf
+from sfm.network import ImagePoints, Source, rows_of
+from sfm.remarks.remark import Quantity, Remark, remark
+
+FEWEST_COMMON = 4  # image points of two sources that show an offset between them
 
 
 @dataclass(frozen=True)
@@ -79,3 +82,63 @@ def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
     merged = replace(seen, xy=xy, covariance=covariance).select(keep)
     same, averaged, contradicting = (tuple(pairs) for pairs in kinds)
     return MergedImagePoints(merged, same, averaged, contradicting, dropped)
+
+
+def merge_sources(
+    seen: ImagePoints, sources: tuple[Source, ...]
+) -> tuple[MergedImagePoints, tuple[Remark, ...]]:
+    """Merge the image points that several sources measure, and report sources that are offset.
+
+    Where two sources differ by the same vector everywhere, such as by another origin of pixels, the image
+    points of the later one are left out where the earlier one has them too.
+
+    Args:
+        seen: image points of all sources, without repetitions in a source.
+        sources: the sources, the more trusted first.
+
+    Returns:
+        The image points, each of the first source that has it; remarks on offsets.
+    """
+    n = int(seen.point.max(initial=0)) + 1
+    key = seen.image * n + seen.point
+    source = np.zeros(len(seen), dtype=np.int64) if seen.source is None else seen.source
+    factor, keep = np.ones(len(seen)), np.ones(len(seen), dtype=bool)
+    remarks = []
+    for b in range(1, len(sources)):
+        for a in range(b):
+            rows = [np.flatnonzero(source == k) for k in (a, b)]
+            _, first, second = np.intersect1d(key[rows[0]], key[rows[1]], return_indices=True)
+            of_a, of_b = rows[0][first], rows[1][second]
+            if not len(of_a):
+                continue
+            difference = seen.xy[of_b] - seen.xy[of_a]
+            C = seen.covariance[of_a] + seen.covariance[of_b]
+            offset = np.median(difference, axis=0)
+            scale = max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
+            factor[of_a] = np.maximum(factor[of_a], np.sqrt(scale))
+            factor[of_b] = np.maximum(factor[of_b], np.sqrt(scale))
+            # the variance of a median is pi / 2 of that of a mean; what is below one sigma does not matter
+            together = _squares(offset[None], scale * np.median(C, axis=0)[None])[0]
+            significant = together * len(of_a) * 2 / np.pi > chi2_isf(LEVEL, 2)
+            if len(of_a) >= FEWEST_COMMON and significant and together > 1:
+                keep[of_b] = False
+                remarks.append(
+                    remark(
+                        "sources_offset",
+                        sources=[sources[b].name, sources[a].name],
+                        x=Quantity(float(offset[0]), "px"),
+                        y=Quantity(float(offset[1]), "px"),
+                        common=len(of_a),
+                    )
+                )
+    seen, key, factor = seen.select(keep), key[keep], factor[keep]
+    merged = merge_repeated(replace(seen, covariance=factor[:, None, None] ** 2 * seen.covariance))
+    kept, (_, first) = merged.image_points, np.unique(key, return_index=True)
+    back = factor[first[np.searchsorted(key[first], kept.image * n + kept.point)]]
+    kept = replace(kept, covariance=kept.covariance / back[:, None, None] ** 2)
+    return replace(merged, image_points=kept), tuple(remarks)
+
+
+def _squares(d: FloatArray, C: FloatArray) -> FloatArray:
+    """Return the squares of differences (n, 2) in units of their covariances (n, 2, 2), (n,)."""
+    return np.einsum("na,nab,nb->n", d, np.linalg.inv(C), d)
