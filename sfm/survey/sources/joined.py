@@ -35,7 +35,7 @@ from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.surface_points import RAYS_OF_NOISE, with_weights
 from sfm.survey.orientation import Oriented
-from sfm.survey.sources.repeated import merge_sources
+from sfm.survey.sources.repeated import without_repeated
 from sfm.survey.sources.source import Correspondences, SurveySource
 
 
@@ -166,15 +166,15 @@ def _joined(survey: Survey, networks: Sequence[Network]) -> tuple[Network, _Repe
         bars.append(
             network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
         )
-    merged, offsets = merge_sources(ImagePoints.joined(parts), sources)
-    contradicting = tuple(f"{points[j]} in {images[i]}" for i, j in merged.dropped)
+    once = without_repeated(ImagePoints.joined(parts), sources)
+    contradicting = tuple(f"{points[j]} in {images[i]}" for i, j in once.contradicting)
     remarks = (remark("image_points_contradicting", image_points=contradicting),) if contradicting else ()
     left_out = tuple(
         LeftOutPoint(name, 2, remark("image_points_contradicting", image_points=name))
         for name in contradicting
     )
-    network = network_of(survey, images, camera, points, merged.image_points, bars=_all_bars(bars))
-    return replace(network, sources=sources), _Repeated((*offsets, *remarks), left_out)
+    network = network_of(survey, images, camera, points, once.image_points, bars=_all_bars(bars))
+    return replace(network, sources=sources), _Repeated((*once.remarks, *remarks), left_out)
 
 
 def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:

@@ -1,12 +1,14 @@
 """Image points that were measured several times in one photograph, in a table or by several sources.
 
-Agreeing measurements are averaged, and contradicting ones are left out. Two sources may state sigmas that are
-too small, so theirs are enlarged by what the differences of all their common image points show.
+Agreeing measurements of one table are averaged, and contradicting ones are left out. Of those of two sources
+the first is used. Both may state sigmas that are too small, which the differences at all their common image
+points show; by these, also an offset is found, such as another origin of pixels.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -84,44 +86,47 @@ def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
     return MergedImagePoints(merged, same, averaged, contradicting, dropped)
 
 
-def merge_sources(
-    seen: ImagePoints, sources: tuple[Source, ...]
-) -> tuple[MergedImagePoints, tuple[Remark, ...]]:
-    """Merge the image points that several sources measure, and report sources that are offset.
+@dataclass(frozen=True)
+class OfOneSource:
+    """Image points of several sources, each measured once."""
 
-    Where two sources differ by the same vector everywhere, such as by another origin of pixels, the image
-    points of the later one are left out where the earlier one has them too.
+    image_points: ImagePoints
+    contradicting: tuple[
+        tuple[int, int], ...
+    ]  # (photograph, point) that sources measure at different positions
+    remarks: tuple[Remark, ...]  # on sources that are offset
+
+
+def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSource:
+    """Return the image points of several sources without those that an earlier source has as well.
+
+    Both measured the same pixels, so that their mean would hardly be better, and only look better. Those of
+    both are left out where they contradict one another, beside the differences at all their common points.
 
     Args:
         seen: image points of all sources, without repetitions in a source.
-        sources: the sources, the more trusted first.
-
-    Returns:
-        The image points, each of the first source that has it; remarks on offsets.
+        sources: the sources, the more precise first.
     """
-    n = int(seen.point.max(initial=0)) + 1
-    key = seen.image * n + seen.point
+    key = seen.image * (int(seen.point.max(initial=0)) + 1) + seen.point
     source = np.zeros(len(seen), dtype=np.int64) if seen.source is None else seen.source
-    factor, keep = np.ones(len(seen)), np.ones(len(seen), dtype=bool)
+    keep: BoolArray = np.ones(len(seen), dtype=bool)
+    contradicting: list[tuple[int, int]] = []
     remarks = []
-    for b in range(1, len(sources)):
-        for a in range(b):
-            rows = [np.flatnonzero(source == k) for k in (a, b)]
-            _, first, second = np.intersect1d(key[rows[0]], key[rows[1]], return_indices=True)
-            of_a, of_b = rows[0][first], rows[1][second]
-            if not len(of_a):
-                continue
-            difference = seen.xy[of_b] - seen.xy[of_a]
-            C = seen.covariance[of_a] + seen.covariance[of_b]
+    for a, b in combinations(range(len(sources)), 2):
+        rows = [np.flatnonzero(source == k) for k in (a, b)]
+        _, first, second = np.intersect1d(key[rows[0]], key[rows[1]], return_indices=True)
+        if not len(first):
+            continue
+        of_a, of_b = rows[0][first], rows[1][second]
+        keep[of_b] = False
+        difference, C = seen.xy[of_b] - seen.xy[of_a], seen.covariance[of_a] + seen.covariance[of_b]
+        offset = np.zeros(2)
+        if len(of_a) >= FEWEST_COMMON:  # of fewer the stated sigmas decide
             offset = np.median(difference, axis=0)
-            scale = max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
-            factor[of_a] = np.maximum(factor[of_a], np.sqrt(scale))
-            factor[of_b] = np.maximum(factor[of_b], np.sqrt(scale))
+            C = C * max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
             # the variance of a median is pi / 2 of that of a mean; what is below one sigma does not matter
-            together = _squares(offset[None], scale * np.median(C, axis=0)[None])[0]
-            significant = together * len(of_a) * 2 / np.pi > chi2_isf(LEVEL, 2)
-            if len(of_a) >= FEWEST_COMMON and significant and together > 1:
-                keep[of_b] = False
+            together = _squares(offset[None], np.median(C, axis=0)[None])[0]
+            if together > max(1.0, np.pi / 2 * chi2_isf(LEVEL, 2) / len(of_a)):
                 remarks.append(
                     remark(
                         "sources_offset",
@@ -131,12 +136,10 @@ def merge_sources(
                         common=len(of_a),
                     )
                 )
-    seen, key, factor = seen.select(keep), key[keep], factor[keep]
-    merged = merge_repeated(replace(seen, covariance=factor[:, None, None] ** 2 * seen.covariance))
-    kept, (_, first) = merged.image_points, np.unique(key, return_index=True)
-    back = factor[first[np.searchsorted(key[first], kept.image * n + kept.point)]]
-    kept = replace(kept, covariance=kept.covariance / back[:, None, None] ** 2)
-    return replace(merged, image_points=kept), tuple(remarks)
+        wrong = _squares(difference - offset, C) > chi2_isf(LEVEL / len(of_a), 2)
+        keep[of_a[wrong]] = False
+        contradicting += zip(seen.image[of_a[wrong]].tolist(), seen.point[of_a[wrong]].tolist(), strict=True)
+    return OfOneSource(seen.select(keep), tuple(contradicting), tuple(remarks))
 
 
 def _squares(d: FloatArray, C: FloatArray) -> FloatArray:
