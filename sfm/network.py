@@ -173,6 +173,11 @@ class Network:
         return common[self.source] if common.any() else np.ones(len(self.image_points), dtype=bool)
 
     @property
+    def has_common_errors(self) -> bool:
+        """Whether the errors of neighbouring image points of a source have a common part."""
+        return any(source.has_common_errors for source in self.sources)
+
+    @property
     def automatic_points(self) -> frozenset[str]:
         """Names of the points that may have other names in later runs."""
         return frozenset(name for name, named in zip(self.points, self.named, strict=True) if not named)

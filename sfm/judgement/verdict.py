@@ -83,7 +83,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *residual_remarks(longest_residual(a)),
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
-        *consistency_remarks(consistency, int(a.rejected.sum()), named=bool(a.network.named.all())),
+        *consistency_remarks(consistency, int(a.rejected.sum()), automatic=a.network.automatic_points),
         *(() if result.photographs else stated_precision_remarks(a)),  # only given image points state theirs
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
@@ -214,7 +214,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
     }
     right, mirrored = len(result.adjustment.network.images), len(single) + sum(map(len, groups))
     decided: dict[str, tuple[str, ...]] = {}
-    unknown = not result.adjustment.network.named.all() or any(
+    unknown = not result.adjustment.network.named.any() or any(
         one.kind == "handedness_unchecked" for one in result.stage_remarks
     )
     if not unknown:
@@ -307,13 +307,15 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     )
 
 
-def consistency_remarks(found: Consistency, rejected: int, *, named: bool = True) -> tuple[Remark, ...]:
+def consistency_remarks(
+    found: Consistency, rejected: int, *, automatic: frozenset[str] = frozenset()
+) -> tuple[Remark, ...]:
     """Return the tests of points and photographs, and remarks on those that a person can correct.
 
     Args:
         found: the tests.
         rejected: number of rejected image points.
-        named: whether a person named the points; nobody can correct those of natural texture.
+        automatic: names of the points that nobody named, such as those of natural texture, or can correct.
     """
     remarks = []
     doubtful = [one.point for one in found.doubtful]
@@ -337,10 +339,10 @@ def consistency_remarks(found: Consistency, rejected: int, *, named: bool = True
             shift=change.shift,
         )
         remarks += unless_note(differ)
-    if named and doubtful:
-        remarks.append(remark("points_doubtful", points=doubtful))
-    if named and found.outlying:
-        remarks.append(remark("points_with_large_residuals", points=found.outlying))
+    for kind, points in (("points_doubtful", doubtful), ("points_with_large_residuals", found.outlying)):
+        correctable = [name for name in points if name not in automatic]
+        if correctable:
+            remarks.append(remark(kind, points=correctable))
     uneven = found.uneven
     if uneven is not None:
         remarks.append(

@@ -146,7 +146,7 @@ def _orient_model(model: Model) -> Oriented:
     if not network.named.all():
         moving = find_second_motion(network, found, _orient_strongest)
         found = replace(found, remarks=(*found.remarks, *moving))
-    elif not wrong_c:
+    if not wrong_c:
         second = find_second_objects(network, found, partial(orient, refine=refine))
         failures = tuple((image, second.get(image, reason)) for image, reason in found.failures)
         found = replace(found, failures=failures)
@@ -154,9 +154,7 @@ def _orient_model(model: Model) -> Oriented:
     if survey.datum.kind != "control":
         estimate = place_on_observations(measured.network, estimate)
     found = replace(found, estimate=estimate)
-    return Oriented(
-        survey, measured, explain_lost_photographs(network, found, named=bool(network.named.all()))
-    )
+    return Oriented(survey, measured, explain_lost_photographs(network, found))
 
 
 def _orient_with_best_c(
@@ -166,11 +164,8 @@ def _orient_with_best_c(
     estimate = start_values(survey, network, measured.cameras)
     given = survey.start_orientations is not None or survey.start_points is not None
 
-    def orient_from(values: Estimate) -> Orientation:
-        if not network.named.all():
-            return _orient_strongest(network, values)
-        exact = all(source.is_exact for source in network.sources)
-        return _orient_on_control(network, values, given=exact, judge=_circle_judge(measured))
+    exact = all(source.is_exact for source in network.sources)
+    orient_from = partial(_orient_on_control, measured, network, given=exact)
 
     found, failure = None, None
     try:
@@ -192,10 +187,11 @@ def _orient_with_best_c(
 
 
 def _orient_on_control(
-    network: Network, estimate: Estimate, *, given: bool, judge: Judge | None
+    measured: Measurements, network: Network, estimate: Estimate, *, given: bool
 ) -> Orientation:
     """Orient all photographs, on their control if it fits them, else without it.
 
+    measured: has the outlines of the targets, which choose between two orientations of a plane.
     given: whether the image points were given; the adjustment, not the orientation, then judges
     contradictions.
     """
@@ -205,7 +201,7 @@ def _orient_on_control(
         if len(part.control) < len(network.control):
             values = replace(estimate, points=estimate.points.copy())
             values.points[network.control.point] = np.nan
-        return orient(part, values, refine=refine, contradicting=given, judge=judge)
+        return _orient_strongest(part, values, measured=measured, contradicting=given)
 
     def without_control(found: Orientation | None) -> Iterator[Network]:
         if len(network.control) and (found is None or not _fits(network, found).all()):
@@ -263,27 +259,48 @@ def _hold_cameras_of_two(
     return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(remarks)
 
 
-def _circle_judge(measured: Measurements) -> Judge | None:
-    """Return a function for the misfit of the outlines as circles; None without circular targets."""
-    photographs, naming = measured.photographs, measured.naming
+def _circle_judge(measured: Measurements, network: Network) -> Judge | None:
+    """Return a function for the misfit of the outlines as circles; None without circular targets.
+
+    network: the network of the judged estimate, which may have fewer points, and those of other sources.
+    """
+    of_targets = next((part for part in measured.parts if part.photographs is not None), measured)
+    photographs, naming = of_targets.photographs, of_targets.naming
     if photographs is None or naming.corners:
         return None
+    images, points = (
+        np.array([{name: k for k, name in enumerate(names)}.get(name, -1) for name in of], dtype=np.int64)
+        for names, of in (
+            (network.images, of_targets.network.images),
+            (network.points, of_targets.network.points),
+        )
+    )
 
     def misfit(estimate: Estimate) -> float:
-        return circle_misfit(photographs, naming, measured.network, estimate)
+        position, xyz = estimate.position[images], estimate.points[points]
+        position[images < 0], xyz[points < 0] = np.nan, np.nan
+        of_part = replace(estimate, position=position, rotation=estimate.rotation[images], points=xyz)
+        return circle_misfit(photographs, naming, of_targets.network, of_part)
 
     return misfit
 
 
-def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
-    """Orient the photographs on the points with the most rays, then intersect all the others.
+def _orient_strongest(
+    network: Network, estimate: Estimate, *, measured: Measurements | None = None, contradicting: bool = False
+) -> Orientation:
+    """Orient the photographs on points with names and those with the most rays, then intersect all others.
 
     Thousands of points orient a survey no better than hundreds do, and slow down every trial.
     """
     images = np.ones(len(network.images), dtype=bool)
     image_points = np.ones(len(network.image_points), dtype=bool)
-    part, start = reduce_network(network, estimate, images, _strongest(network), image_points)
-    found = orient(part, start, refine=refine)
+    part, start = network, estimate
+    if not network.named.all():
+        part, start = reduce_network(network, estimate, images, _strongest(network), image_points)
+    judge = None if measured is None else _circle_judge(measured, part)
+    found = orient(part, start, refine=refine, contradicting=contradicting, judge=judge)
+    if part is network:
+        return found
     rays = intersect_image_points(
         network.image_points,
         network.camera,
@@ -294,14 +311,16 @@ def _orient_strongest(network: Network, estimate: Estimate) -> Orientation:
     estimate = replace(found.estimate, points=rays.points)
     limit = found.tolerance_px[network.camera[network.image_points.image]]
     fits = residual_lengths(network, estimate) <= limit  # the RMS is that of the strongest points
-    return replace(found, estimate=estimate, fits=fits, point_failures=())
+    undetermined = set(np.array(network.points, dtype=object)[network.named & ~estimate.determined])
+    failures = tuple(failure for failure in found.point_failures if failure[0] in undetermined)
+    return replace(found, estimate=estimate, fits=fits, point_failures=failures)
 
 
 def _strongest(network: Network) -> BoolArray:
-    """Choose the points with the most rays, and up to POINTS_PER_PHOTOGRAPH of each photograph, (n,)."""
+    """Choose the points with names, those with the most rays, and some of each photograph, (n,)."""
     seen = network.image_points
     order = np.argsort(-network.rays(), kind="stable")
-    chosen = np.zeros(len(network.points), dtype=bool)
+    chosen = network.named.copy()
     chosen[order[:ORIENTATION_POINTS]] = True
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

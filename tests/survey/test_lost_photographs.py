@@ -12,7 +12,7 @@ import sfm
 from sfm.camera import camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.network import Estimate, ImagePoints, Network, Source, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
 from sfm.survey.diagnosis.lost_photographs import (
@@ -88,9 +88,8 @@ def test_points_of_one_oriented_photograph_connect_nothing() -> None:
     assert not group.connected and group.shared.tolist() == [20, 21]
     (group,) = lost_groups(network, estimate)
     assert group.connected
-    told = explain_lost_photographs(
-        network, orientation(network, replace(estimate, points=points)), named=False
-    )
+    unnamed = replace(network, sources=(Source("texture", names_last=False),))
+    told = explain_lost_photographs(unnamed, orientation(network, replace(estimate, points=points)))
     assert not told.remarks[0].names("shared") and not told.remarks[0].names("others")
 
 

@@ -80,7 +80,7 @@ def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
     survey = found.model.survey
     differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
     varying = frozenset(one.name for one in survey.cameras if not one.states_free)
-    if differs and varying and not found.adjustment.network.named.all() and not survey.rigs:
+    if differs and varying and found.adjustment.network.has_common_errors and not survey.rigs:
         report_step("adjusting c of each photograph")
         yield replace(found.model, varying=varying)
 

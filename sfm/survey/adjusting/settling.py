@@ -156,7 +156,7 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         accepted = accepted_image_points(network, adjustment, images, points)
         if wrong is None:  # once only: errors of windows are not quite normal, each round would find more
             wrong = np.zeros(len(points), dtype=bool)
-            if not network.named.all() and task.survey.reject != "none":
+            if task.survey.reject != "none":
                 wrong[points] = _wrong_windows(adjustment)
         accepted &= ~wrong[network.image_points.point]
         now = np.bincount(network.image_points.point[accepted], minlength=len(points))

@@ -127,7 +127,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     report_step("adjusting all observations")
     found = _finish_from_best_start(start, settled)
     final, settled, whole = found.adjustment, found.settled, matched.network
-    if not whole.named.all():
+    if whole.has_common_errors:
         report_step("estimating the errors that neighbours have in common")
         final = with_neighbours(final)
     left_out = left_out_points(
@@ -324,7 +324,7 @@ def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork |
         return None
     adjustment, network = free.adjustment, start.task.network
     given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
-    if not network.named.all() and (given_any or network.observations):
+    if network.has_common_errors and (given_any or network.observations):
         adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
     return FreeNetwork(adjustment)
 

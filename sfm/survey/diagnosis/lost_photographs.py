@@ -81,7 +81,7 @@ class LostGroup:
     connected: bool  # whether one of them shows enough of these points to be oriented
 
 
-def explain_lost_photographs(network: Network, found: Orientation, *, named: bool = True) -> Orientation:
+def explain_lost_photographs(network: Network, found: Orientation) -> Orientation:
     """Return the orientation with remarks on groups of photographs that are not connected to the others.
 
     Photographs with fewer points than any orientation needs get no remark: their failure reason states it.
@@ -89,7 +89,6 @@ def explain_lost_photographs(network: Network, found: Orientation, *, named: boo
     Args:
         network: has the named image points.
         found: orientation of this network.
-        named: whether people know the points by these names.
     """
     groups = [
         one
@@ -105,7 +104,7 @@ def explain_lost_photographs(network: Network, found: Orientation, *, named: boo
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
             reasons[network.images[i]] = remark("photograph_with_few_points", seen=count, needed=MIN_POINTS)
     groups.sort(key=lambda one: -len(one.images))
-    remarks = (_remark_on_unconnected(network, oriented, group, named=named) for group in groups)
+    remarks = (_remark_on_unconnected(network, oriented, group) for group in groups)
     failures = tuple((image, reasons[image]) for image, _ in found.failures)
     return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
 
@@ -249,23 +248,23 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
     return replace(estimate, cameras=tuple(cameras))
 
 
-def _remark_on_unconnected(network: Network, oriented: BoolArray, group: LostGroup, *, named: bool) -> Remark:
+def _remark_on_unconnected(network: Network, oriented: BoolArray, group: LostGroup) -> Remark:
     """Return the remark on a group of photographs that is not connected, with points to connect it."""
-    theirs = _most_seen_points(network, group.images) if named else []
+    theirs = _most_seen_points(network, group.images)
     return remark(
         "not_connected",
         photographs=[network.images[i] for i in group.images],
         oriented=int(oriented.sum()),
-        shared=[network.points[j] for j in group.shared if named] or None,
+        shared=[network.points[j] for j in group.shared if network.named[j]] or None,
         needed=MIN_POINTS,
         points=theirs if len(theirs) >= MIN_POINTS else None,
-        others=(_most_seen_points(network, np.flatnonzero(oriented)) or None) if named else None,
+        others=_most_seen_points(network, np.flatnonzero(oriented)) or None,
     )
 
 
 def _most_seen_points(network: Network, images: IntArray) -> list[str]:
-    """Return the names of the points that these photographs show most often."""
-    seen = network.image_points
+    """Return the names of the points that these photographs show most often, of those that people know."""
+    seen = network.image_points.select(network.named[network.image_points.point])
     rays = np.bincount(seen.point[np.isin(seen.image, images)], minlength=len(network.points))
     order = np.argsort(-rays, kind="stable")[: MIN_POINTS + 2]
     return [network.points[j] for j in order if rays[j]]
@@ -369,10 +368,13 @@ def find_second_objects(
     """Return the failure reasons, by name, of lost photographs that can be oriented among themselves.
 
     Args:
-        network: has the named image points.
+        network: its points with lasting names show whether photographs see the same object.
         found: its orientation, in which some photographs are missing.
         orient: returns the orientation of a network from start values; raises GeometryError if there is none.
     """
+    lasting = network.named[network.image_points.point]
+    network = replace(network, image_points=network.image_points.select(lasting))
+    found = replace(found, fits=found.fits[lasting])
     seen, names = network.image_points, np.array(network.images, dtype=object)
     left = ~found.estimate.oriented
     left &= np.array([len(rows) for rows in rows_of(seen.image, len(names))]) >= MIN_POINTS
