@@ -331,6 +331,18 @@ class SurveyResult:
         return html_table(f"Survey {self.survey}", ("", ""), rows)
 
     @property
+    def point_counts(self) -> str:
+        """Numbers of coded and other points, and of those whose numbers are new in every run, in words."""
+        coded = int((self.code >= 0).sum())
+        named = int(self.adjustment.network.named.sum())
+        counts = {"coded": coded, "uncoded": named - coded, "of natural texture": len(self.code) - named}
+        if named == len(self.code):
+            del counts["of natural texture"]
+        elif not named:
+            del counts["coded"], counts["uncoded"]
+        return ", ".join(f"{count} {what}" for what, count in counts.items())
+
+    @property
     def image_point_counts(self) -> str:
         """Numbers of accepted, rejected and unused image points, in words."""
         rejected = int(self.adjustment.rejected.sum())

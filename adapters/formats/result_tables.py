@@ -35,7 +35,7 @@ from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
 from sfm.files.plain_text import Name, Pixel, Side, Text, as_plain, or_none, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
-from sfm.network import Estimate, ImagePoints, InteriorObservations, Network
+from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, Source
 from sfm.reduced_network import CORRELATION_LIMIT
 from sfm.remarks.remark import Quantity, Remark
 from sfm.remarks.verdict import Verdict
@@ -64,8 +64,9 @@ def read_result(folder: Path) -> Solution:
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
     table = tables.POINTS.read(folder)
     points = table.keys("id")
-    seen, rejected = _image_points(folder, images, points)
-    network = Network(images, camera, points, seen.select(~rejected))
+    sources = tuple(one.content for one in summary.sources) or Network.sources
+    seen, rejected = _image_points(folder, images, points, sources)
+    network = Network(images, camera, points, seen.select(~rejected), sources=sources)
     mounts, moment = read_rigs(folder, names, network)
     network = replace(network, moment=moment)
     known = table.values.shape[1] > 3
@@ -101,7 +102,7 @@ def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, Bool
     Raises:
         SurveyFileError: with file and line number.
     """
-    seen, rejected = _image_points(folder, network.images, network.points)
+    seen, rejected = _image_points(folder, network.images, network.points, network.sources)
     path = folder / tables.RELIABILITY.file
     if not path.is_file():
         return seen, rejected, np.full((len(seen), 2), np.nan)
@@ -171,6 +172,7 @@ def write_content(folder: Path, content: Content) -> None:
         "sigma0": None if content.sigma0 is None else or_none(content.sigma0),
         "sigma0_px": None if content.sigma0_px is None else or_none(content.sigma0_px),
         "verdict": None if result.verdict is None else result.verdict.entry,
+        "sources": [{"name": one.name, "names_last": one.names_last} for one in network.sources],
         "cameras": [
             {
                 "name": camera.name,
@@ -330,6 +332,16 @@ class _VerdictEntry(Json):
         return Verdict(self.level, as_plain(self.headline), remarks, tests)
 
 
+class _SourceEntry(Json):
+    name: Text
+    names_last: bool
+
+    @property
+    def content(self) -> Source:
+        """The source; what only its measurement needs is not in the summary."""
+        return Source(self.name, self.names_last)
+
+
 class _Summary(Json):
     """The part of summary.json that is read."""
 
@@ -338,6 +350,7 @@ class _Summary(Json):
     datum: _DatumEntry | None = None
     redundancy: Annotated[int, Field(ge=0, strict=True)] | None = None
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
+    sources: tuple[_SourceEntry, ...] = ()
     verdict: _VerdictEntry | None = None
 
 
@@ -399,11 +412,11 @@ def _size(
 
 
 def _image_points(
-    folder: Path, images: tuple[str, ...], points: tuple[str, ...]
+    folder: Path, images: tuple[str, ...], points: tuple[str, ...], sources: tuple[Source, ...]
 ) -> tuple[ImagePoints, BoolArray]:
     """Read the image points, and which of them were rejected."""
     table = tables.IMAGE_POINTS.read(folder)
-    table.refuse_duplicates(tuple(zip(*table.texts, strict=True)), ("image", "point"))
+    table.refuse_duplicates(tuple(zip(*table.texts[:2], strict=True)), ("image", "point"))
     image = table.places("image", images, "images.csv")
     point = table.places("point", points, "points.csv")
     rejected, sigma = np.nan_to_num(table.part(("rejected",))), table.part(SIGMAS_PX)
@@ -416,7 +429,10 @@ def _image_points(
     largest = CORRELATION_LIMIT * sigma.prod(axis=1, keepdims=True)
     table.refuse(mixed, np.abs(mixed) > largest, ("cxy_px2",), "a correlation below 1 with the sigmas")
     covariance += (1 - np.eye(2)) * mixed[:, :, None]
-    found = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated)
+    source = None
+    if len(table.texts) > 2:
+        source = table.places("source", [one.name for one in sources], "summary.json")
+    found = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated, source)
     return found, rejected[:, 0] == 1
 
 

@@ -260,6 +260,12 @@ class Adjustment:
         return float(np.median(self.image_sigma_factor))
 
     @property
+    def sigma_of_sources(self) -> tuple[float, ...]:
+        """Standard deviation of an accepted image coordinate of each source, median, px; NaN without any."""
+        kept = [~self.rejected & (self.network.source == k) for k in range(len(self.network.sources))]
+        return tuple(_median_sigma(self.image_covariance[rows]) for rows in kept)
+
+    @property
     def sigma0_px(self) -> float:
         """A posteriori standard deviation of an accepted image coordinate, median, px."""
         return self.sigma0 * self.usual_px

@@ -143,7 +143,6 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
     """Return names and values of the figures of the summary, with units."""
     result, precision = findings.result, findings.precision
     a = result.adjustment
-    coded = int((result.code >= 0).sum())
     typical, largest = float(precision.rms[3]), float(precision.largest[3])
     text = describe_precision(typical, largest, result.length_unit)
     if not math.isfinite(typical):
@@ -154,7 +153,7 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         ("photographs", f"{len(a.network.images)} of {result.images_total} oriented"),
         (
             "object points",
-            f"{len(a.network.points)} ({coded} coded, {len(a.network.points) - coded} uncoded)",
+            f"{len(a.network.points)} ({result.point_counts})",
         ),
         ("image points", result.image_point_counts),
         ("adjustment", f"{'converged' if a.converged else 'NOT converged'}, {a.steps}"),

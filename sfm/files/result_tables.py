@@ -37,6 +37,7 @@ SIGMAS = ("sX", "sY", "sZ", "somega_deg", "sphi_deg", "skappa_deg")
 IN_FILES = np.repeat([1.0, np.degrees(1.0)], 3)  # factors from internal units to those of files
 KINDS = (
     "name",  # text
+    "label",  # text; the column may be missing
     "number",
     "blank",  # numbers; cells may be empty
     "optional",  # numbers; cells may be empty, and the whole group may be missing
@@ -71,7 +72,7 @@ class ResultTable:
         """
         path, blank = folder / self.file, self.names_of("blank", "optional")
         optional = [names for kind, names in self.groups if kind == "optional"]
-        flags = self.names_of("flag")
+        flags, labels = self.names_of("flag"), self.names_of("label")
         if flags or optional[1:]:
             header = read_header(path)
             flags = tuple(one for one in flags if one in header)
@@ -79,7 +80,7 @@ class ResultTable:
         numbers = (*self.names_of("number"), *self.names_of("blank"), *flags)
         return read_table(
             path,
-            self.names_of("name"),
+            (*self.names_of("name"), *(one for one in labels if one in read_header(path))),
             numbers,
             tuple(one for names in optional for one in names),
             ignored=None,
@@ -154,7 +155,7 @@ CAMERAS = ResultTable(
 IMAGE_POINTS = ResultTable(
     "image_points",
     *("name: image point", "number: x_px y_px", "optional: sx_px sy_px", "optional: cxy_px2"),
-    *("further: vx_px vy_px", "flag: rejected"),
+    *("further: vx_px vy_px", "flag: rejected", "label: source"),
 )
 CAMERAS_BALANCED = ResultTable("cameras_balanced", "further: camera parameter value sigma unit")
 TARGETS = ResultTable(
@@ -240,6 +241,7 @@ def write_solution(
         [one or None for one in between.tolist()] if every or between.any() else None,
         residuals,
         rejected.astype(int) if every or rejected.any() else None,
+        None if seen.source is None else [network.sources[k].name for k in seen.source.tolist()],
     )
 
 

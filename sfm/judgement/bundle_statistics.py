@@ -29,7 +29,13 @@ from sfm.adjustment.quality.statistics import (
     tau_test,
     w_test,
 )
-from sfm.adjustment.quality.variance_components import VarianceComponents, by_camera, by_kind, by_photograph
+from sfm.adjustment.quality.variance_components import (
+    VarianceComponents,
+    by_camera,
+    by_kind,
+    by_photograph,
+    by_source,
+)
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.conventions import FloatArray, IntArray
 from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
@@ -66,7 +72,8 @@ class Statistics:
     redundancy: Spread  # redundancy numbers of the image coordinates
     redundancy_of_image_points: float  # sum of their redundancy numbers
     redundancy_sum: float  # sum of the redundancy numbers of all kinds of observation
-    kinds: VarianceComponents  # relative to the stated standard deviations, as are the next two
+    kinds: VarianceComponents  # relative to the stated standard deviations, as are the next three
+    sources: VarianceComponents  # of image points
     cameras: VarianceComponents
     photographs: VarianceComponents
     significance: tuple[Significance, ...]
@@ -118,6 +125,7 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
         redundancy_of_image_points=float(np.nansum(adjustment.redundancy_numbers)),
         redundancy_sum=float(kinds.redundancy.sum()),
         kinds=kinds,
+        sources=by_source(adjustment),
         cameras=by_camera(adjustment),
         photographs=by_photograph(adjustment),
         significance=significance(adjustment),

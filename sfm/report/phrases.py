@@ -91,6 +91,18 @@ def describe_weights(result: SurveyResult) -> str:
         return "Weights: as stated for all observations, with one sigma0 for all standard deviations."
     if factor == 1:
         return ""
+    sources = result.adjustment.network.sources
+    if len(sources) > 1:
+        sigmas = [
+            f"{significant(sigma)} px of {source.name}"
+            for source, sigma in zip(sources, result.adjustment.sigma_of_sources, strict=True)
+        ]
+        return (
+            "Weights: image points have the standard deviations that the variance component of their source "
+            f"shows, in the median {listed(sigmas)}. The other kinds of observation keep their stated ones. "
+            "A test of all observations together would pass by construction, so each kind is tested against "
+            "its stated standard deviations."
+        )
     return (
         "Weights: the standard deviations of the image points were multiplied by "
         f"{factor:.3f}, from their variance component, and the other kinds of "

@@ -65,9 +65,11 @@ class Protocol:
 def protocol_of(result: SurveyResult, given: Given) -> Protocol:
     """Return the protocol entries of a result."""
     a = result.adjustment
-    seen = a.network.image_points
+    seen, source = a.network.image_points, a.network.source
+    names = tuple(one.name for one in a.network.sources)
     return Protocol(
         residuals=(
+            *(_groups(a, "source", source, names, seen.point, a.network.points) if names[1:] else ()),
             *_groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points),
             *_groups(a, "point", seen.point, a.network.points, seen.image, a.network.images),
         ),

@@ -374,15 +374,17 @@ COMPONENTS = {
 
 
 def component_parts(f: Findings) -> Iterator[Part]:
-    """Yield the variance components of kinds of observation, cameras and photographs, largest first."""
+    """Yield the variance components of kinds, sources, cameras and photographs, largest first."""
     yield Note(
         "Variance components: sigma0 of a group over the value stated beforehand. A group far above the "
         "others was measured with less precision, or does not fit."
     )
     rows = sorted(component_rows(f.statistics), key=lambda row: -np.nan_to_num(row[-1]))
-    for kind, name in (("kind", "kind of observation"), ("camera", "camera"), ("photograph", "photograph")):
+    named = {"kind": "kind of observation", "source": "source of image points"}
+    for kind in ("kind", "source", "camera", "photograph"):
+        name = named.get(kind, kind)
         columns = columns_of(VARIANCE_COMPONENTS, {"group": Column(name), **COMPONENTS})
         some = [row for row in rows if row[0] == kind]
-        if kind != "kind" or len(some) > 1:
+        if kind not in named or len(some) > 1:
             table = Table(columns, some, all_in=VARIANCE_COMPONENTS.file)
             yield FoldedParts(f"Variance components by {name}", table, in_text=True)

@@ -133,8 +133,7 @@ def _tiles(f: Findings) -> Iterator[Tile]:
         rms = f"{significant(one.projection_rms_px)} px"
         yield Tile(f"Projection uncertainty of {one.name}", rms, projection)
     yield Tile("Photographs oriented", f"{len(a.network.images)} of {result.images_total}")
-    coded = int((result.code >= 0).sum())
-    yield Tile("Object points", len(result.code), f"{coded} coded, {len(result.code) - coded} uncoded")
+    yield Tile("Object points", len(result.code), result.point_counts)
     if not f.calibrated:
         yield _precision_tile(f)
     yield Tile("RMS residual", f"{fixed(a.rms_px, 4)} px", "per image coordinate")

@@ -97,6 +97,16 @@ def by_camera(adjustment: Adjustment) -> VarianceComponents:
     return variance_components(adjustment, family[network.camera[network.image_points.image]], names)
 
 
+def by_source(adjustment: Adjustment) -> VarianceComponents:
+    """Return the variance factor of each source of image points.
+
+    Args:
+        adjustment: finished adjustment.
+    """
+    network = adjustment.network
+    return variance_components(adjustment, network.source, tuple(one.name for one in network.sources))
+
+
 def by_kind(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each kind of observation.
 

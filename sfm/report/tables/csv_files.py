@@ -160,9 +160,11 @@ def _names(network: Network) -> Iterator[tuple[str, str]]:
 
 
 def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
-    """Return the variance components of kinds of observation, cameras and photographs."""
+    """Return the variance components of kinds of observation, sources, cameras and photographs."""
+    of_sources = (("source", statistics.sources),) if len(statistics.sources.names) > 1 else ()
     for kind, found in (
         ("kind", statistics.kinds),
+        *of_sources,
         ("camera", statistics.cameras),
         ("photograph", statistics.photographs),
     ):

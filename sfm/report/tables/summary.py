@@ -68,6 +68,16 @@ def _figures(findings: Findings) -> dict[str, Any]:
             "failed": [{"image": f.image, "reason": f.reason.as_dict()} for f in result.failed],
         },
         "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
+        "sources": [
+            values_of(source, "name names_last")
+            | {
+                "image_points": int((a.network.source == k).sum()),
+                "rejected": int(a.rejected[a.network.source == k].sum()),
+                "sigma_px": a.sigma_of_sources[k],
+                "sigma0": float(findings.statistics.sources.sigma0[k]),
+            }
+            for k, source in enumerate(a.network.sources)
+        ],
         "observations": {
             "used": int((~a.rejected).sum()),
             "rejected": int(a.rejected.sum()),

@@ -370,7 +370,7 @@ def read_image_points(path: Path) -> Observations:
     """Read image points: image,point,x_px,y_px[,sx_px,sy_px[,cxy_px2]], or with mm in place of px.
 
     Unknown sigmas may be empty. cxy is the covariance of x and y; empty or 0 means none.
-    `sfm.survey.inputs.start` treats points that occur twice in an image.
+    `sfm.survey.sources.repeated` treats points that occur twice in an image.
 
     image_points.csv of a result is accepted too. Its residuals and rejections are ignored, and all its image
     points are taken as measured.
@@ -388,7 +388,7 @@ def read_image_points(path: Path) -> Observations:
         ("image", "point"),
         (f"x_{unit}", f"y_{unit}"),
         sigmas,
-        ignored=("vx_px", "vy_px", "rejected"),
+        ignored=("vx_px", "vy_px", "rejected", "source"),
         blank=sigmas,
     )
     return _observations(table, unit)

@@ -144,4 +144,4 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
 
 def _squares(d: FloatArray, C: FloatArray) -> FloatArray:
     """Return the squares of differences (n, 2) in units of their covariances (n, 2, 2), (n,)."""
-    return np.einsum("na,nab,nb->n", d, np.linalg.inv(C), d)
+    return np.asarray(np.einsum("na,nab,nb->n", d, np.linalg.inv(C), d))
