@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+from sfm.api import read_result, write_result
+from sfm.camera import project
 from sfm.conventions import AnyArray
-from sfm.network import Source
+from sfm.network import ImagePoints, Source
 from sfm.pipeline import run_survey
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics, join_marks, rectangles
@@ -24,6 +26,7 @@ from sfm.survey.inputs import sources
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.sources import Declared, declared
 from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.sources.repeated import OfOneSource, without_repeated
 from sfm.survey.sources.source import SurveySource, complete_as_measured
 from tests.places import ROOT
 from tests.surveys import SURVEY, camera, code_centres, plates, stations, survey_of
@@ -92,6 +95,88 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert "targets" in tables and "tie_points" in tables
     (first, *_) = both.photographs
     assert len(first.xy) > len(alone.photographs[0].xy)
+
+
+CORNERS = {"corner a": (-90.0, -60.0, 0.0), "corner b": (90.0, 70.0, 0.0), "u001": (-80.0, 80.0, 0.0)}
+
+
+def write_given(path: Path, xyz: dict[str, tuple[float, ...]], off_px: float = 0.0) -> None:
+    """Write image points with a noise of 0.2 px, all off by the same vector."""
+    position, rotation = stations(6)
+    noise = seed_of(path.name)
+    lines = ["image,point,x_px,y_px"]
+    for name, X in xyz.items():
+        for i in range(6):
+            exact = project(camera(), position[i], rotation[i], np.array([X]))[0]
+            x, y = (exact + off_px + 0.2 * noise.standard_normal(2)).tolist()
+            lines.append(f"photo {i + 1}.png,{name},{x},{y}")
+    path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def test_given_image_points_stand_beside_targets(tmp_path: Path) -> None:
+    """Corners by hand, and those of codes by a program that counts pixels from their corners."""
+    codes = {str(code): tuple(X.tolist()) for code, X in code_centres().items()}
+    write_given(tmp_path / "corners.csv", CORNERS)
+    write_given(tmp_path / "codes.csv", codes, off_px=0.5)
+    more = '[[observations]]\nfile = "corners.csv"\nsigma_px = 0.2\n[[observations]]\nfile = "codes.csv"\n'
+    result = run_survey(read_survey(write(tmp_path, more)))
+    alone = run_survey(read_survey(write(tmp_path)))
+    a, b = result.adjustment, alone.adjustment
+    network = a.network
+    assert [one.name for one in network.sources] == ["targets", "given"]
+    (offset,) = [one for one in result.verdict.remarks if one.kind == "sources_offset"]
+    assert offset.numbers["x"].value == pytest.approx(0.5, abs=0.1)
+    # given image points of codes are left out where the code was measured, and in no place twice
+    seen, seen_alone = (
+        [(n.images[i], n.points[j]) for i, j in zip(n.image_points.image, n.image_points.point, strict=True)]
+        for n in (network, b.network)
+    )
+    source = dict(zip(seen, network.source.tolist(), strict=True))
+    assert len(source) == len(seen) and not any(source[key] for key in seen_alone)
+    common = [name for name in b.network.points if name in codes]
+    here = [network.points.index(name) for name in (*common, *CORNERS)]
+    there = [b.network.points.index(name) for name in common]
+    truth = np.array([*(codes[name] for name in common), *CORNERS.values()])
+    placing = fit_similarity(a.estimate.points[here][: len(common)], truth[: len(common)])
+    sigma = placing.scale * np.sqrt(np.einsum("nii->ni", a.covariance.points[here]))
+    error = (placing.apply(a.estimate.points[here]) - truth)[len(common) :]
+    assert np.abs(error / sigma[len(common) :]).max() < 4
+    before = fit_similarity(b.estimate.points[there], truth[: len(common)]).apply(b.estimate.points[there])
+    moved = before - placing.apply(a.estimate.points[here])[: len(common)]
+    assert np.abs(moved).max() < 3 * sigma[: len(common)].max()
+    # the corner that has the number of an uncoded target is another point
+    assert network.source[network.image_points.point == network.points.index("u001")].tolist() == [1] * 6
+    assert a.sigma_of_sources[1] == pytest.approx(0.2, rel=0.4)
+    folder = tmp_path / "out"
+    write_result(result, folder)
+    read = read_result(folder)
+    assert [one.name for one in read.network.sources] == ["targets", "given"]
+    kept = network.image_points.select(~a.rejected)
+    assert (read.network.source == kept.source).all()
+    rows = (folder / "residuals.csv").read_text("utf-8").splitlines()
+    assert [row.split(",")[:2] for row in rows[1:3]] == [["source", "targets"], ["source", "given"]]
+
+
+def test_what_two_sources_measure_is_used_once() -> None:
+    rng, n = seed_of("two sources"), 30
+    image, point = np.arange(n) % 5, np.arange(n)
+    xy = rng.uniform(0, 1000, (n, 2))
+    sources = (Source("first"), Source("second"))
+
+    def both(noise_px: float, stated_px: float, wrong_px: float = 0.0) -> OfOneSource:
+        other = xy + noise_px * rng.standard_normal((n, 2))
+        other[3] += wrong_px
+        sigma = np.full((n, 1, 1), stated_px**2) * np.eye(2)
+        parts = [
+            ImagePoints(image, point, seen, sigma, source=np.full(n, k)) for k, seen in enumerate((xy, other))
+        ]
+        return without_repeated(ImagePoints.joined(parts), sources)
+
+    agreeing = both(0.1, 0.1)
+    assert (agreeing.image_points.xy == xy).all() and not agreeing.contradicting and not agreeing.remarks
+    assert not both(1.0, 0.1).contradicting  # sigmas that are too small contradict nothing
+    wrong = both(0.1, 0.1, wrong_px=5.0)
+    assert wrong.contradicting == ((3, 3),) and len(wrong.image_points) == n - 1
 
 
 def test_no_module_asks_which_source_a_survey_has() -> None:

@@ -96,6 +96,7 @@ class TargetTrial:
     circles: float  # median number of circular targets in a photograph
     blur_px: float  # median standard deviation of their edges, px; NaN without targets
     photographs: tuple[str, ...]  # photographs that were tried
+    fewest: int = 0  # codes in the photograph that has fewest
     plates: tuple[PlateFamily, ...] = ()  # calibration plates; the others are seen with the first
     left_out: tuple[tuple[PlateFamily, str], ...] = ()  # (plate that cannot be used with the first, reason)
     unreadable: tuple[tuple[str, str], ...] = ()  # (photograph that could not be decoded, reason)
@@ -194,6 +195,7 @@ def try_targets(
         float(np.median([_is_circle(one).sum() for one in measured])),
         _blur(measured),
         names,
+        min(int((one.code >= 0).sum()) for one in measured) if coded else 0,
         plates,
         left_out,
         unreadable,
