@@ -368,11 +368,20 @@ def _described(plate: PlateFamily) -> str:
 
 def _example_lines(trial: TargetTrial) -> list[str]:
     first, second = trial.repeated[:2] if len(trial.repeated) > 1 else ("1", "2")
-    ends, known = "targets", "coordinates"
-    if trial.codes == "none":  # natural texture, whose points have their names from the first run
-        first, second = "t00001", "t00002"
-        ends, known = "points of points.csv of a first run", "coordinates of such points"
+    ends, known, named = "targets", "coordinates", list[str]()
+    if trial.codes == "none":  # points of natural texture have other numbers in every run
+        first, second = "corner 1", "corner 2"
+        ends, known = "points with names", "coordinates of such points"
+        named = [
+            "# Points of texture have no names. Image points of points with names, measured by hand in two",
+            "# photographs or more, in a table image,point,x_px,y_px beside this file:",
+            "# [[observations]]",
+            '# file = "image_points.csv"',
+            "# sigma_px = 0.5",
+            "#",
+        ]
     return [
+        *named,
         f"# The scale comes from a measured distance between two {ends} (repeat the section for more):",
         "# [[scale_bar]]",
         f"# from = {_quoted(first)}",
