@@ -18,7 +18,6 @@ from sfm.judgement.hypotheses.hypotheses import (
     Cause,
     JudgedAssumptions,
     contradicted_parameters,
-    find_causes,
     free_network,
     judge_alternatives,
     remark_of,
@@ -245,28 +244,6 @@ def test_causes() -> None:
     assert cause(alternative("c", "each")) == cause(alternative("centre", "each")) == ("camera", "each")
     assert cause(alternative("given", parameters=((0, 1),))) == ("given", False)
     assert cause(alternative("format")) == ("format",)
-
-
-def test_two_causes_at_most_of_a_standard_deviation_at_least(
-    a: Adjustment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shifts: list[float] = []
-    treated: list[str] = []
-
-    def best(plain: Adjustment, causes: tuple[Cause, ...]) -> Cause:
-        assert len(causes) == len(treated)
-        treated.append("")
-        return Cause(alternative(), Refit(replace(plain), np.ones(1), 1.0, shifts.pop(0), 1.0), ())
-
-    def needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
-        return (*causes, found)
-
-    monkeypatch.setattr(hypotheses, "_still_needed", needed)
-    monkeypatch.setattr(hypotheses, "_best", best)
-    for given, count in (([2.0, 3.0, 4.0], 2), ([0.9, 3.0], 1), ([1.1, 0.6], 1), ([1.0, 1.9], 2)):
-        shifts[:], treated[:] = given, []
-        assert len(find_causes(a)) == count
-        assert len(treated) == 2
 
 
 def test_the_free_network_is_the_adjustment_itself_where_nothing_else_was_observed(

@@ -326,6 +326,34 @@ def test_a_plate_that_moved_is_named_and_not_the_camera() -> None:
     assert found.number("distance") == pytest.approx(np.hypot(1e-3, 5e-4) + 1e-3 * reach, rel=0.2)
 
 
+@pytest.mark.parametrize("moved", [0, 3])
+def test_a_sheet_that_bends_while_the_camera_varies_has_no_moved_half(moved: int) -> None:
+    """Photographs that differ from one another do not show a movement; points that moved are still named."""
+    rng = seed_of("sheet 1")
+    network, truth = make_network(
+        rng, images=20, points=80, planar=True, noise_px=0.02, free=("c", "x0", "y0")
+    )
+    seen, xy = network.image_points, np.array(network.image_points.xy)
+    x, y = truth.points[:, 0] / 0.7, truth.points[:, 1] / 0.7
+    bends = np.cumsum(rng.normal(0, 3e-4, (20, 3)), axis=0) / 3
+    zooms = rng.normal(0, 2e-3, 20)
+    for i in range(20):
+        p = truth.cameras[0].parameters.copy()
+        p[0] *= 1 + zooms[i]
+        X = truth.points.copy()
+        X[:, 2] += np.stack([x * y, np.maximum(x, 0) ** 2, y * y], axis=1) @ bends[i]
+        X[:moved, 0] += 2e-4 * (i >= 12)
+        rows = seen.image == i
+        camera = truth.cameras[0].with_parameters(p)
+        xy[rows] = project(camera, truth.position[i], truth.rotation[i], X[seen.point[rows]])
+    xy += 0.02 * rng.standard_normal(xy.shape)
+    found = judge_alternatives(solved(replace(network, image_points=replace(seen, xy=xy)), truth)).causes
+    assert found[0].kind == "camera_varies"
+    assert [set(one.names("points")) for one in found if one.kind == "points_moved"] == (
+        [{"1", "2", "3"}] if moved else []
+    )
+
+
 def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does() -> None:
     network, truth = make_network(seed_of("refit"), images=8, points=40, free=("c",))
     a = solved(network, truth, "none")

@@ -34,18 +34,20 @@ from sfm.judgement.hypotheses.alternatives import (
     is_significant,
 )
 from sfm.judgement.hypotheses.columns import columns_of
-from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily
+from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
 from sfm.judgement.hypotheses.refit import (
     Refit,
     log_likelihood_of,
     precision_factor,
+    readjusted,
     refit,
     shifts_of,
+    spread_of_photographs,
     unchecked_assumptions,
 )
 from sfm.judgement.hypotheses.score import (
     Gain,
-    Reduced,
+    log_likelihood_gain,
     reduce_adjustment,
     squares_gained,
 )
@@ -56,7 +58,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import reported
 from sfm.similarity import fit_similarity
 
-MAX_CAUSES = 2  # number of causes, sought one after another
+MAX_CAUSES = 4  # number of causes, each sought beside the others
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those with most evidence in the score test
 MAX_IMAGE_POINTS = 6_000  # largest tested network; of a larger one, the points with most rays are used
 # Adjustments of a search times the cube of the photographs, to which their time is proportional. Its
@@ -226,7 +228,7 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
             break
         causes = _still_needed(plain, causes, found)
     return tuple(
-        one for one in causes if not one.refit.shift < MIN_NAMED_SIGMAS
+        one for one in _with_joint_shifts(plain, causes) if not one.refit.shift < MIN_NAMED_SIGMAS
     )  # an unknown shift (NaN) counts as large
 
 
@@ -269,7 +271,7 @@ def _best(
         (
             min(
                 one.deflated(found.gain, reduced.redundancy),
-                _beyond_spread(one, found.gain, reduced) if causes else np.inf,
+                _beyond_spread(one, found, reduced.redundancy, before) if causes else np.inf,
             )
             - one.price,
             one,
@@ -336,36 +338,66 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
 
 
-def _beyond_spread(one: Alternative, gain: float, reduced: Reduced) -> float:
+def _beyond_spread(
+    one: Alternative, found: Refit, redundancy: int, before: Sequence[tuple[Alternative, FloatArray]]
+) -> float:
     """Return the gain of ln likelihood by another cause beyond the usual differences between photographs.
 
     It is not known for the first cause, because its large error itself makes photographs differ.
     """
     if isinstance(one.family, InteriorFamily):
-        return gain
-    squares = squares_gained(gain, reduced.redundancy)
-    return one.spread.evidence(squares, one.gain.rank, reduced.redundancy)
+        return found.gain
+    squares = squares_gained(found.gain, redundancy)
+    beyond = one.spread.evidence(squares, one.gain.rank, redundancy)
+    if not isinstance(one.family, PointFamily):
+        return beyond
+    among = spread_of_photographs(found, one, [other for other, _ in before])
+    return min(beyond, log_likelihood_gain(squares / max(among, 1.0), redundancy))
 
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
-    """Return the causes with a new one; the earlier ones are dropped if the new one explains them too."""
-    if not causes:
-        return (found,)
-    together = found.refit
-    alone = refit(
-        plain,
-        replace(found.alternative, gain=replace(found.alternative.gain, beta=together.beta)),
-        together.adjustment,
+    """Return the causes with a new one, without those that the others explain too."""
+    for kind in causes:
+        earlier = [one for one in causes if one is not kind]
+        before = [
+            (one.alternative, beta)
+            for one, beta in zip(causes, found.refit.before, strict=True)
+            if one is not kind
+        ]
+        alternative, together = found.alternative, found.refit
+        alone = refit(
+            plain,
+            replace(alternative, gain=replace(alternative.gain, beta=together.beta)),
+            together.adjustment,
+            before,
+        )
+        if alone is None:
+            continue
+        gain = kind.alternative.deflated(-alone.gain, plain.redundancy)
+        if gain - kind.alternative.price < np.log(1 / ALPHA):
+            causes, found = tuple(earlier), replace(found, refit=alone)
+    joint = (
+        replace(one, refit=replace(one.refit, beta=beta))
+        for one, beta in zip(causes, found.refit.before, strict=True)
     )
-    first = causes[0].alternative
-    if alone is not None and first.deflated(-alone.gain, plain.redundancy) - first.price < np.log(1 / ALPHA):
-        shift, rms = shifts_of(plain, plain, alone.adjustment, found.alternative, alone.beta)
-        return (replace(found, refit=replace(alone, shift=shift, rms=rms)),)
-    before = (
-        replace(other, refit=replace(other.refit, beta=beta))
-        for other, beta in zip(causes, together.before, strict=True)
-    )
-    return (*before, found)
+    return (*joint, found)
+
+
+def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
+    """Return the causes with what each shifts while the effects of all others are removed."""
+    if len(causes) < 2:
+        return causes
+    last, shifted = causes[-1].refit.adjustment, []
+    columns, seen = columns_of(last), last.network.image_points
+    for cause in causes:
+        one, beta = cause.alternative, cause.refit.beta
+        with_effect = replace(seen, xy=seen.xy + one.columns(last, columns) @ beta)
+        left = readjusted(plain, replace(plain.network, image_points=with_effect), last)
+        shift = rms = float("nan")
+        if left is not None:
+            shift, rms = shifts_of(plain, left, last, one, beta)
+        shifted.append(replace(cause, refit=replace(cause.refit, shift=shift, rms=rms)))
+    return tuple(shifted)
 
 
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:

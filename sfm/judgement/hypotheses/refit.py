@@ -54,6 +54,7 @@ from sfm.judgement.hypotheses.score import (
     reduce_adjustment,
 )
 from sfm.likelihood import areas_of_photographs, log_likelihood
+from sfm.network import Network
 from sfm.remarks.kind import WRONG_SIGMAS
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity, without_motions
@@ -131,26 +132,39 @@ def _stepped(
     xy, best = plain.network.image_points.xy, None
     for taken in range(1, HALVINGS + 1):
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
-        try:
-            found = adjust(
-                replace(plain.network, image_points=points),
-                start.estimate,
-                datum=Datum("control" if plain.datum == "control" else "free"),
-                image_sigma_factor=plain.image_sigma_factor,
-                reject="tau",
-                alpha=plain.test_alpha,
-                rejected=start.rejected,
-                max_iterations=MAX_ITERATIONS,
-            )
-        except GeometryError:
-            found = None
-        if found is not None and found.converged:
-            found = replace(found, error_correlation=plain.error_correlation)  # the best known one
+        found = readjusted(plain, replace(plain.network, image_points=points), start)
+        if found is not None:
             if log_likelihood_of(found) > log_likelihood_of(start) - LAST_GAIN:
                 return found, beta + step, taken
             best = best or (found, beta + step)
         step = step / 2
     return None if best is None else (*best, HALVINGS)
+
+
+def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjustment | None:
+    """Adjust other image points of a network as it was adjusted; None if the adjustment does not converge.
+
+    Args:
+        plain: adjustment of the network, with the datum, weights and level of rejection.
+        network: the network with the other image points.
+        start: start values, and which image points are rejected at first.
+    """
+    try:
+        found = adjust(
+            network,
+            start.estimate,
+            datum=Datum("control" if plain.datum == "control" else "free"),
+            image_sigma_factor=plain.image_sigma_factor,
+            reject="tau",
+            alpha=plain.test_alpha,
+            rejected=start.rejected,
+            max_iterations=MAX_ITERATIONS,
+        )
+    except GeometryError:
+        return None
+    if not found.converged:
+        return None
+    return replace(found, error_correlation=plain.error_correlation)  # the best known one
 
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
@@ -214,6 +228,37 @@ def _shifts_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment)
         change.append((changed.parameters - one.parameters)[known] / sigma[known])
     every = np.concatenate(change)
     return float(np.abs(every).max(initial=0.0)), float(np.sqrt((every**2).mean())) if len(every) else 0.0
+
+
+def spread_of_photographs(found: Refit, one: Alternative, others: Sequence[Alternative]) -> float:
+    """Return the variance of what photographs say of an alternative, relative to that expected by chance.
+
+    Errors that image points of a photograph have in common resemble a movement of many points. They differ
+    among the photographs of one state of the object, where a true movement is the same.
+
+    Args:
+        found: adjustment with the alternative and the others.
+        one: the alternative.
+        others: alternatives that were adjusted with it.
+
+    Raises:
+        numpy.linalg.LinAlgError: the network is not determined.
+
+    Source: White (1982), Econometrica 50, for a score test with dependent observations.
+    """
+    a = found.adjustment
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    effect = reduced.whiten(one.columns(a, columns)) @ found.beta
+    left = reduced.absorb(effect[:, :, None])[2].ravel()
+    if others:
+        taken = reduced.absorb(reduced.whiten(_side_by_side(others, a, columns)))[2]
+        taken = taken.reshape(len(left), -1)
+        left = left - taken @ np.linalg.lstsq(taken, left, rcond=None)[0]
+    left = left.reshape(-1, 2)
+    m = reduced.photographs
+    slope = np.bincount(reduced.image, (reduced.v * left).sum(axis=1), minlength=m)
+    return float(slope @ slope / (left**2).sum()) * m / (m - 1)
 
 
 def precision_factor(a: Adjustment) -> float:

@@ -145,8 +145,7 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     )
 
 
-# Largest share of points that is left out. Of camcal, where the camera varies too, a body of 42 of 100 dots
-# is named, though 5 at one end of the sheet moved.
+# Largest share of points that is left out. Which of two bodies is the object, a person decides.
 MAX_MOVED = 0.1
 
 
@@ -170,8 +169,9 @@ def _models_without_moved_points(found: SolvedSurvey) -> Iterator[SurveyModel]:
 
 
 def _moved_points(found: SolvedSurvey) -> list[Remark]:
-    """Return the remarks on points that moved so far that the result is wrong."""
-    return [named for named in of_kind(found.remarks, "points_moved") if named.severity == "error"]
+    """Return the remarks on points that moved, if some moved so far that the result is wrong."""
+    moved = list(of_kind(found.remarks, "points_moved"))
+    return moved if any(named.severity == "error" for named in moved) else []
 
 
 def _gain_without_moved_points(_: SolvedSurvey, after: SolvedSurvey) -> float:
