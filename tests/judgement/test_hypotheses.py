@@ -326,6 +326,23 @@ def test_a_plate_that_moved_is_named_and_not_the_camera() -> None:
     assert found.number("distance") == pytest.approx(np.hypot(1e-3, 5e-4) + 1e-3 * reach, rel=0.2)
 
 
+@pytest.mark.parametrize(("skew_px", "kinds"), [(10.0, ("rolling_shutter",)), (0.0, ())])
+def test_a_rolling_shutter_is_named_with_its_skew(skew_px: float, kinds: tuple[str, ...]) -> None:
+    """Of a camera that only zooms or is stabilised it is not named, see the planted faults."""
+    rng = seed_of("rows 2")
+    network, truth = make_network(rng, images=10, points=50, noise_px=0.05, free=("c", "x0", "y0", "K1"))
+    seen, rows = network.image_points, truth.cameras[0].size_px[1]
+    speed = skew_px * rng.standard_normal((10, 2)) / rows
+    xy = seen.xy + (seen.xy[:, 1:] - rows / 2) * speed[seen.image]
+    found = judge_alternatives(solved(replace(network, image_points=replace(seen, xy=xy)), truth)).causes
+    assert kinds_of(found) == kinds
+    for one in found:
+        largest = rows * np.linalg.norm(speed, axis=1)
+        assert one.number("skew") == pytest.approx(largest.max(), rel=0.2)
+        assert network.images[int(largest.argmax())] in one.names("photographs")
+        assert one.severity == ("error" if one.number("shift") > WRONG_SIGMAS else "warning")
+
+
 @pytest.mark.parametrize("moved", [0, 3])
 def test_a_sheet_that_bends_while_the_camera_varies_has_no_moved_half(moved: int) -> None:
     """Photographs that differ from one another do not show a movement; points that moved are still named."""

@@ -345,7 +345,7 @@ def _rolling(scene: _Scene) -> str:
         rows = seen.image == i
         speed = 0.3 * scene.rng.standard_normal(2) / SIZE_PX[1]
         scene.extra[rows] += (seen.xy[rows, 1:] - SIZE_PX[1] / 2) * speed
-    return "camera_varies"
+    return "rolling_shutter"
 
 
 def _heavy(scene: _Scene) -> str:

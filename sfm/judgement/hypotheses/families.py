@@ -16,6 +16,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.judgement.hypotheses.columns import (
     BENDING_PLACES,
+    CAMERA,
     CAMERA_PLACES,
     STRAIN_PLACES,
     Columns,
@@ -239,6 +240,38 @@ class CameraFamily(OfPhotographs):
 
 
 @dataclass(frozen=True)
+class RowsFamily(CameraFamily):
+    """Rows that are exposed one after the other while the camera moves, at another speed in each photograph.
+
+    The image is sheared and stretched along its columns. With y along the columns, and s the speed,
+    s_x y is b2, and s_y y is c together with an equal and opposite b1.
+    """
+
+    unchecked = ""
+
+    def kind(self, pattern: str) -> str:
+        """Return the kind of remark for an alternative of this family."""
+        return "rolling_shutter"
+
+    def cause(self, one: Alternative) -> tuple[object, ...]:
+        """Return a key for the cause: rows."""
+        return ("rows",)
+
+    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+        """Return the photographs that are displaced most, half as much or more, and by how much."""
+        # from the first row to the last; a column of 1 moves an image point at the edge by 1 px
+        sizes = np.array([camera.size_px for camera in a.estimate.cameras])[a.network.camera]
+        stretch, _, shear = beta.reshape(-1, len(self.places)).T
+        speed = np.hypot(stretch - stretch.mean(), shear)[one.factor.astype(np.int64)]
+        skew = 2 * speed * sizes[:, 1] / sizes.max(axis=1)
+        most = np.flatnonzero(2 * skew >= skew.max())
+        return {
+            "photographs": tuple(a.network.images[i] for i in most),
+            "skew": (float(skew.max()), "px"),
+        }
+
+
+@dataclass(frozen=True)
 class ObjectFamily(OfPhotographs):
     """Another shape of the object in some photographs."""
 
@@ -423,7 +456,12 @@ CAMERA_FAMILIES = (
 )
 STRAIN = ObjectFamily("strain", STRAIN_PLACES)
 # a stabiliser moves x0 and y0 only; such a small set is affordable for each photograph
-OF_EACH = (CAMERA_FAMILIES[0], CameraFamily("point", (1, 2)), *CAMERA_FAMILIES[1:])
+OF_EACH = (
+    CAMERA_FAMILIES[0],
+    CameraFamily("point", (1, 2)),
+    RowsFamily("rows", tuple(map(CAMERA.index, ("c", "b1", "b2")))),
+    *CAMERA_FAMILIES[1:],
+)
 OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     *CAMERA_FAMILIES,
     STRAIN,

@@ -208,7 +208,9 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
     if plain.datum == "control":
         of = "cameras"
     wrong, factor = found.shift, None
-    if one.pattern == "each":  # a random error of each photograph biases nothing, but widens the scatter
+    if (
+        one.kind == "camera_varies"
+    ):  # a random error of each photograph biases nothing, but widens the scatter
         wrong = factor = precision_factor(plain)
     rms = None if of == "cameras" else found.rms
     size = {"shift": found.shift, "wrong": wrong, "rms": rms, "factor": factor}

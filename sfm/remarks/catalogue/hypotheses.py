@@ -130,9 +130,20 @@ ROWS: tuple[Kind, ...] = (
         "The camera changes between photographs[[, c by up to {change}]][[, principal point by up to "
         "{away}]][[, distortion at the edge by up to {distortion}]]. Standard deviations are too small, by a "
         f"factor of {{factor}} or more. {SHIFTED}{INSTEAD}",
-        "autofocus, a stabiliser, a rolling shutter or a loose lens",
+        "autofocus, a stabiliser or a loose lens",
         "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
         short="a camera that changes from photograph to photograph",
+        explains=OF_GIVEN,
+    ),
+    Kind(
+        "rolling_shutter",
+        SHIFT,
+        "The rows of a photograph were exposed one after the other while the camera moved: by up to {skew} "
+        f"from the first row to the last, most in {{photographs}}. {SHIFTED}{INSTEAD}",
+        "a rolling shutter, as of telephones, drones and video",
+        "Keep the camera still during an exposure, or use one with a global shutter; leave out these "
+        "photographs.",
+        short="a rolling shutter",
         explains=OF_GIVEN,
     ),
     Kind(
