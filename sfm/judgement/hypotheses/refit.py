@@ -255,9 +255,8 @@ def spread_of_photographs(found: Refit, one: Alternative, others: Sequence[Alter
         taken = reduced.absorb(reduced.whiten(_side_by_side(others, a, columns)))[2]
         taken = taken.reshape(len(left), -1)
         left = left - taken @ np.linalg.lstsq(taken, left, rcond=None)[0]
-    left = left.reshape(-1, 2)
     m = reduced.photographs
-    slope = np.bincount(reduced.image, (reduced.v * left).sum(axis=1), minlength=m)
+    slope = np.bincount(reduced.image, (reduced.v * left.reshape(-1, 2)).sum(axis=1), minlength=m)
     return float(slope @ slope / (left**2).sum()) * m / (m - 1)
 
 
