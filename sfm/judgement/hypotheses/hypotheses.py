@@ -359,30 +359,19 @@ def _beyond_spread(
 
 def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
     """Return the causes with a new one, without those that the others explain too."""
-    for kind in causes:
-        earlier = [one for one in causes if one is not kind]
-        before = [
-            (one.alternative, beta)
-            for one, beta in zip(causes, found.refit.before, strict=True)
-            if one is not kind
-        ]
-        alternative, together = found.alternative, found.refit
-        alone = refit(
-            plain,
-            replace(alternative, gain=replace(alternative.gain, beta=together.beta)),
-            together.adjustment,
-            before,
-        )
+    for cause in causes:
+        joint = zip(causes, found.refit.before, strict=True)
+        before = [(one, beta) for one, beta in joint if one is not cause]
+        new = replace(found.alternative, gain=replace(found.alternative.gain, beta=found.refit.beta))
+        others = [(one.alternative, beta) for one, beta in before]
+        alone = refit(plain, new, found.refit.adjustment, others)
         if alone is None:
             continue
-        gain = kind.alternative.deflated(-alone.gain, plain.redundancy)
-        if gain - kind.alternative.price < np.log(1 / ALPHA):
-            causes, found = tuple(earlier), replace(found, refit=alone)
-    joint = (
-        replace(one, refit=replace(one.refit, beta=beta))
-        for one, beta in zip(causes, found.refit.before, strict=True)
-    )
-    return (*joint, found)
+        gain = cause.alternative.deflated(-alone.gain, plain.redundancy)
+        if gain - cause.alternative.price < np.log(1 / ALPHA):
+            causes, found = tuple(one for one, _ in before), replace(found, refit=alone)
+    joint = zip(causes, found.refit.before, strict=True)
+    return (*(replace(one, refit=replace(one.refit, beta=beta)) for one, beta in joint), found)
 
 
 def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
