@@ -72,7 +72,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             "tests/judgement/test_given_model.py",
             "tests/judgement/test_given_values.py",
         )
-        for module in ("values", "points", "names")
+        for module in ("values", "points", "mistakes")
     },
     "sfm/adjustment/quality/consistency.py": (
         "tests/report/test_findings.py",

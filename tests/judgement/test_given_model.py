@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.judgement.given import free_network
-from sfm.judgement.given import names as given_names
+from sfm.judgement.given import mistakes as given_names
 from sfm.judgement.given import points as given_points
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.scales import Scales, scales_of_lengths

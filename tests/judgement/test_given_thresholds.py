@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
@@ -16,6 +17,7 @@ from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import scales as given_scales
 from sfm.judgement.given.judge import judge_given
+from sfm.judgement.given.scales import Comparison, Scales, Source
 from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
@@ -68,7 +70,8 @@ def test_bars_of_too_small_standard_deviations_take_part_as_the_weights_say(
     weights: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged = Judgement(90.0, 2, 1e-6, factor=6.0, score=-20.0)
-    monkeypatch.setattr(given_scales, "judge_values", lambda *_: judged)
+    alone = Judgement(0.0, 0, 1.0)  # of each bar beside others of its ends
+    monkeypatch.setattr(given_scales, "judge_values", lambda model, _: judged if model.items > 1 else alone)
     network, truth = make_network(seed_of("small bars"), images=8, points=30)
     bars = tuple(
         ScaleBar(str(k + 1), str(k + 16), float(np.linalg.norm(truth.points[k] - truth.points[k + 15])), 1e-3)
@@ -103,11 +106,14 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     v, variance = np.log([1.0, 1.1, 1.02]), np.array([1e-4, 3e-4, 2e-4])
     model = GivenModel(v, np.zeros((3, 3)), np.diag(variance), np.ones((3, 1)), np.arange(3), 100)
 
-    def said(bars: int = 3, *, on_points: bool = False, **found: tuple[int, ...]) -> tuple[set[int], Remark]:
-        judged, names = Judgement(30.0, 2, 1e-6, **found), ["a", "b", "control"]
-        task: Any = SimpleNamespace(in_control=on_points, settings=SimpleNamespace(plates=()))
-        out, remarks = given_scales._contradicting_scales(task, model, judged, names, bars)
-        return set(out), remarks[0]
+    def said(points: str = "", **found: tuple[int, ...]) -> tuple[set[int], Remark]:
+        scales = Scales(v, csr_matrix((3, 3)), variance)
+        sources = [Source("a", scales), Source("b", scales), Source("control", scales, points=points)]
+        compared = Comparison(sources, model, Judgement(30.0, 2, 1e-6, **found))
+        if compared.is_open(on_points=bool(points)):
+            out, remark = compared.contradiction()
+            return set(out), remark
+        return {*compared.judgement.wrong}, next(compared.remarks("bars", rescale=True))
 
     out, both = said(doubtful=(0, 1, 2))
     assert out == {0, 1, 2}
@@ -119,8 +125,8 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     assert one.number("off") == pytest.approx(100 * np.expm1(v[1] - mean))
     assert one.number("sigmas") == pytest.approx((v[1] - mean) / np.sqrt(3e-4 + 1 / 1.5e4))
     mean = (v[0] / 1e-4 + v[1] / 3e-4) / (1 / 1e-4 + 1 / 3e-4)
-    for on_points, wrong, kind in ((False, {2}, "scale_left_out"), (True, {0, 1, 2}, "scale_contradicted")):
-        out, one = said(2, on_points=on_points, wrong=(2,))
+    for points, wrong, kind in (("", {2}, "scale_left_out"), ("control", {0, 1, 2}, "scale_contradicted")):
+        out, one = said(points, wrong=(2,))
         assert (out, one.kind, one.names("given")) == (wrong, kind, ("control",))
         assert abs(one.number("off")) == pytest.approx(
             100 * np.expm1(v[2] - mean if v[2] > mean else mean - v[2]), rel=0.02
@@ -143,24 +149,17 @@ def test_a_length_is_that_of_a_unit_at_the_level(apart: float, unit: float | Non
     assert found.get("unit_factor") == unit and (unit is None or found["coarser"] == "inch")
 
 
-def test_a_bar_given_twice_counts_once() -> None:
-    bars = ScaleBars(
-        np.array([3, 5, 5, 6, 0]),
-        np.array([5, 3, 3, 7, 1]),
-        np.array([1.0, 1.0003, 1.2, 0.5, 2.0]),
-        np.array([1e-4, 2e-4, 1e-4, 1e-4, 1e-4]),
+@pytest.mark.parametrize(("apart", "agree"), [(3.4, True), (4.0, False)])
+def test_bars_of_the_same_ends_are_one_scale_if_they_agree_at_the_level(apart: float, agree: bool) -> None:
+    """Three tests share the level of 0.001: 3.6 standard deviations."""
+    network, truth = make_network(seed_of("same ends"), images=8, points=30)
+    length = float(np.linalg.norm(truth.points[8] - truth.points[19]))
+    bars = (
+        ScaleBar("9", "20", length, 1e-3),
+        ScaleBar("20", "9", length + apart * 1e-3 * np.sqrt(2), 1e-3),
     )
-    merged, members, contradicted = given_scales.merge_lengths(bars)
-    assert members == ((0, 1), (2,), (3,), (4,))
-    assert contradicted == (True, True, False, False)
-    assert merged.length[0] == pytest.approx(1.00006) and merged.sigma[0] == 1e-4
-
-
-@pytest.mark.parametrize(("apart", "agree"), [(3.2, True), (3.4, False)])
-def test_bars_of_the_same_ends_agree_at_the_level(apart: float, agree: bool) -> None:
-    length = np.array([1.0, 1.0 + apart * 1e-4 * np.sqrt(2)])
-    bars = ScaleBars(np.array([0, 0]), np.array([1, 1]), length, np.array([1e-4, 1e-4]))
-    assert (len(given_scales.merge_lengths(bars)[0]) == 1) == agree
+    said = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=bars)))
+    assert kinds_of(said) == (("scale_unchecked",) if agree else ("scale_contradicted",))
 
 
 @pytest.mark.parametrize(("false_alarm", "found"), [(0.05, True), (1e-4, False)])

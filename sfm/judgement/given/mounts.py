@@ -6,7 +6,7 @@ one another, and with everything else that gives a scale.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +14,16 @@ from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
-from sfm.judgement.given.scales import numbers_of_scale
-from sfm.judgement.given.values import RANK, GivenModel
+from sfm.judgement.given.mistakes import explanations
+from sfm.judgement.given.scales import (
+    Scales,
+    common_scale,
+    difference_of,
+    numbers_of_scale,
+    scales_of,
+)
+from sfm.judgement.given.values import GivenModel
 from sfm.network import Network
-from sfm.observations.kind import Kind
 from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import Similarity
@@ -42,15 +48,13 @@ def judge_mounts(
     rest = free.adjustment.redundancy
     for k, camera in enumerate(given.camera.tolist()):
         one = given.select(np.array([k]))
-        model = _shape(one, reference, mounts.position[camera])
+        model = _shape(one, reference, mounts.position)
         if model.fits(level):
             continue
         kept[k] = False
         turn = rotation_from_angles(*one.angles[0]).T @ mounts.rotation[camera]
-        mistakes = (
-            name
-            for name, mended in one.mistakes().items()
-            if _shape(mended, reference, mounts.position[camera]).fits(level)
+        mistakes = explanations(
+            [one], lambda mended: _shape(mended[0], reference, mounts.position).fits(level)
         )
         remarks.append(
             remark(
@@ -59,16 +63,16 @@ def judge_mounts(
                 angle=(_degrees((np.trace(turn) - 1) / 2), "deg"),
                 direction=(_degrees(_cosine(one.position[0], mounts.position[camera])), "deg"),
                 sigmas=float(np.sqrt(model.kept().chi2)),
-                mistake=next(mistakes, None),
+                mistake=next(iter(mistakes), None),
                 rest=rest if rest > model.kept().dof else None,
             )
         )
     return given.select(kept), tuple(remarks)
 
 
-def _shape(one: MountObservations, reference: Reference, X: FloatArray) -> GivenModel:
-    """Return the differences of one mount from that of the photographs, X; the length of the base is free."""
-    P = one.position[0]
+def _shape(one: MountObservations, reference: Reference, positions: FloatArray) -> GivenModel:
+    """Return the differences of one mount from that of the photographs; the length of the base is free."""
+    P, X = one.position[0], positions[one.camera[0]]
     scale = float(np.linalg.norm(P)) / max(float(np.linalg.norm(X)), TINY) or 1.0
     model, _ = reference.differences([one], Similarity(scale, np.eye(3), np.zeros(3)))
     return model if P @ X > 0 else replace(model, A=np.zeros((6, 0)))  # no positive scale reverses a base
@@ -96,55 +100,31 @@ def judge_mount_scales(
     if mounts is None or not has_scale:
         return given, ()
     placing = place(network)
-    model = _lengths(given, right, reference, placing)
-    if model.A.any():  # nothing else gives the scale: the covariance is that at the scale of the mounts
+    of_right = common_scale(reference, right, placing)
+    if of_right is None:
         bases = np.linalg.norm(mounts.position[given.camera], axis=1)
         scale = float(np.median(np.linalg.norm(given.position, axis=1) / bases))
-        model = _lengths(given, right, reference, replace(placing, scale=scale))
+        placing = replace(placing, scale=scale)
+    along = [np.append(position, np.zeros(3))[None] / (position @ position) for position in given.position]
+    of_mounts = scales_of(reference, [given], placing, block_diag(*along))
+    model = Scales.joined([of_mounts, *([] if of_right is None else [of_right])]).model(reference)
     if model.kept().probability() >= level:
         return given, ()
-    cameras, S = free.cameras, model.network + model.stated
-    if model.A.any():  # the two that differ most
+    cameras = [free.cameras[a].name for a in given.camera]
+    if of_right is None:  # the two that differ most
         low, high = int(model.v.argmin()), int(model.v.argmax())
-        off, sigma = model.v[high] - model.v[low], np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high])
-        contradicting, others = [high], [f"the mount of {cameras[given.camera[low]].name}"]
+        (off, sigma), contradicting = difference_of(model, high, low), [cameras[high]]
+        others = [f"the mount of {cameras[low]}"]
     else:
-        k = int(np.argmax(np.abs(model.v) / np.sqrt(np.diagonal(S))))
-        off, sigma, contradicting = model.v[k], np.sqrt(S[k, k]), list(range(len(given)))
-        sources = (
-            ("bars", network.scale_bars),
-            ("control", network.control),
-            ("centres", network.exterior),
-        )
-        others = [name for name, values in sources if len(values)]
-        others += [one.name for one in network.observations]
-    said = remark(
-        "scale_contradicted",
-        cameras=[cameras[a].name for a in given.camera[contradicting]],
-        others=others,
-        **numbers_of_scale(float(off), float(sigma)),
-    )
+        differences = [difference_of(model, k, len(given)) for k in range(len(given))]
+        off, sigma = max(differences, key=lambda by: abs(by[0]) / by[1])
+        contradicting = cameras
+        sources = {"bars": network.scale_bars, "control": network.control, "centres": network.exterior}
+        others = [name for name, values in sources.items() if len(values)]
+        others += [kind.name for kind in network.observations]
+    by = numbers_of_scale(off, sigma)
+    said = remark("scale_contradicted", cameras=contradicting, others=others, **by)
     return given.select(np.zeros(len(given), dtype=bool)), (said,)
-
-
-def _lengths(
-    given: MountObservations, right: Sequence[Kind], reference: Reference, placing: Similarity
-) -> GivenModel:
-    """Return the differences of ln of the lengths of bases from what the right values imply."""
-    model, kind = reference.differences([*right, given], placing)
-    model = model.beside((kind < len(right))[model.item])
-    along = block_diag(*(position[None] / (position @ position) for position in given.position))
-    along = along.reshape(len(given), -1, 3)
-    along = np.concatenate([along, np.zeros(along.shape)], axis=2).reshape(len(given), -1)
-    A = along @ model.A
-    return GivenModel(
-        -np.log(1 - along @ model.v),
-        along @ model.network @ along.T,
-        along @ model.stated @ along.T,
-        A[:, np.abs(A).max(axis=0, initial=0.0) > RANK],
-        np.arange(len(given)),
-        model.redundancy,
-    )
 
 
 def _cosine(a: FloatArray, b: FloatArray) -> float:

@@ -20,7 +20,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vecto
 from sfm.distributions import MARGIN
 from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import Reference, centre_and_size
-from sfm.judgement.given.names import assignments, cost_of_choice, find_renamed
+from sfm.judgement.given.mistakes import assignments, cost_of_choice, explanations, find_renamed
 from sfm.judgement.given.values import (
     RANK,
     GivenModel,
@@ -244,10 +244,7 @@ def judge_points(
     found = _placed(points, level, start, estimated)
     if found is None or found.judgement.fits:
         return found
-    others = list(_renamed(points, level, found.agreeing, estimated))
-    mirrored = _placed(points.mirrored(), level, None, estimated)
-    if mirrored is not None and mirrored.judgement.explained:
-        others.append(replace(mirrored, unmirrored=found.judgement.statistic))
+    others = list(_corrected(points, level, found, estimated))
     strained = _strained(points, level, found, estimated)
     if strained is not None:
         others.append(strained)
@@ -293,14 +290,23 @@ def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
     return n > 0 and n * float(np.log(max(unlike.chi2, n) / max(like.chi2, n))) > MARGIN
 
 
-def _renamed(
-    points: GivenPoints, level: float, agreed: Similarity | None, estimated: bool
+def _corrected(
+    points: GivenPoints, level: float, found: PlacedPoints, estimated: bool
 ) -> Iterator[PlacedPoints]:
-    """Yield the points with other names that explain the differences."""
-    for order in assignments(points.free, points.given, points.variances, agreed):
-        one = _placed(points.reordered(order), level, None, estimated)
-        if one is not None and one.judgement.explained:
-            yield replace(one, order=order)
+    """Yield the points with other names, and mirrored, that explain the differences."""
+
+    def judge(mended: list[CoordinateKind]) -> PlacedPoints | None:
+        placed = _placed(replace(points, kind=mended[0]), level, None, estimated)
+        return placed if placed is not None and placed.judgement.explained else None
+
+    orders = {
+        f"names {order}": order
+        for order in assignments(points.free, points.given, points.variances, found.agreeing)
+    }
+    renamed = {name: points.kind.reordered(np.array(order)) for name, order in orders.items()}
+    for mistake, placed in explanations([points.kind], judge, [renamed | points.kind.mistakes()]).items():
+        unmirrored = found.judgement.statistic if mistake == "mirrored" else None
+        yield replace(placed, order=orders.get(mistake, ()), unmirrored=unmirrored)
 
 
 def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:

@@ -1,28 +1,32 @@
-"""Tests of the scales given by bars, control and projection centres against one another.
+"""Scales of bars, plates, tables of distances, points and mounts, tested against one another.
 
-Every scale bar, and every group of given points, gives the ratio of an object length to its length in the
-free network. The logarithms of these scales are tested with their joint covariance.
+Each of them gives the logarithm of an object length over its length in the free network: of its differences
+from this network, the one parameter that the image points leave open. The logarithms are tested with their
+joint covariance. Rows of a table share the errors of a tape or an instrument, so they are one scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix, diags, vstack
+from scipy.spatial.transform import Rotation
 
 from sfm.conventions import FloatArray, find_unit
-from sfm.distributions import LEVEL, chi2_isf, chi2_sf
+from sfm.distributions import LEVEL, chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
-from sfm.judgement.given.values import UNSTATED_FRACTION, GivenModel, Judgement, judge_values
+from sfm.judgement.given.values import RANK, UNSTATED_FRACTION, GivenModel, Judgement, judge_values
 from sfm.network import ScaleBars
+from sfm.observations.kind import Kind
 from sfm.remarks.kind import significant
 from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
+from sfm.similarity import Similarity
 
 TABLE = "the table of distances"
 MAX_PERCENT = 2.0  # a larger ratio of lengths is reported as a factor, a smaller one in per cent
@@ -41,52 +45,53 @@ class JudgedScales:
 def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     """Judge the scales of bars, tables and dependable groups of points against one another.
 
+    Rows that contradict most of their table are left out. If nothing shows which rows of a table are wrong,
+    each of them is a source.
+
     Args:
         task: values to judge.
         groups: dependable groups of given points.
     """
-    lengths = _lengths_of(task)
-    found = [(group, scale_of_points(group.points, group.placed)) for group in groups]
-    of_groups = [(group, scale) for group, scale in found if scale is not None]
-    if not task.in_control:  # coordinates without a standard deviation may be those of a print
-        of_groups = [
-            (group, scale if group.points.stated.any() else scale.looser(UNSTATED_FRACTION))
-            for group, scale in of_groups
-        ]
-    names = list(lengths.sources)
-    names += [
-        plate_name(0) if task.of_plate and group.of == "control" else group.of for group, _ in of_groups
-    ]
-    if not names:
-        return JudgedScales(task.network.scale_bars)
-    scales = Scales.joined(
-        [lengths.scales.mean(lengths.sources.values()), *(scale for _, scale in of_groups)]
-    )
-    model = scales.model(task.reference)
-    judgement = judge_values(model, task.level)
-    tests: tuple[GivenTest, ...] = (
-        GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability),
-    )
-    out: tuple[int, ...] = ()
-    remarks: tuple[Remark, ...] = ()
-    factor = 1.0
-    if len(names) == 1:
-        tests = lengths.tests or tests
-        alone = not (task.of_plate or task.settings.checks_scale)
-        remarks = (remark("scale_unchecked", given=names[0]),) if alone else ()
-    elif judgement.fits:
-        remarks = tuple(remarks_on_unchecked("lengths", names, model))
-    elif judgement.factor != 1.0:
-        factor = judgement.factor if task.settings.rescale else 1.0
-        used = factor if task.settings.rescale else None
-        remarks = (remark("given_sigmas", of="bars", factor=judgement.factor, used=used),)
+    bars, rescale = task.network.scale_bars, task.settings.rescale
+    used, factor = np.ones(len(bars), dtype=bool), np.ones(len(bars))
+    sources, remarks, tests = list[Source](), list[Remark](), list[GivenTest]()
+    for name, rows in _lengths(task).items():
+        compared = Comparison.of(task, rows)
+        if compared.judgement.doubtful and not rows[0].is_plate:
+            sources += compared.with_lengths(bars, task.settings.unit)
+            continue
+        sources.append(compared.as_one(name))
+        used[[b for k in compared.judgement.wrong for b in rows[k].bars]] = False
+        factor[[b for row in rows for b in row.bars]] = compared.factor if rescale else 1.0
+        remarks += compared.remarks(name, rescale=rescale)
+        if rows[0].table:  # the rows that were not judged, too
+            factor[bars.table == rows[0].table] = compared.factor if rescale else 1.0
+            remarks += compared.unchecked
+            tests = [compared.test]
+    sources += _sources_of_points(task, groups)
+    if not sources:
+        return JudgedScales(bars)
+    compared, out = Comparison.of(task, sources), tuple[int, ...]()
+    if len(sources) == 1:
+        tests = tests or [compared.test]
+        if not (task.of_plate or task.settings.checks_scale):
+            remarks.append(remark("scale_unchecked", given=sources[0].name))
     else:
-        out, remarks = _contradicting_scales(task, model, judgement, names, len(lengths.sources))
-    count = len(lengths.sources)
-    left_out = frozenset(of_groups[k - count][0].of for k in out if k >= count)
-    bars = lengths.without([names[k] for k in out if k < count])
-    bars = replace(bars, sigma=factor * bars.sigma)
-    return JudgedScales(bars, (*lengths.remarks, *remarks), tests, left_out)
+        tests, out = [compared.test], compared.judgement.wrong
+        if compared.is_open(on_points=task.in_control):
+            out, contradiction = compared.contradiction()
+            remarks.append(contradiction)
+        else:
+            factor *= compared.factor if rescale else 1.0
+            remarks += compared.remarks("bars", rescale=rescale)
+            remarks += compared.unchecked if compared.judgement.fits else ()
+    for source in (sources[k] for k in out):
+        used[list(source.bars)] = False
+        if source.is_table:
+            used &= bars.table != source.table
+    left_out = frozenset(sources[k].points for k in out) - {""}
+    taken = replace(bars, sigma=factor * bars.sigma).select(used)
+    return JudgedScales(taken, tuple(remarks), tuple(tests), left_out)
 
 
 class Scales(NamedTuple):
@@ -106,12 +111,12 @@ class Scales(NamedTuple):
         """Return the scales with a further relative standard deviation."""
         return self._replace(variance=self.variance + sigma**2)
 
-    def mean(self, sets: Collection[Sequence[int]]) -> Scales:
-        """Return the mean of each of several sets of scales from independent lengths."""
-        M = np.zeros((len(sets), len(self.log)))
-        for row, members in zip(M, sets, strict=True):
-            row[list(members)] = 1 / len(members)
-        return Scales(M @ self.log, csr_matrix(M) @ self.J, M**2 @ self.variance)
+    @property
+    def mean(self) -> Scales:
+        """Mean of scales from independent lengths."""
+        k = len(self.log)
+        J = csr_matrix(np.full((1, k), 1 / k)) @ self.J
+        return Scales(self.log.mean(keepdims=True), J, self.variance.sum(keepdims=True) / k**2)
 
     def model(self, reference: Reference) -> GivenModel:
         """Return the differences of scales as a model of given values.
@@ -134,14 +139,53 @@ class Scales(NamedTuple):
         return GivenModel(self.log, network, stated, np.ones((k, 1)), np.arange(k), redundancy)
 
 
+def scales_of(
+    reference: Reference, kinds: Sequence[Kind], placing: Similarity, by_values: csr_matrix | FloatArray
+) -> Scales:
+    """Return the scales that observations give, from their differences from the free network.
+
+    Args:
+        reference: the free network.
+        kinds: observations.
+        placing: object frame from the frame of the free network.
+        by_values: derivatives of the logarithms of scales by the given values, (k, m).
+    """
+    found, W = reference.compare(kinds, placing), csr_matrix(by_values)
+    left = 1 - W @ found.v  # length in the free network, over the given one
+    variance = np.asarray(W.multiply(W @ found.stated).sum(axis=1)).ravel()
+    return Scales(np.log(placing.scale) - np.log(left), -csr_matrix(diags(1 / left) @ W @ found.J), variance)
+
+
 def scales_of_lengths(bars: ScaleBars, reference: Reference) -> Scales:
     """Return the scale of each length between two points of the free network."""
-    if not len(bars):
-        return Scales(np.zeros(0), csr_matrix((0, len(reference.C))), np.zeros(0))
-    found = reference.compare([bars], UNCHANGED)
-    length = bars.length - found.v  # in the free network
-    J = csr_matrix(-found.J.multiply(1 / length[:, None]))
-    return Scales(np.log(bars.length / length), J, (bars.sigma / bars.length) ** 2)
+    return scales_of(reference, [bars], UNCHANGED, diags(1 / bars.length))
+
+
+def common_scale(
+    reference: Reference,
+    kinds: Sequence[Kind],
+    placing: Similarity,
+    *,
+    without: tuple[int, ...] = (),
+    estimated: bool = False,
+) -> Scales | None:
+    """Return the scale that observations give together, in the object frame; None if they give none.
+
+    Args:
+        reference: the free network.
+        kinds: observations.
+        placing: object frame from the frame of the free network.
+        without: given values left out.
+        estimated: whether the standard deviations are unknown.
+    """
+    if not kinds:
+        return None
+    model, _ = reference.differences(kinds, placing)
+    kept, by_values = ~np.isin(model.item, without), np.zeros((1, len(model.v)))
+    by_values[0, kept] = parameters_of(replace(model, estimated=estimated), kept)[6]
+    if by_values @ model.A[:, 6] < 1 - RANK**0.5:  # another parameter may be all of it
+        return None
+    return scales_of(reference, kinds, placing, by_values / reference.compare(kinds, placing).size)
 
 
 def scale_of_points(points: GivenPoints, placed: PlacedPoints) -> Scales | None:
@@ -151,204 +195,181 @@ def scale_of_points(points: GivenPoints, placed: PlacedPoints) -> Scales | None:
         points: given points.
         placed: these points, judged.
     """
-    complete, reference, out = points.complete, points.reference, placed.judgement.wrong
+    complete, placing, out = points.complete, placed.placing, placed.judgement.wrong
     if len(complete) == 2 and np.isfinite(points.given).sum() == 6:
-        pair = points.select(complete)
-        apart, apart_free = (X[1] - X[0] for X in (pair.given, pair.free))
-        length, free = float(np.linalg.norm(apart)), float(np.linalg.norm(apart_free))
-        if not length > 0:
+        points, out = points.select(complete), ()
+        (apart,), (apart_free,) = np.diff(points.given, axis=0), np.diff(points.free, axis=0)
+        if not apart.any():
             return None
-        log, G = np.log(length / free), np.concatenate([-apart_free, apart_free]) / free**2
-        J, e = reference.compare([pair.kind], UNCHANGED).J, apart / length
-        variance = float(e @ pair.stated.sum(axis=0) @ e) / length**2
+        turn = Rotation.align_vectors(apart[None], apart_free[None])[0].as_matrix()
+        scale = float(np.linalg.norm(apart) / np.linalg.norm(apart_free))
+        placing = Similarity(scale, turn, points.given[0] - scale * turn @ points.free[0])
     elif len(complete) < 3 or placed.model.kept(out).dof < 0:
         return None
-    else:
-        found, kept = reference.compare([points.kind], placed.placing), ~np.isin(placed.model.item, out)
-        G = np.zeros(len(kept))
-        G[kept] = parameters_of(placed.model, kept)[6] / found.size
-        log, J, variance = np.log(placed.placing.scale), found.J, float(G @ placed.model.stated @ G)
-    return Scales(np.array([log]), csr_matrix(-csr_matrix(G) @ J), np.array([variance]))
+    estimated = placed.model.estimated
+    return common_scale(points.reference, [points.kind], placing, without=out, estimated=estimated)
 
 
-@dataclass(frozen=True)
-class _Lengths:
-    """Given lengths, and the sources of their scale: a bar, a plate, or a table of distances."""
+class Source(NamedTuple):
+    """Given values that have one scale: a bar, a plate, a table of distances, or given points."""
 
-    scales: Scales
-    bars: ScaleBars  # with standard deviations that fit
-    members: tuple[tuple[int, ...], ...]  # bars of each length
-    sources: dict[str, list[int]]  # lengths of each source
-    tables: dict[str, int]  # number of each table
-    wrong: tuple[int, ...] = ()  # lengths of tables that contradict the others of their table
-    remarks: tuple[Remark, ...] = ()  # on rows of tables
-    tests: tuple[GivenTest, ...] = ()  # of the rows of a table
-
-    def without(self, sources: Collection[str]) -> ScaleBars:
-        """Return the bars of all other sources; of a table that is left out, none remains."""
-        lengths = [*self.wrong, *(length for source in sources for length in self.sources[source])]
-        out = np.isin(np.arange(len(self.bars)), [b for length in lengths for b in self.members[length]])
-        if len(self.bars.table):
-            tables = [self.tables[source] for source in sources if source in self.tables]
-            out |= np.isin(self.bars.table, tables)
-        return self.bars.select(~out)
+    name: str
+    scales: Scales  # of its independent lengths
+    bars: tuple[int, ...] = ()  # rows of its lengths among all bars
+    table: int = 0  # number of the table of its lengths
+    points: str = ""  # kind of given points
+    is_plate: bool = False
+    is_table: bool = False  # whether it is all rows of its table
 
 
-def _lengths_of(task: Task) -> _Lengths:
-    """Return the given lengths by source.
+class Comparison(NamedTuple):
+    """Sources of scale, judged against one another."""
 
-    The rows of a table share the errors of a tape or an instrument. Rows that contradict most of their table
-    are left out. If nothing shows which rows of a table are wrong, each of them is a source.
-    """
+    sources: Sequence[Source]
+    model: GivenModel
+    judgement: Judgement
+
+    @classmethod
+    def of(cls, task: Task, sources: Sequence[Source]) -> Comparison:
+        """Judge sources of scale."""
+        model = Scales.joined([source.scales.mean for source in sources]).model(task.reference)
+        return cls(sources, model, judge_values(model, task.level))
+
+    @property
+    def factor(self) -> float:
+        """Factor on all standard deviations with which the sources agree."""
+        return self.judgement.factor
+
+    @property
+    def test(self) -> GivenTest:
+        """Test of all sources."""
+        return GivenTest("scale", self.judgement.statistic, self.judgement.dof, self.judgement.probability)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the sources."""
+        return [source.name for source in self.sources]
+
+    @property
+    def unchecked(self) -> Iterator[Remark]:
+        """Remarks on right sources whose errors hardly anything would reveal."""
+        return remarks_on_unchecked("lengths", self.names, self.model, self.judgement.wrong)
+
+    def as_one(self, table: str) -> Source:
+        """Return the right ones as one source, with standard deviations that fit.
+
+        Args:
+            table: name of the table, if they are its rows.
+        """
+        first, *others = (source for k, source in enumerate(self.sources) if k not in self.judgement.wrong)
+        scales = Scales.joined([first.scales, *(source.scales for source in others)])
+        scales = scales._replace(variance=self.factor**2 * scales.variance)
+        name, is_table = (table, True) if first.table and others else (first.name, False)
+        bars = tuple(b for source in (first, *others) for b in source.bars)
+        return first._replace(name=name, scales=scales, bars=bars, is_table=is_table)
+
+    def with_lengths(self, bars: ScaleBars, unit: str) -> list[Source]:
+        """Return the sources, with their lengths where several have one name."""
+        lengths = [f" ({significant(float(bars.length[source.bars[0]]))} {unit})" for source in self.sources]
+        return [
+            source._replace(name=source.name + length) if self.names.count(source.name) > 1 else source
+            for source, length in zip(self.sources, lengths, strict=True)
+        ]
+
+    def remarks(self, of: str, *, rescale: bool) -> Iterator[Remark]:
+        """Yield remarks on wrong sources and on standard deviations.
+
+        Args:
+            of: what the standard deviations belong to.
+            rescale: whether standard deviations that are too small are replaced.
+        """
+        wrong = self.judgement.wrong
+        for k in wrong:
+            what = "plate" if self.sources[k].is_plate else "given"
+            yield remark(
+                "scale_left_out", **{what: self.sources[k].name}, **numbers_of_scale(*self.difference(k))
+            )
+        if self.factor != 1.0:
+            yield remark("given_sigmas", of=of, factor=self.factor, used=self.factor if rescale else None)
+
+    def difference(self, k: int) -> tuple[float, float]:
+        """Return the logarithm of a wrong scale over the scale of the right ones, and its sigma."""
+        others = tuple(j for j in self.judgement.wrong if j != k)
+        (off,), ((variance,),) = self.model.kept(others).difference(k)
+        return float(off), float(np.sqrt(variance))
+
+    def is_open(self, *, on_points: bool) -> bool:
+        """Return whether the others do not identify the wrong ones.
+
+        Args:
+            on_points: whether points carry the datum: bars, which may share a wrong unit, do not replace
+                them.
+        """
+        of_points = {k for k, source in enumerate(self.sources) if source.points}
+        outvoted = on_points and len(of_points) > 0 and of_points <= {*self.judgement.wrong}
+        return bool(self.judgement.doubtful) or outvoted
+
+    def contradiction(self) -> tuple[tuple[int, ...], Remark]:
+        """Return the sources that are not used because they contradict one another, and the remark on it."""
+        wrong = self.judgement.wrong
+        which = sorted(wrong or self.judgement.doubtful, key=lambda k: (not self.sources[k].points, k))
+        lengths = [k for k, source in enumerate(self.sources) if not source.points]
+        agreeing = None
+        if wrong:
+            off, sigma = self.difference(which[0])
+            agreeing = len(set(lengths) - set(wrong))
+        else:
+            low, *_, high = sorted(which, key=lambda k: self.model.v[k])
+            off, sigma = difference_of(self.model, high, low)
+        by = numbers_of_scale(abs(off), sigma)
+        out = (*lengths, *(k for k in which if self.sources[k].points))
+        if not any(source.is_plate for source in self.sources):
+            given = [self.sources[k].name for k in which]
+            return out, remark("scale_contradicted", given=given, agreeing=agreeing, **by)
+        by_name = (self.sources[k] for k in which)
+        given = [
+            source.name if source.is_plate or source.is_table else f"bar {source.name}" for source in by_name
+        ]
+        others = [name for k, name in enumerate(self.names) if k not in which] or None
+        return out, remark("plate_sizes_contradict", given=given, others=others, **by)
+
+
+def _sources_of_points(task: Task, groups: Sequence[Group]) -> Iterator[Source]:
+    """Yield dependable groups of points that give a scale."""
+    for group in groups:
+        scale = scale_of_points(group.points, group.placed)
+        if scale is None:
+            continue
+        if not (task.in_control or group.points.stated.any()):
+            # coordinates without a standard deviation may be those of a print
+            scale = scale.looser(UNSTATED_FRACTION)
+        is_plate = task.of_plate and group.of == "control"
+        yield Source(plate_name(0) if is_plate else group.of, scale, points=group.of, is_plate=is_plate)
+
+
+def _lengths(task: Task) -> dict[str, list[Source]]:
+    """Return the given lengths that have one scale: of each table, plate or pair of points."""
     bars = task.network.scale_bars
     judged = thinned(len(bars))
     rows, seen = task.in_free(bars.select(judged))
     apart = seen.start != seen.end
-    rows, seen = judged[rows[apart]], seen.select(apart)
-    merged, members, contradicted = merge_lengths(seen)
+    rows, scales = judged[rows[apart]], scales_of_lengths(seen.select(apart), task.reference)
     several = len(np.unique(bars.table[bars.table > 0])) > 1
-    lengths = _Lengths(
-        scales_of_lengths(merged, task.reference),
-        bars,
-        tuple(tuple(rows[list(group)].tolist()) for group in members),
-        {},
-        {},
-    )
-    tables: dict[str, dict[str, list[int]]] = {}
-    for k, of_length in enumerate(lengths.members):
-        b = of_length[0]
+    sources: dict[str, list[Source]] = {}
+    for k, b in enumerate(rows.tolist()):
         ends = tuple(task.network.points[j] for j in (bars.start[b], bars.end[b]))
-        given = f" ({significant(float(merged.length[k]))} {task.settings.unit})" if contradicted[k] else ""
-        name = task.plate_at(ends) or f"{ends[0]} - {ends[1]}{given}"
-        number = int(bars.table[b]) if len(bars.table) else 0
-        table = (f"{TABLE} {number}" if several else TABLE) if number else ""
-        of = tables.setdefault(table, {}) if table else lengths.sources
-        of.setdefault(name, []).append(k)
-        if table:
-            lengths.tables[table] = number
-    for table, of_table in tables.items():
-        lengths = _with_table(task, lengths, table, of_table)
-    return lengths
+        plate, table = task.plate_at(ends), int(bars.table[b]) if len(bars.table) else 0
+        of_table = f"{TABLE} {table}" if several else TABLE
+        name = plate or " - ".join(ends)
+        source = Source(name, Scales(*(part[[k]] for part in scales)), (b,), table, is_plate=bool(plate))
+        sources.setdefault(of_table if table else plate or " - ".join(sorted(ends)), []).append(source)
+    return sources
 
 
-def _with_table(task: Task, lengths: _Lengths, table: str, rows: dict[str, list[int]]) -> _Lengths:
-    """Return the lengths with the rows of a table, judged against one another."""
-    model = lengths.scales.mean(rows.values()).model(task.reference)
-    judgement, names = judge_values(model, task.level), list(rows)
-    alike = [name for k, name in enumerate(names) if k not in judgement.wrong]
-    for name in alike:
-        source = name if judgement.doubtful or len(alike) == 1 else table
-        lengths.sources.setdefault(source, []).extend(rows[name])
-    if judgement.doubtful:
-        return lengths
-    remarks = [_left_out(model, judgement.wrong, names, k) for k in judgement.wrong]
-    scales, bars = lengths.scales, lengths.bars
-    if judgement.factor != 1.0:
-        used = judgement.factor if task.settings.rescale else None
-        remarks.append(remark("given_sigmas", of=table, factor=judgement.factor, used=used))
-        every = [length for row in rows.values() for length in row]
-        variance = scales.variance.copy()
-        variance[every] *= judgement.factor**2
-        factor = np.where(bars.table == lengths.tables[table], used or 1.0, 1.0)
-        scales, bars = scales._replace(variance=variance), replace(bars, sigma=factor * bars.sigma)
-    remarks += remarks_on_unchecked("lengths", names, model, judgement.wrong)
-    test = GivenTest("scale", judgement.statistic, judgement.dof, judgement.probability)
-    return replace(
-        lengths,
-        scales=scales,
-        bars=bars,
-        wrong=(*lengths.wrong, *(length for k in judgement.wrong for length in rows[names[k]])),
-        remarks=(*lengths.remarks, *remarks),
-        tests=(test,),
-    )
-
-
-def merge_lengths(bars: ScaleBars) -> tuple[ScaleBars, tuple[tuple[int, ...], ...], tuple[bool, ...]]:
-    """Merge agreeing lengths of a table between the same points: giving one twice does not improve it.
-
-    Args:
-        bars: scale bars.
-
-    Returns:
-        The weighted means with the sigma of the best bar, the bars of each, and whether a different length
-        is given between the same points.
-    """
-    same: dict[tuple[frozenset[int], int], list[list[int]]] = {}
-    for b in np.argsort(bars.length, kind="stable").tolist():
-        ends = frozenset((int(bars.start[b]), int(bars.end[b])))
-        alike = same.setdefault((ends, int(bars.table[b]) if len(bars.table) else 0), [])
-        if alike and _agree(bars, alike[-1][0], b):
-            alike[-1].append(b)
-        else:
-            alike.append([b])
-    found = sorted(
-        ((members, len(alike) > 1) for alike in same.values() for members in alike),
-        key=lambda one: min(one[0]),
-    )
-    members = tuple(tuple(group) for group, _ in found)
-    merged = replace(
-        bars.select(np.array([group[0] for group in members], dtype=np.int64)),
-        length=np.array([np.average(bars.length[[*b]], weights=1 / bars.sigma[[*b]] ** 2) for b in members]),
-        sigma=np.array([bars.sigma[[*b]].min() for b in members]),
-    )
-    return merged, members, tuple(contradicted for _, contradicted in found)
-
-
-def _contradicting_scales(
-    task: Task, model: GivenModel, judgement: Judgement, names: list[str], bars: int
-) -> tuple[tuple[int, ...], tuple[Remark, ...]]:
-    """Return the scales that the others identify as wrong, or all doubtful ones if they do not, with remarks.
-
-    names: bars and plates, of which the first `bars` are lengths, then kinds of given points.
-    If given points carry the datum, bars, which may share a wrong unit, do not replace them.
-    """
-    on_points = task.in_control
-    plates = {plate_name(k) for k in range(len(task.settings.plates))}.intersection(names)
-    wrong, every = judgement.wrong, range(model.items)
-    if wrong and not (on_points and max(wrong) >= bars and {*every[bars:]} <= {*wrong}):
-        return wrong, tuple(_left_out(model, wrong, names, k, plates) for k in wrong)
-    which = sorted(wrong or judgement.doubtful or every, key=lambda k: (k < bars, k))
-    if wrong:
-        off, sigma = _difference(model, wrong, which[0])
-        agreeing = bars - sum(k < bars for k in wrong)
-    else:
-        v, S = model.v[which], (model.network + model.stated)[np.ix_(which, which)]
-        low, high = int(v.argmin()), int(v.argmax())
-        off = float(v[high] - v[low])
-        sigma = float(np.sqrt(S[low, low] + S[high, high] - 2 * S[low, high]))
-        agreeing = None
-    by = numbers_of_scale(abs(off), sigma)
-    if plates:
-        given = [
-            one if one in plates or one.startswith(TABLE) else f"bar {one}"
-            for one in (names[k] for k in which)
-        ]
-        others = [names[k] for k in every if k not in which] or None
-        said = remark("plate_sizes_contradict", given=given, others=others, **by)
-    else:
-        said = remark("scale_contradicted", given=[names[k] for k in which], agreeing=agreeing, **by)
-    return (*every[:bars], *(k for k in which if k >= bars)), (said,)
-
-
-def _left_out(
-    model: GivenModel, wrong: tuple[int, ...], names: list[str], k: int, plates: Collection[str] = ()
-) -> Remark:
-    """Return the remark that a bar, a plate or given points were left out because of their scale."""
-    off, sigma = _difference(model, wrong, k)
-    what = "plate" if names[k] in plates else "given"
-    return remark("scale_left_out", **{what: names[k]}, **numbers_of_scale(off, sigma))
-
-
-def _difference(model: GivenModel, wrong: tuple[int, ...], k: int) -> tuple[float, float]:
-    """Return the logarithm of a wrong scale over the scale of the correct ones, and its sigma."""
-    (off,), ((variance,),) = model.kept(tuple(j for j in wrong if j != k)).difference(k)
-    return float(off), float(np.sqrt(variance))
-
-
-def _agree(bars: ScaleBars, a: int, b: int) -> bool:
-    """Return whether two lengths differ by no more than their standard deviations allow."""
-    variance = float(bars.sigma[a] ** 2 + bars.sigma[b] ** 2)
-    return bool(chi2_sf((bars.length[b] - bars.length[a]) ** 2 / variance, 1) >= LEVEL)
+def difference_of(model: GivenModel, a: int, b: int) -> tuple[float, float]:
+    """Return the logarithm of one scale over another, and its sigma."""
+    S = model.network + model.stated
+    return float(model.v[a] - model.v[b]), float(np.sqrt(S[a, a] + S[b, b] - 2 * S[a, b]))
 
 
 def numbers_of_scale(log: float, sigma: float) -> dict[str, Any]:

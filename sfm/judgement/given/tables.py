@@ -16,6 +16,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.judgement.given.free_network import Reference, confirmed, thinned
+from sfm.judgement.given.mistakes import explanations
 from sfm.judgement.given.values import GivenModel, judge_values
 from sfm.network import Network
 from sfm.observations.kind import Group, Kind, TableKind
@@ -213,20 +214,18 @@ class _Judge:
 
         A unit also changes the standard deviations. It explains nothing if these alone do.
         """
-        found = list[str]()
         if self.fit([*others, *kinds]):  # there is nothing to correct
             return ()
-        corrected = [kind.mistakes() for kind in kinds]
-        for mistake in dict.fromkeys(mistake for mistakes in corrected for mistake in mistakes):
-            mended = [by.get(mistake, kind) for by, kind in zip(corrected, kinds, strict=True)]
+
+        def is_explained(mended: Sequence[Kind]) -> bool:
             looser = [
                 kind.with_sigma(other.sigma)
                 for kind, other in zip(kinds, mended, strict=True)
                 if isinstance(kind, TableKind) and isinstance(other, TableKind)
             ]
-            if self.fit([*others, *mended]) and not self.fit([*others, *looser]):
-                found.append(mistake)
-        return tuple(found)
+            return self.fit([*others, *mended]) and not self.fit([*others, *looser])
+
+        return tuple(explanations(kinds, is_explained))
 
 
 def _parts_of(tables: Sequence[Table]) -> tuple[tuple[int, int], ...]:

@@ -1,4 +1,4 @@
-"""Finds other assignments of names to given points, from the shape of the free network.
+"""Common mistakes in given values: each that a kind lists is corrected on trial, and names are assigned anew.
 
 A list of coordinates shifted by one row, or with two names exchanged, is the same figure of points with other
 names. Similar triangles in both figures give the similarity between them, and with it the assignment.
@@ -6,13 +6,15 @@ names. Similar triangles in both figures give the similarity between them, and w
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import permutations
 from math import lgamma
+from typing import TypeVar
 
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.observations.kind import Kind
 from sfm.similarity import Similarity, fit_similarities
 
 MIN_POINTS = 4  # three points have a similar triangle by chance too easily: two degrees of freedom
@@ -20,6 +22,27 @@ MAX_POINTS = 40  # 59,280 ordered triangles; with more points, only the agreed s
 TRIANGLES = 20  # with half of the points correct, 14 of 15 lists of triangles include a correct one
 MAX_SIMILAR = 60  # similar triangles that are tried; a cube has 24, and 24 mirrored ones
 MAX_ASSIGNMENTS = 8  # assignments that are judged: the likeliest and its rivals
+
+T = TypeVar("T")
+K = TypeVar("K", bound=Kind)
+
+
+def explanations(
+    kinds: Sequence[K], judge: Callable[[list[K]], T | None], corrected: Sequence[Mapping[str, K]] = ()
+) -> dict[str, T]:
+    """Return what observations are judged to be after the correction of each mistake that explains them.
+
+    Args:
+        kinds: observations with the same mistake.
+        judge: judges corrected observations; None or False if the correction explains nothing.
+        corrected: corrected observations of each kind by the name of the mistake; `Kind.mistakes` if empty.
+    """
+    corrected, found = corrected or [kind.mistakes() for kind in kinds], dict[str, T]()
+    for mistake in dict.fromkeys(mistake for mistakes in corrected for mistake in mistakes):
+        judged = judge([by.get(mistake, kind) for by, kind in zip(corrected, kinds, strict=True)])
+        if judged:
+            found[mistake] = judged
+    return found
 
 
 def assignments(
