@@ -109,7 +109,7 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     def said(points: str = "", **found: tuple[int, ...]) -> tuple[set[int], Remark]:
         scales = Scales(v, csr_matrix((3, 3)), variance)
         sources = [Source("a", scales), Source("b", scales), Source("control", scales, points=points)]
-        compared = Comparison(sources, model, Judgement(30.0, 2, 1e-6, **found))
+        compared = Comparison(sources, model, Judgement(30.0, 2, 1e-6, **found), 1e-3)
         if compared.is_open(on_points=bool(points)):
             out, remark = compared.contradiction()
             return set(out), remark

@@ -20,7 +20,14 @@ from sfm.distributions import LEVEL, chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
-from sfm.judgement.given.values import RANK, UNSTATED_FRACTION, GivenModel, Judgement, judge_values
+from sfm.judgement.given.values import (
+    RANK,
+    UNSTATED_FRACTION,
+    GivenModel,
+    Judgement,
+    cost_of_parameter,
+    judge_values,
+)
 from sfm.network import ScaleBars
 from sfm.observations.kind import Kind
 from sfm.remarks.kind import significant
@@ -57,7 +64,7 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     sources, remarks, tests = list[Source](), list[Remark](), list[GivenTest]()
     for name, rows in _lengths(task).items():
         compared = Comparison.of(task, rows)
-        if compared.judgement.doubtful and not rows[0].is_plate:
+        if compared.judgement.doubtful and not compared.scatters and not rows[0].is_plate:
             sources += compared.with_lengths(bars, task.settings.unit)
             continue
         sources.append(compared.as_one(name))
@@ -228,17 +235,28 @@ class Comparison(NamedTuple):
     sources: Sequence[Source]
     model: GivenModel
     judgement: Judgement
+    level: float  # probability that right sources are reported as wrong
 
     @classmethod
     def of(cls, task: Task, sources: Sequence[Source]) -> Comparison:
         """Judge sources of scale."""
         model = Scales.joined([source.scales.mean for source in sources]).model(task.reference)
-        return cls(sources, model, judge_values(model, task.level))
+        return cls(sources, model, judge_values(model, task.level), task.level)
+
+    @property
+    def scatters(self) -> bool:
+        """Whether all are rows of a table, and too small deviations explain more than errors of some rows.
+
+        The rows of a table have one precision. If nothing shows which of them are wrong, it is their scatter.
+        """
+        score = cost_of_parameter(len(self.sources)) - self.model.factor()[1]
+        is_likelier = bool(self.judgement.doubtful) and score <= min(self.judgement.score, 0.0)
+        return self.sources[0].table > 0 and is_likelier and self.model.at_worst.fits(self.level)
 
     @property
     def factor(self) -> float:
         """Factor on all standard deviations with which the sources agree."""
-        return self.judgement.factor
+        return self.model.factor()[0] if self.scatters else self.judgement.factor
 
     @property
     def test(self) -> GivenTest:
