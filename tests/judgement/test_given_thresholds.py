@@ -12,6 +12,7 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.distributions import LEVEL
 from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
@@ -137,7 +138,7 @@ def test_contradicting_lengths_differ_by_their_standard_deviation() -> None:
     ("factor", "percent"), [(1.95, 95.0), (1 / 1.95, 100 / 1.95 - 100), (2.05, None), (0.1, None)]
 )
 def test_more_than_twice_is_a_factor(factor: float, percent: float | None) -> None:
-    found = given_scales.numbers_of_scale(float(np.log(factor)), 1e-3)
+    found = given_scales.numbers_of_scale(float(np.log(factor)), 1e-3, LEVEL)
     assert found.get("times") == (None if percent else pytest.approx(factor))
     assert found.get("off", (None,))[0] == (percent and pytest.approx(percent))
     assert found["sigmas"] == pytest.approx(abs(np.log(factor)) / 1e-3)
@@ -145,7 +146,7 @@ def test_more_than_twice_is_a_factor(factor: float, percent: float | None) -> No
 
 @pytest.mark.parametrize(("apart", "unit"), [(3.2, 25.4), (3.4, None)])
 def test_a_length_is_that_of_a_unit_at_the_level(apart: float, unit: float | None) -> None:
-    found = given_scales.numbers_of_scale(float(np.log(25.4 * (1 + apart * 1e-3))), 1e-3)
+    found = given_scales.numbers_of_scale(float(np.log(25.4 * (1 + apart * 1e-3))), 1e-3, LEVEL)
     assert found.get("unit_factor") == unit and (unit is None or found["coarser"] == "inch")
 
 

@@ -225,3 +225,28 @@ def test_a_wrong_row_leaves_its_table_which_alone_gives_the_scale() -> None:
     said = {one.kind: one.names("given") for one in remarks_on_given(result)}
     assert said == {"scale_left_out": ("4 - 18",), "scale_unchecked": ("the table of distances",)}
     assert len(result.network.scale_bars) == 7
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    ("times", "kinds", "level"),
+    [(1.0, [], "good"), (5.0, ["given_sigmas"], "fair"), (50.0, ["scale_contradicted"], "bad")],
+)
+def test_a_table_scatters_up_to_ten_times_its_standard_deviations(
+    times: float, kinds: list[str], level: str, seed: int
+) -> None:
+    """At five times, every row became a scale of its own, and a right survey was bad."""
+    network, truth = _scene(f"a table that scatters {seed}")
+    table = _table(truth, 12, 1.0)
+    noise = seed_of(f"scatter of rows {seed}").standard_normal((12, 1))
+    result = run_survey(
+        survey_of(network, truth, tables=(replace(table, value=table.value + times * 2e-4 * noise),))
+    )
+    said = [one for one in remarks_on_given(result) if one.severity != "note"]
+    assert [one.kind for one in said] == kinds
+    assert findings_of(result).verdict.level == level and result.has_scale == (level != "bad")
+    if level == "fair":
+        assert said[0].names("of") == ("the table of distances",)
+        assert said[0].number("factor") == pytest.approx(times, rel=0.5)
+        sigma = result.network.scale_bars.sigma
+        np.testing.assert_allclose(sigma, said[0].number("factor") * 2e-4)

@@ -122,7 +122,7 @@ def judge_mount_scales(
         sources = {"bars": network.scale_bars, "control": network.control, "centres": network.exterior}
         others = [name for name, values in sources.items() if len(values)]
         others += [kind.name for kind in network.observations]
-    by = numbers_of_scale(off, sigma)
+    by = numbers_of_scale(off, sigma, level)
     said = remark("scale_contradicted", cameras=contradicting, others=others, **by)
     return given.select(np.zeros(len(given), dtype=bool)), (said,)
 

@@ -16,7 +16,7 @@ from scipy.sparse import csr_matrix, diags, vstack
 from scipy.spatial.transform import Rotation
 
 from sfm.conventions import FloatArray, find_unit
-from sfm.distributions import LEVEL, chi2_isf
+from sfm.distributions import chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
@@ -249,9 +249,10 @@ class Comparison(NamedTuple):
 
         The rows of a table have one precision. If nothing shows which of them are wrong, it is their scatter.
         """
+        if not (self.sources[0].table and self.judgement.doubtful and self.model.at_worst.fits(self.level)):
+            return False
         score = cost_of_parameter(len(self.sources)) - self.model.factor()[1]
-        is_likelier = bool(self.judgement.doubtful) and score <= min(self.judgement.score, 0.0)
-        return self.sources[0].table > 0 and is_likelier and self.model.at_worst.fits(self.level)
+        return score <= min(self.judgement.score, 0.0)
 
     @property
     def factor(self) -> float:
@@ -304,9 +305,8 @@ class Comparison(NamedTuple):
         wrong = self.judgement.wrong
         for k in wrong:
             what = "plate" if self.sources[k].is_plate else "given"
-            yield remark(
-                "scale_left_out", **{what: self.sources[k].name}, **numbers_of_scale(*self.difference(k))
-            )
+            by = numbers_of_scale(*self.difference(k), self.level)
+            yield remark("scale_left_out", **{what: self.sources[k].name}, **by)
         if self.factor != 1.0:
             yield remark("given_sigmas", of=of, factor=self.factor, used=self.factor if rescale else None)
 
@@ -339,7 +339,7 @@ class Comparison(NamedTuple):
         else:
             low, *_, high = sorted(which, key=lambda k: self.model.v[k])
             off, sigma = difference_of(self.model, high, low)
-        by = numbers_of_scale(abs(off), sigma)
+        by = numbers_of_scale(abs(off), sigma, self.level)
         out = (*lengths, *(k for k in which if self.sources[k].points))
         if not any(source.is_plate for source in self.sources):
             given = [self.sources[k].name for k in which]
@@ -390,14 +390,15 @@ def difference_of(model: GivenModel, a: int, b: int) -> tuple[float, float]:
     return float(model.v[a] - model.v[b]), float(np.sqrt(S[a, a] + S[b, b] - 2 * S[a, b]))
 
 
-def numbers_of_scale(log: float, sigma: float) -> dict[str, Any]:
+def numbers_of_scale(log: float, sigma: float, level: float) -> dict[str, Any]:
     """Return the numbers for a remark on a difference of scale, with the two units if it is a unit factor.
 
     Args:
         log: logarithm of the ratio of scales.
         sigma: standard deviation of the logarithm.
+        level: probability that a unit factor is not recognised.
     """
-    unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(LEVEL, 1))) * sigma)
+    unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(level, 1))) * sigma)
     found: dict[str, Any] = {"sigmas": abs(log) / sigma}
     if abs(log) > np.log(MAX_PERCENT):
         found["times"] = float(np.exp(log))
