@@ -285,19 +285,19 @@ def test_the_mirror_is_excluded_by_the_likelihood_of_a_variance_that_is_not_know
     """Of points in a plane but one of height h; mirrored ones differ by 2 h in what a similarity leaves."""
     plane = exact(8, "mirror")
 
-    def judged(height: float) -> tuple[given_points.GivenPoints, given_points.PlacedPoints]:
+    def judged(height: float) -> given_points.PlacedPoints:
         X = plane.given * (1, 1, 0) + height * np.eye(8)[0][:, None] * (0, 0, 1)
         points = replace(plane, given=X, free=FRAME.apply(X))
         found = judge(points, 0.001)
         assert found is not None and found.judgement.fits
-        return points.points, found
+        return found
 
-    n, flat = 3 * 8 - 7, judged(0.0)[1].model
+    n, flat = 3 * 8 - 7, judged(0.0).model
     limit = n * np.exp(given_values.MARGIN / n)  # chi-square of the mirrored ones
     h = float(np.sqrt(limit / flat.precision[2, 2])) / 2
-    assert not given_points.excludes_mirror(*judged(0.0))
-    assert not given_points.excludes_mirror(*judged(0.95 * h))
-    assert given_points.excludes_mirror(*judged(1.05 * h))
+    assert not given_points.excludes_mirror(judged(0.0))
+    assert not given_points.excludes_mirror(judged(0.95 * h))
+    assert given_points.excludes_mirror(judged(1.05 * h))
 
 
 def test_points_are_mirrored_with_their_covariance() -> None:

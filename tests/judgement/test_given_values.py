@@ -420,7 +420,7 @@ def scales_of(one: Figure, length: float) -> Scales:
     """Return the scales of a bar between the first two points and of all points."""
     found = judge(one, LEVEL)
     assert found is not None
-    of_points = scale_of_points(one.points, found)
+    of_points = scale_of_points(found)
     assert of_points is not None
     bar = ScaleBars(np.array([0]), np.array([1]), np.array([length]), np.array([SIGMA]))
     return Scales.joined([scales_of_lengths(bar, one.reference), of_points])
@@ -443,10 +443,10 @@ def test_derivatives_of_scales_by_the_free_network(n: int) -> None:
     one = points(5, "derivatives")
     if n == 2:
         one = replace(one, given=np.where(np.arange(5)[:, None] < 2, one.given, np.nan)).select(np.arange(2))
-        placed = PlacedPoints(Judgement(0.0, 0, 1.0), FRAME.inverse(), bars(0.0))
+        placed = PlacedPoints(Judgement(0.0, 0, 1.0), FRAME.inverse(), bars(0.0), one.points)
 
         def scales(figure: Figure) -> Scales:
-            found = scale_of_points(figure.points, placed)
+            found = scale_of_points(replace(placed, points=figure.points))
             assert found is not None
             return found
     else:

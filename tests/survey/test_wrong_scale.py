@@ -177,6 +177,17 @@ def test_right_bars_and_control_are_no_remark(reject: str) -> None:
     assert findings_of(result).verdict.level == "good"
 
 
+def test_control_with_exchanged_names_has_the_scale_of_the_right_names() -> None:
+    network, truth = _scene("right")
+    xyz = truth.points[20:28] + 1e-4 * seed_of("exchanged noise").standard_normal((8, 3))
+    control = KnownPoints.from_arrays([str(k + 1) for k in range(20, 28)], xyz[[1, 0, *range(2, 8)]], 1e-4)
+    for datum in ("free", "control"):
+        parts = {"control": control, "scale_bars": _bars(truth, [1.0, 1.0]), "datum": {"kind": datum}}
+        result = run_survey(survey_of(network, truth, **parts))
+        said = [one.kind for one in remarks_on_given(result) if one.severity != "note"]
+        assert said == ["given_renamed"] and len(result.network.scale_bars) == 2 and result.has_scale
+
+
 def _table(truth: Estimate, rows: int, factor: float) -> ObservationTable:
     """Return a table of distances that are all as much too long."""
     pairs = [(k, k + 14) for k in range(rows)]

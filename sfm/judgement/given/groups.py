@@ -108,7 +108,6 @@ class Group:
     of: str  # control or centres
     rows: IntArray  # rows of the points in their table of the network, (n,)
     names: tuple[str, ...]
-    points: GivenPoints
     placed: PlacedPoints
     scatter: float = 0.0  # standard deviation of fixed coordinates from their scatter, object unit; 0: exact
 
@@ -130,7 +129,7 @@ class Group:
     @property
     def checks_handedness(self) -> bool:
         """Whether the points fit either the network or its mirror image, but not both."""
-        return self.placed.mirrored or excludes_mirror(self.points, self.placed)
+        return self.placed.mirrored or excludes_mirror(self.placed)
 
     @property
     def test(self) -> GivenTest:
@@ -140,9 +139,8 @@ class Group:
     def taking_part(self, *, rescale: bool) -> GivenPoints:
         """Return the points that take part, with their covariance in the adjustment."""
         kept = np.setdiff1d(np.arange(len(self.names)), self.out)
-        points = self.points.reordered(self.placed.order) if self.placed.order else self.points
-        points = points.select(kept)
-        if self.found.doubtful and rescale and self.points.stated.any():
+        points = self.placed.points.select(kept)
+        if self.found.doubtful and rescale and points.stated.any():
             points = points.with_stated(self.placed.model.factor()[0] ** 2 * points.stated)
         return points
 
@@ -170,7 +168,7 @@ class Group:
         """Return the covariance with which the points fit."""
         known = np.isfinite(covariance)
         if self.scatter and rescale:
-            return np.where(known, self.points.stated, covariance)
+            return np.where(known, self.placed.points.stated, covariance)
         fixed = not np.where(known, covariance, 0.0).any()
         changes = bool(self.found.doubtful) or self.found.factor != 1.0
         if fixed or not rescale or not changes or self.placed.model.estimated:

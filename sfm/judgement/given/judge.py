@@ -229,31 +229,29 @@ def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     placed = judge_points(points, task.level, start=start, estimated=fixed and not in_datum)
     if placed is None:
         return None
-    group = Group(of, rows[there], tuple(names[k] for k in there.tolist()), points, placed)
+    group = Group(of, rows[there], tuple(names[k] for k in there.tolist()), placed)
     if fixed and in_datum and not (task.of_plate or placed.judgement.fits):
-        group = _scattering(group, start, task)
+        group = _scattering(group, points, start, task)
     found = group.found
     if found.factor == 1.0:
         return group
     stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
-    points = points.with_stated(found.factor**2 * stated)
-    fitting = judge_points(points, task.level, start=start)
-    placed = group.placed if fitting is None else replace(fitting, judgement=found)
-    return replace(group, points=points, placed=placed)
+    fitting = judge_points(points.with_stated(found.factor**2 * stated), task.level, start=start)
+    return group if fitting is None else replace(group, placed=replace(fitting, judgement=found))
 
 
-def _scattering(group: Group, start: Similarity | None, task: Task) -> Group:
+def _scattering(group: Group, points: GivenPoints, start: Similarity | None, task: Task) -> Group:
     """Judge fixed coordinates as values of unknown precision, if their scatter explains the misfit.
 
     No coordinate is exact. Single points are then wrong only if they exceed the scatter of the others, which
     does not depend on how many decimals the coordinates are written with.
     """
-    placed = judge_points(group.points, task.level, start=start, estimated=True)
+    placed = judge_points(points, task.level, start=start, estimated=True)
     if placed is None or placed.mirrored or placed.judgement.doubtful or not placed.judgement.explained:
         return group
     kept = ~np.isin(placed.model.item, placed.judgement.wrong)
     sigma = placed.model.part(kept).factor()[0]
-    points = group.points.with_stated(np.broadcast_to(sigma**2 * np.eye(3), group.points.stated.shape))
+    points = points.with_stated(np.broadcast_to(sigma**2 * np.eye(3), points.stated.shape))
     again = judge_points(points, task.level, start=start)
     if again is None or again.judgement.doubtful or again.judgement.wrong != placed.judgement.wrong:
         return group
@@ -265,7 +263,7 @@ def _scattering(group: Group, start: Similarity | None, task: Task) -> Group:
         dof=tested.dof,
         probability=tested.probability,
     )
-    return replace(group, points=points, placed=replace(again, judgement=judgement), scatter=sigma)
+    return replace(group, placed=replace(again, judgement=judgement), scatter=sigma)
 
 
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
@@ -338,7 +336,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
     if found.one_wrong:
         shift = float(_shifts(model)[list(found.doubtful)].max())
         # they take part with standard deviations from their differences, if these may be replaced
-        if task.settings.rescale and group.points.stated.any() and model.at_worst.fits(task.level):
+        if task.settings.rescale and group.placed.points.stated.any() and model.at_worst.fits(task.level):
             shift /= model.factor()[0]
     return remark(
         "given_contradicted",

@@ -121,10 +121,6 @@ class GivenPoints:
         of_free = np.diagonal(model.network).reshape(-1, 3).mean(axis=1)
         return of_free, np.einsum("nii->n", self.stated) / 3
 
-    def reordered(self, order: tuple[int, ...]) -> GivenPoints:
-        """Return the points with their given coordinates in another order."""
-        return replace(self, kind=self.kind.reordered(np.array(order)))
-
     def with_stated(self, stated: FloatArray) -> GivenPoints:
         """Return the points with another covariance of the known coordinates, (n, 3, 3)."""
         covariance = self.kind.coordinate_covariance
@@ -191,6 +187,7 @@ class PlacedPoints:
     judgement: Judgement
     placing: Similarity  # given frame from the frame of the free network
     model: GivenModel  # differences after the similarity
+    points: GivenPoints  # with corrected names
     unmirrored: float | None = None  # chi-square without mirroring, if only the mirrored network fits
     order: tuple[int, ...] = ()  # point whose coordinates each point has, if they fit with other names
     exchangeable: tuple[int, ...] = ()  # points whose exchanged names would explain the differences as well
@@ -266,7 +263,7 @@ def judge_points(
     return replace(_contradiction(found, like), strain=best.strain) if best.strain else best
 
 
-def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
+def excludes_mirror(found: PlacedPoints) -> bool:
     """Return whether points, without the wrong ones, fit the network but not the mirrored network.
 
     With n differences the mirror image is less likely by n ln of the ratio of both chi-squares, in -2 ln
@@ -274,13 +271,12 @@ def excludes_mirror(points: GivenPoints, found: PlacedPoints) -> bool:
     points that contradict one another.
 
     Args:
-        points: given points, and the same points of the free network.
-        found: these points, judged and not mirrored.
+        found: judged points that are not mirrored.
 
     Source: Seber and Wild (1989), Nonlinear Regression, sec. 2.2.
     """
-    kept = np.setdiff1d(np.arange(len(points.given)), found.judgement.wrong)
-    mirrored = (points.reordered(found.order) if found.order else points).select(kept).mirrored()
+    kept = np.setdiff1d(np.arange(len(found.points.given)), found.judgement.wrong)
+    mirrored = found.points.select(kept).mirrored()
     start = next(_starts(mirrored, None), None)
     if start is None:
         return False
@@ -351,7 +347,7 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
             judgement = judge_values(model, level)
             q, fall = found.judgement.dof - judgement.dof, found.judgement.statistic - judgement.statistic
             cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
-            fitting.append((PlacedPoints(judgement, placing, model, cost_of_strain=cost), strain))
+            fitting.append((PlacedPoints(judgement, placing, model, points, cost_of_strain=cost), strain))
     if not fitting:
         return None
     best, strain = min(fitting, key=lambda one: one[0].cost)
@@ -407,7 +403,7 @@ def _judged(
         judgement = judge_values(model, level)
         out = judgement.wrong
         if out in tried:
-            return PlacedPoints(judgement, placing, model)
+            return PlacedPoints(judgement, placing, model, points)
 
 
 def _converged(

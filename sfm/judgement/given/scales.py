@@ -19,7 +19,7 @@ from sfm.conventions import FloatArray, find_unit
 from sfm.distributions import chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
-from sfm.judgement.given.points import UNCHANGED, GivenPoints, PlacedPoints, parameters_of
+from sfm.judgement.given.points import UNCHANGED, PlacedPoints, parameters_of
 from sfm.judgement.given.values import (
     RANK,
     UNSTATED_FRACTION,
@@ -195,13 +195,9 @@ def common_scale(
     return scales_of(reference, kinds, placing, by_values / reference.compare(kinds, placing).size)
 
 
-def scale_of_points(points: GivenPoints, placed: PlacedPoints) -> Scales | None:
-    """Return the scale from given points, from their distance if there are two; None if they give none.
-
-    Args:
-        points: given points.
-        placed: these points, judged.
-    """
+def scale_of_points(placed: PlacedPoints) -> Scales | None:
+    """Return the scale from judged points, from their distance if there are two; None if they give none."""
+    points = placed.points
     complete, placing, out = points.complete, placed.placing, placed.judgement.wrong
     if len(complete) == 2 and np.isfinite(points.given).sum() == 6:
         points, out = points.select(complete), ()
@@ -355,10 +351,10 @@ class Comparison(NamedTuple):
 def _sources_of_points(task: Task, groups: Sequence[Group]) -> Iterator[Source]:
     """Yield dependable groups of points that give a scale."""
     for group in groups:
-        scale = scale_of_points(group.points, group.placed)
+        scale = scale_of_points(group.placed)
         if scale is None:
             continue
-        if not (task.in_control or group.points.stated.any()):
+        if not (task.in_control or group.placed.points.stated.any()):
             # coordinates without a standard deviation may be those of a print
             scale = scale.looser(UNSTATED_FRACTION)
         is_plate = task.of_plate and group.of == "control"
