@@ -23,7 +23,7 @@ from sfm.camera import Camera
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, UnknownNameError
-from sfm.observations.given import InteriorObservations, ObjectPoints, ScaleBars
+from sfm.observations.control_and_bars import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind
 from sfm.observations.pose import ExteriorObservations
 

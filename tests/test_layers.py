@@ -27,7 +27,7 @@ LAYERS = (
             "sfm.similarity",
         ),
         *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.solution", "sfm.given_residuals", "sfm.display", "sfm.remarks"),
+        *("sfm.solution", "sfm.observation_residuals", "sfm.display", "sfm.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.judgement.hypotheses",),  # of an adjustment; the rest of the room judges results

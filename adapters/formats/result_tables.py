@@ -18,7 +18,7 @@ from pydantic import Field
 
 from adapters.colmap.camera_models import SIDE_FILE, NamedCamera, read_side_file
 from adapters.formats.content import Content
-from adapters.formats.given_table import Statistics, read_given, read_known_points, write_given
+from adapters.formats.control_tables import Statistics, read_given, read_known_points, write_given
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.distortion.models import MODELS

@@ -1,7 +1,7 @@
 """The survey file of a converted network, with which its tables and control can be adjusted again.
 
     survey.toml     unit, cameras, rigs, image points, approximate values, scale bars, datum
-    control.csv     control and check points, see `given_table`
+    control.csv     control and check points, see `control_tables`
     exterior.csv    image,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg
 
 Source: the README, "The survey file".
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.content import Content
-from adapters.formats.given_table import CONTROL, write_known_points
+from adapters.formats.control_tables import CONTROL, write_known_points
 from sfm.camera import Camera
 from sfm.conventions import METRES, angles_from_rotation
 from sfm.files.plain_text import csv_text

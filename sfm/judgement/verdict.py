@@ -29,7 +29,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
 from sfm.distributions import LEVEL, binomial_sf, normal_ppf, share_of
-from sfm.given_residuals import GivenResiduals, GivenValue
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
 from sfm.judgement.cameras import camera_remarks, edges_of, sharpness_remarks
@@ -43,6 +42,7 @@ from sfm.judgement.checks import (
 )
 from sfm.judgement.stated_precision import stated_precision_remarks
 from sfm.network import rows_of
+from sfm.observation_residuals import GivenResiduals, GivenValue
 from sfm.remarks.kind import Grade
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.remarks.verdict import Level, Verdict, judge

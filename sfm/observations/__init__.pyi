@@ -1,8 +1,8 @@
 """The public names of `sfm.observations`, a row each."""
 
-from sfm.observations.given import InteriorObservations as InteriorObservations
-from sfm.observations.given import ObjectPoints as ObjectPoints
-from sfm.observations.given import ScaleBars as ScaleBars
+from sfm.observations.control_and_bars import InteriorObservations as InteriorObservations
+from sfm.observations.control_and_bars import ObjectPoints as ObjectPoints
+from sfm.observations.control_and_bars import ScaleBars as ScaleBars
 from sfm.observations.kind import Block as Block
 from sfm.observations.kind import Group as Group
 from sfm.observations.kind import Kind as Kind

@@ -10,8 +10,8 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.display import counted
 from sfm.files.result_tables import GIVEN
-from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.judgement.bundle_statistics import Given
+from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.page import (
     Column,
     FoldedParts,

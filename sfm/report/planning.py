@@ -15,7 +15,7 @@ from sfm.display import counted
 from sfm.distributions import LEVEL, POWER
 from sfm.files.result_tables import IN_FILES
 from sfm.judgement.calibrated_cameras import rigs_of
-from sfm.observations.given import ScaleBars
+from sfm.observations.control_and_bars import ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.observations.tables import TABLES
 from sfm.planning import MIN_PIXELS

@@ -25,7 +25,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angle
 from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, values_of
-from sfm.observations.given import ScaleBars
+from sfm.observations.control_and_bars import ScaleBars
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
 from sfm.observations.pose import MountObservations
 from sfm.result import ControlCheck

@@ -14,7 +14,7 @@ from datasets.camcal.reference import prepare
 from sfm.errors import SurveyFileError
 from sfm.judgement.checks import longest_residual
 from sfm.network import Estimate, Network
-from sfm.observations.given import ObjectPoints, ScaleBars
+from sfm.observations.control_and_bars import ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.tables.csv_files import write_tables

@@ -20,7 +20,7 @@ from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.network import Network
-from sfm.observations.given import ObjectPoints
+from sfm.observations.control_and_bars import ObjectPoints
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse_of_observed
 
 

@@ -442,7 +442,7 @@ def more_command(
     with loading():
         import numpy as np
 
-        from adapters.formats.given_table import read_given
+        from adapters.formats.control_tables import read_given
         from adapters.formats.result_tables import read_result
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder

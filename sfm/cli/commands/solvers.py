@@ -291,7 +291,7 @@ def epochs(
 
 def _read_epoch(path: Path) -> Epoch:
     """Return the epoch of a result folder, or of a survey file, which is run first."""
-    from adapters.formats.given_table import read_given
+    from adapters.formats.control_tables import read_given
     from adapters.formats.result_tables import read_result
     from sfm.cli.commands.surveying import run_file
     from sfm.epochs.differences import Epoch

@@ -26,9 +26,9 @@ from sfm.files.covariance_file import write_covariances
 from sfm.files.csv_tables import write_ply
 from sfm.files.plain_text import BLOCK
 from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
-from sfm.given_residuals import given_rows
 from sfm.judgement.bundle_statistics import Statistics
 from sfm.network import Network
+from sfm.observation_residuals import given_rows
 from sfm.report.findings import Findings
 from sfm.result import SurveyResult
 from sfm.solution import MEASURED

@@ -17,10 +17,10 @@ from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
 from sfm.files.plain_text import or_none
-from sfm.given_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.judgement.bundle_statistics import Given, Spread, summarise_redundancy
 from sfm.judgement.calibrated_cameras import Rig
 from sfm.judgement.checks import point_sigma
+from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings import Findings
 from sfm.report.page import plain, values_of
 from sfm.report.phrases import describe_test, describe_weights

@@ -22,7 +22,7 @@ from sfm.camera import camera_from_values
 from sfm.conventions import AnyArray
 from sfm.errors import OutputError
 from sfm.network import ObjectPoints
-from sfm.observations.given import InteriorObservations
+from sfm.observations.control_and_bars import InteriorObservations
 from sfm.observations.pose import ExteriorObservations
 from tests.synthetic import make_network
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapters.formats.content import Content
-from adapters.formats.given_table import read_given
+from adapters.formats.control_tables import read_given
 from adapters.formats.photomodeler import write_photomodeler
 from adapters.formats.registry import read_any, read_content, write_any, write_content
 from sfm.errors import SurveyFileError

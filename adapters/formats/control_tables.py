@@ -20,8 +20,8 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.files.csv_tables import read_header, read_table
 from sfm.files.plain_text import Content, csv_text, read_json
 from sfm.files.result_tables import CONTROL_POINTS, GIVEN
-from sfm.given_residuals import given_residuals, given_rows
 from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.observation_residuals import given_residuals, given_rows
 from sfm.solution import CONTROL_COVARIANCE
 
 AXES, SIGMAS = ("X", "Y", "Z"), ("sX", "sY", "sZ")
