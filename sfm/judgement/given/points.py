@@ -300,7 +300,8 @@ def _corrected(
         for order in assignments(points.free, points.given, points.variances, found.agreeing)
     }
     renamed = {name: points.kind.reordered(np.array(order)) for name, order in orders.items()}
-    for mistake, placed in explanations([points.kind], judge, [renamed | points.kind.mistakes()]).items():
+    corrected = {**renamed, **points.kind.mistakes()}
+    for mistake, placed in explanations([points.kind], judge, [corrected]).items():
         unmirrored = found.judgement.statistic if mistake == "mirrored" else None
         yield replace(placed, order=orders.get(mistake, ()), unmirrored=unmirrored)
 

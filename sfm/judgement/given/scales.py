@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags, vstack
 from scipy.spatial.transform import Rotation
 
-from sfm.conventions import FloatArray, find_unit
+from sfm.conventions import FloatArray, IntArray, find_unit
 from sfm.distributions import chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
@@ -63,42 +63,69 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
     used, factor = np.ones(len(bars), dtype=bool), np.ones(len(bars))
     sources, remarks, tests = list[Source](), list[Remark](), list[GivenTest]()
     for name, rows in _lengths(task).items():
-        compared = Comparison.of(task, rows)
-        if compared.judgement.doubtful and not compared.scatters and not rows[0].is_plate:
-            sources += compared.with_lengths(bars, task.settings.unit)
-            continue
-        sources.append(compared.as_one(name))
-        used[[b for k in compared.judgement.wrong for b in rows[k].bars]] = False
-        factor[[b for row in rows for b in row.bars]] = compared.factor if rescale else 1.0
-        remarks += compared.remarks(name, rescale=rescale)
-        if rows[0].table:  # the rows that were not judged, too
-            factor[bars.table == rows[0].table] = compared.factor if rescale else 1.0
-            remarks += compared.unchecked
-            tests = [compared.test]
+        shared = _with_one_scale(task, name, rows)
+        sources += shared.sources
+        remarks += shared.remarks
+        tests += shared.tests
+        used[list(shared.out)] = False
+        factor[shared.bars] = shared.factor
     sources += _sources_of_points(task, groups)
     if not sources:
         return JudgedScales(bars)
-    compared, out = Comparison.of(task, sources), tuple[int, ...]()
+    compared = Comparison.of(task, sources)
     if len(sources) == 1:
-        tests = tests or [compared.test]
-        if not (task.of_plate or task.settings.checks_scale):
-            remarks.append(remark("scale_unchecked", given=sources[0].name))
+        alone = not (task.of_plate or task.settings.checks_scale)
+        unchecked = [remark("scale_unchecked", given=sources[0].name)] if alone else []
+        return JudgedScales(
+            replace(bars, sigma=factor * bars.sigma).select(used),
+            (*remarks, *unchecked),
+            tuple(tests) or (compared.test,),
+        )
+    if compared.is_open(on_points=task.in_control):
+        out, contradiction = compared.contradiction()
+        remarks.append(contradiction)
     else:
-        tests, out = [compared.test], compared.judgement.wrong
-        if compared.is_open(on_points=task.in_control):
-            out, contradiction = compared.contradiction()
-            remarks.append(contradiction)
-        else:
-            factor *= compared.factor if rescale else 1.0
-            remarks += compared.remarks("bars", rescale=rescale)
-            remarks += compared.unchecked if compared.judgement.fits else ()
+        out = compared.judgement.wrong
+        factor *= compared.factor if rescale else 1.0
+        remarks += compared.remarks("bars", rescale=rescale)
+        remarks += compared.unchecked if compared.judgement.fits else ()
     for source in (sources[k] for k in out):
         used[list(source.bars)] = False
         if source.is_table:
             used &= bars.table != source.table
     left_out = frozenset(sources[k].points for k in out) - {""}
     taken = replace(bars, sigma=factor * bars.sigma).select(used)
-    return JudgedScales(taken, tuple(remarks), tuple(tests), left_out)
+    return JudgedScales(taken, tuple(remarks), (compared.test,), left_out)
+
+
+class _Shared(NamedTuple):
+    """Lengths of one table, plate or pair of points, judged against one another."""
+
+    sources: list[Source]
+    bars: IntArray  # all their bars, also those that were not judged
+    out: Sequence[int] = ()  # bars that are left out
+    factor: float = 1.0  # on their standard deviations
+    remarks: Sequence[Remark] = ()
+    tests: Sequence[GivenTest] = ()
+
+
+def _with_one_scale(task: Task, name: str, rows: list[Source]) -> _Shared:
+    """Return lengths of a table, plate or pair of points as one source, or each as one if that is open."""
+    bars, rescale, table = task.network.scale_bars, task.settings.rescale, rows[0].table
+    judged = np.array([b for row in rows for b in row.bars])
+    every = np.flatnonzero(bars.table == table) if table else judged
+    compared = Comparison.of(task, rows)
+    if compared.judgement.doubtful and not compared.scatters and not rows[0].is_plate:
+        return _Shared(compared.with_lengths(bars, task.settings.unit), every)
+    unchecked = compared.unchecked if table else ()
+    return _Shared(
+        [compared.as_one(name)],
+        every,
+        [b for k in compared.judgement.wrong for b in rows[k].bars],
+        compared.factor if rescale else 1.0,
+        [*compared.remarks(name, rescale=rescale), *unchecked],
+        [compared.test] if table else (),
+    )
 
 
 class Scales(NamedTuple):
