@@ -141,6 +141,7 @@ def test_measuring_depends_on_nothing_else() -> None:
     assert rooms == {
         "sfm.arguments",
         "sfm.conventions",
+        "sfm.distributions",
         "sfm.errors",
         "sfm.kernels",
         "sfm.photographs",

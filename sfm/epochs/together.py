@@ -28,11 +28,11 @@ from sfm.arguments import checked_arguments
 from sfm.comparison.stable_points import critical_value
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import listed
+from sfm.distributions import FAMILY
 from sfm.epochs.differences import MAX_SAME_DIFFERENCE, Common, Epoch, given_observations
 from sfm.errors import GeometryError
 from sfm.network import InteriorObservations, Network
 
-ALPHA = 0.01  # level of the test whether a camera is the same
 MAX_NAMED = 4  # cameras that an error message lists
 # Largest difference between the stored result and an adjustment from its tables: of coordinates in standard
 # deviations, and of the standard deviations relatively.
@@ -307,7 +307,7 @@ def _tested(
     redundancy = None if None in known else sum(r for r in known if r is not None)
     parameters = tuple(dict.fromkeys(owner[r][2] for r in rows))
     return SharedCamera(
-        name, tuple(epochs), parameters, statistic, critical_value(ALPHA, len(rows), redundancy)
+        name, tuple(epochs), parameters, statistic, critical_value(FAMILY, len(rows), redundancy)
     )
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.quality.consistency import FAMILY, Consistency, larger_than_the_others
+from sfm.adjustment.quality.consistency import Consistency, larger_than_the_others
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.distributions import share_of
+from sfm.distributions import FAMILY, share_of
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.result import PhotographTargets, SurveyResult

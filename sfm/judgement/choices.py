@@ -21,9 +21,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from sfm.distributions import FALSE_ALARM, share_of
+from sfm.distributions import FALSE_ALARM, FAMILY, share_of
 from sfm.errors import GeometryError
-from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.likelihood import price_of
 
 Solution = TypeVar("Solution")
@@ -78,7 +77,7 @@ def choose(
     """
     for choice in choices:
         models, best, most = list(choice.models(present)), None, 0.0
-        search = float(np.log(max(len(models), 1) * choice.behind / share_of(ALPHA, false_alarm)))
+        search = float(np.log(max(len(models), 1) * choice.behind / share_of(FAMILY, false_alarm)))
         for model in models:
             try:
                 solution = solve(model)

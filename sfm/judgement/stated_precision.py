@@ -19,7 +19,7 @@ import numpy as np
 from sfm.adjustment.quality.consistency import MIN_UNEVEN_RATIO
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray
-from sfm.distributions import LEVEL, chi2_isf, normal_ppf
+from sfm.distributions import LEVEL, chi2_isf, normal_ppf, share_of
 from sfm.remarks.remark import Remark, remark
 
 STEP = 0.01  # relative difference below which two stated standard deviations are equal
@@ -39,10 +39,11 @@ def stated_precision_remarks(a: Adjustment) -> tuple[Remark, ...]:
         return ()
     stated = np.linalg.det(seen.covariance) ** 0.25
     _, of, count = np.unique(np.round(np.log(stated) / STEP), return_inverse=True, return_counts=True)
+    level = share_of(LEVEL, a.false_alarm)
     worst, factor = -1, MIN_UNEVEN_RATIO
     for k in np.flatnonzero(count > 1).tolist() if len(count) > 1 else []:
         (here, n), (others, m) = _scale(a.standardised[of == k]), _scale(a.standardised[of != k])
-        limit = -normal_ppf(LEVEL / len(count)) * SPREAD * np.sqrt(1 / max(n, 1) + 1 / max(m, 1))
+        limit = -normal_ppf(level / len(count)) * SPREAD * np.sqrt(1 / max(n, 1) + 1 / max(m, 1))
         if here > factor * others > 0 and np.log(here / others) > limit:
             worst, factor = k, here / others
     if worst < 0:

@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 
 from sfm.adjustment.engine.unknowns import NO_START
-from sfm.adjustment.quality.consistency import FAMILY, Consistency, consistency_of
+from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.statistics import component_tests, more_than_chance, robust_test
 from sfm.adjustment.quality.variance_components import (
     IMAGE_POINTS,
@@ -28,7 +28,7 @@ from sfm.adjustment.quality.variance_components import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
-from sfm.distributions import LEVEL, binomial_sf, normal_ppf, share_of
+from sfm.distributions import FAMILY, LEVEL, binomial_sf, normal_ppf, share_of
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
 from sfm.judgement.cameras import camera_remarks, edges_of, sharpness_remarks

@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, f_isf
+from sfm.distributions import LEVEL, f_isf, share_of
 from sfm.network import Estimate, rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
@@ -89,10 +89,11 @@ def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -
     ):
         return AgreedTurns(None, None)
     codes = [target.code for target in photographs.targets]
+    level = share_of(LEVEL, survey.adjust.false_alarm)
     unsure = np.zeros(len(measured.network.images), dtype=bool)
     for camera in cameras[1:].tolist():
         tried = [
-            (pairs, _common_rig(plate, measured, estimate, pairs))
+            (pairs, _common_rig(plate, measured, estimate, pairs, level))
             for pairs in _pairings(measured, int(cameras[0]), camera)
         ]
         pairs, rig = max(tried, key=lambda one: 0 if one[1] is None else int(one[1].agrees.sum()))
@@ -153,7 +154,7 @@ def _numbered(names: Sequence[str]) -> dict[int, str]:
 
 
 def _common_rig(
-    plate: PlateFamily, measured: Measurements, estimate: Estimate, pairs: Sequence[Pair]
+    plate: PlateFamily, measured: Measurements, estimate: Estimate, pairs: Sequence[Pair], level: float
 ) -> _Rig | None:
     """Return the relative orientation of two cameras that most pairs agree on; None if another is possible.
 
@@ -172,16 +173,16 @@ def _common_rig(
             if turns not in rigs or rig.rank < rigs[turns].rank:
                 rigs[turns] = rig
     best, *others = sorted(rigs.values(), key=lambda one: one.rank)
-    return best if _is_certain(best, others, len(seen)) else None
+    return best if _is_certain(best, others, len(seen), level) else None
 
 
-def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int) -> bool:
+def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int, level: float) -> bool:
     """Return whether most pairs agree with the best one, and no other fits as well (F test)."""
     agreeing = int(best.agrees.sum())
     if agreeing < 2 or 2 * agreeing <= pairs:
         return False
     redundancy = OF_A_RIG * (agreeing - 1)
-    limit = float(f_isf(LEVEL, redundancy, redundancy))
+    limit = float(f_isf(level, redundancy, redundancy))
     rivals = [other for other in others if (other.turn != best.turn)[best.agrees].any()]
     return all(other.squares(best.agrees) > limit * best.squares(best.agrees) for other in rivals)
 

@@ -69,6 +69,15 @@ def test_a_zoomed_photograph_gets_its_own_c(factor: float) -> None:
     assert findings_of(result).verdict.level == "fair"
 
 
+def test_the_camera_of_a_photograph_follows_the_false_alarm_of_the_survey() -> None:
+    """One survey with two levels: a c that differs by 1 % is found, or only makes residuals uneven."""
+    network, truth = with_zoom("zoomed little", {7: 0.99})
+    for level, expected in ((0.05, "camera_per_photograph"), (1e-9, "photographs_uneven")):
+        survey = survey_of(network, truth, adjust={"reject": "tau", "false_alarm": level})
+        kinds = {named.kind for named in run_survey(survey).verdict.remarks}
+        assert kinds & {"camera_per_photograph", "photographs_uneven"} == {expected}
+
+
 @pytest.mark.parametrize(("share", "left_out"), [(0.65, True), (0.4, False)])
 def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool) -> None:
     """The larger part of the points lies elsewhere in one photograph: no c explains that."""

@@ -383,6 +383,6 @@ def test_a_turn_is_certain_at_one_in_a_thousand() -> None:
     """F of 6 and 6 degrees of freedom exceeds 20.03 so often (Abramowitz, Stegun 1964, table 26.9)."""
     both = np.ones(2, dtype=bool)
     best = _Rig(np.zeros(2, dtype=np.int64), np.full(2, 0.1), both)
-    for ratio, is_certain in ((18.0, False), (22.0, True)):
+    for ratio, level, is_certain in ((18.0, 1e-3, False), (22.0, 1e-3, True), (22.0, 1e-4, False)):
         other = _Rig(np.ones(2, dtype=np.int64), np.full(2, 0.1 * ratio**0.5), both)
-        assert _is_certain(best, [other], 2) == is_certain
+        assert _is_certain(best, [other], 2, level) == is_certain

@@ -28,11 +28,10 @@ from sfm.adjustment.quality.variance_components import VarianceComponents, by_ph
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, chi2_isf, chi2_sf, f_sf, normal_ppf, share_of, t_ppf
+from sfm.distributions import FAMILY, LEVEL, chi2_isf, chi2_sf, f_sf, normal_ppf, share_of, t_ppf
 from sfm.network import Estimate, rows_of
 
 MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
-FAMILY = 0.01  # share of FALSE_ALARM of each of these tests
 # Ratio of the largest component of a photograph to the median below which a difference does not matter.
 MIN_UNEVEN_RATIO = 1.5
 MIN_PART = 2  # photographs, and rays of a point, with which a part determines it

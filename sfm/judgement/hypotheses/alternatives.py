@@ -22,7 +22,7 @@ from scipy.special import gammaln
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf
+from sfm.distributions import FAMILY, chi2_isf
 from sfm.judgement.hypotheses.columns import Columns, interior_columns, rigid_motions
 from sfm.judgement.hypotheses.families import (
     BODY,
@@ -53,7 +53,7 @@ from sfm.judgement.hypotheses.score import (
 from sfm.likelihood import price_of
 from sfm.network import sum_rows
 
-ALPHA = 0.01  # probability of naming any alternative if none is true
+ALPHA = FAMILY  # probability of naming any alternative if none is true
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
 MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds

@@ -199,6 +199,7 @@ def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
             settled.accepted,
             oriented=estimate.oriented,
             suspected=task.suspected,
+            false_alarm=task.survey.adjust.false_alarm,
         )
         if changed is not None:
             yield changed

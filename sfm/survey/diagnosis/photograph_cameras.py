@@ -30,9 +30,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
+from sfm.distributions import FALSE_ALARM, FAMILY, share_of
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
-from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
 from sfm.judgement.hypotheses.refit import log_likelihood_of
 from sfm.likelihood import log_likelihood, price_of
@@ -68,6 +68,7 @@ def find_photograph_cameras(
     *,
     oriented: BoolArray,
     suspected: tuple[str, ...] = (),
+    false_alarm: float = FALSE_ALARM,
 ) -> PhotographCameras | None:
     """Give photographs that lost many of their points a per-photograph camera, or leave them out.
 
@@ -78,6 +79,7 @@ def find_photograph_cameras(
         oriented: photographs that had an exterior orientation before the adjustment, (m,).
         suspected: names of photographs that fitted with per-photograph cameras before; their points may bend
             the network so much that none of them looks wrong.
+        false_alarm: probability that a right result is called wrong, as the user states it.
 
     Returns:
         The network, and the estimate with start values of the new cameras; None if nothing changes.
@@ -88,7 +90,7 @@ def find_photograph_cameras(
     against = np.bincount(seen.image[known & ~accepted], minlength=m)
     enough = count > MAJORITY_FRACTION * np.bincount(seen.image, minlength=m)
     lost = against > MAJORITY_FRACTION * count
-    unusual = more_than_chance(against, count, ALPHA)
+    unusual = more_than_chance(against, count, share_of(FAMILY, false_alarm))
     doubtful = enough & (unusual | (np.isin(network.images, suspected) & estimate.oriented))
     if not doubtful.any() or (doubtful & lost).sum() > MAJORITY_FRACTION * m:
         return None
@@ -100,7 +102,8 @@ def find_photograph_cameras(
     out = np.zeros(m, dtype=bool)
     for i in np.flatnonzero(doubtful).tolist():
         name, before = network.images[i], estimate.cameras[network.camera[i]]
-        fit = _photograph_camera(network, estimate, i, np.flatnonzero((seen.image == i) & known), sigma_px)
+        rows = np.flatnonzero((seen.image == i) & known)
+        fit = _photograph_camera(network, estimate, i, rows, sigma_px, false_alarm)
         if fit is None:
             out[i] = lost[i]
             if lost[i] and oriented[i]:
@@ -191,7 +194,7 @@ def _explained_otherwise(
 
 
 def _photograph_camera(
-    network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float
+    network: Network, estimate: Estimate, image: int, rows: IntArray, sigma_px: float, false_alarm: float
 ) -> tuple[Camera, Adjustment] | None:
     """Return the per-photograph camera with which a photograph fits the points of the others, or None."""
     camera = estimate.cameras[network.camera[image]]
@@ -238,7 +241,7 @@ def _photograph_camera(
         lambda _, after: [(int(after.freed.sum()), n)],
         behind=len(SCALES) * len(network.images),
     )
-    best = choose(_Fit(shared, nothing), (row,), adjust_freed)
+    best = choose(_Fit(shared, nothing), (row,), adjust_freed, false_alarm=false_alarm)
     if best.adjustment is None or not best.freed.any():
         return None
     found, freed = best.adjustment, best.freed
@@ -294,8 +297,8 @@ def _scaled_resection(
     """Return the camera with c times the best of the scales, and the exterior orientation."""
     best: tuple[float, Camera, FloatArray, FloatArray] | None = None
     tolerance_px = TOLERANCE * max(camera.size_px)
-    # trials that find a triple of good points, except with probability ALPHA over all scales
-    trials = math.ceil(math.log(ALPHA / len(SCALES)) / math.log1p(-((1 - MAJORITY_FRACTION) ** 3)))
+    # trials that find a triple of good points, except with probability FAMILY over all scales
+    trials = math.ceil(math.log(FAMILY / len(SCALES)) / math.log1p(-((1 - MAJORITY_FRACTION) ** 3)))
     for scale in scales:
         p = camera.parameters.copy()
         p[camera.parts[0]] *= scale

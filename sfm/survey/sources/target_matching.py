@@ -204,7 +204,9 @@ def _match_by_photograph_cameras(
     """
     estimate = matched.estimate
     accepted = residual_lengths(matched.network, estimate) <= tolerance_px
-    per_photograph = find_photograph_cameras(matched.network, estimate, accepted, oriented=estimate.oriented)
+    per_photograph = find_photograph_cameras(
+        matched.network, estimate, accepted, oriented=estimate.oriented, false_alarm=survey.adjust.false_alarm
+    )
     if per_photograph is None or not per_photograph.photographs:
         return matched
     separate = replace(photographs, camera=per_photograph.network.camera)

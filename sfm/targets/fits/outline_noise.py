@@ -21,11 +21,10 @@ import numpy as np
 from scipy.special import digamma, fdtri, ndtri, polygamma
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.distributions import FAMILY
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.goodness import SHAPES
 
-# Level of significance for a photograph, divided by the number of tests.
-LEVEL = 0.01
 # Numbers of neighbouring sectors that are tested together; an ellipse follows most of any wider damage.
 WIDTHS = (1, 2, 4)
 # Number of sound targets from which a photograph shows their common shape.
@@ -141,7 +140,7 @@ def moderate(ratio: FloatArray, sound: BoolArray, freedom: float) -> tuple[Float
         half = _inverse_trigamma((MAD * np.median(np.abs(z - middle))) ** 2 - polygamma(1, freedom / 2))
         prior_freedom, prior = 2 * half, np.exp(middle + digamma(half) - np.log(half))
     moderated = (prior_freedom * prior + freedom * ratio) / (prior_freedom + freedom)
-    strange = ratio > prior * fdtri(freedom, prior_freedom, 1 - LEVEL / max(len(ratio), 1))
+    strange = ratio > prior * fdtri(freedom, prior_freedom, 1 - FAMILY / max(len(ratio), 1))
     return np.where(strange, ratio, moderated), strange
 
 
@@ -219,7 +218,7 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
     """
     z = _robust_residuals(h, weight)
     level = np.maximum(MAD * np.median(np.abs(z), axis=1), 1.0)
-    limit = -ndtri(LEVEL / (2 * len(WIDTHS) * RAYS * max(len(h), 1)))
+    limit = -ndtri(FAMILY / (2 * len(WIDTHS) * RAYS * max(len(h), 1)))
     if sound.sum() >= MIN_POPULATION:
         usual = np.median(level[sound])
         level = np.clip(level, usual, MAX_LEVEL * usual)

@@ -12,12 +12,12 @@ import numpy as np
 from scipy.special import ndtri
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.distributions import FAMILY
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R
 from sfm.targets.fits.ellipse_fit import MIN_AGREEMENT, EllipseFits, fit_ellipses
 from sfm.targets.fits.outline_noise import (
-    LEVEL,
     MAD,
     MIN_POPULATION,
     OutlineNoise,
@@ -310,7 +310,7 @@ def _marks(fits: EllipseFits, column: int, sound: BoolArray) -> FloatArray:
     lacking = _model_misfit(fits.theta) * contrast * 2 * blur
     marks = np.maximum((fits.statistics[:, column] - lacking) / spread, 1.0)
     squares = (fits.statistics[:, goodness.PIXELS] / blur**2).sum()
-    return np.asarray(marks / -ndtri(LEVEL / (2 * max(squares, 1.0))))
+    return np.asarray(marks / -ndtri(FAMILY / (2 * max(squares, 1.0))))
 
 
 def _model_misfit(theta: FloatArray) -> FloatArray:
