@@ -13,10 +13,10 @@ from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.distributions import FAMILY, share_of
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
+from sfm.remarks.kind import EXPECTED_SIGMAS
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
 from sfm.result import PhotographTargets, SurveyResult
 
-SURE_SIGMAS = 3.0  # standard deviations beyond which a deviation of a camera is considered real
 DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected
 
 
@@ -72,7 +72,7 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         diagonal = float(np.hypot(width, height))
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
         sigma = _principal_sigma_px(result, number) / diagonal
-        surely = away - SURE_SIGMAS * sigma
+        surely = away - EXPECTED_SIGMAS * sigma
         off = remark("principal_point_far", camera=camera.name, share=away, sigma=sigma, surely=surely)
         far = unless_note(off)
         remarks += far
@@ -101,14 +101,14 @@ def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
         shares = {
             name: values[name]
             for name, one in zip(camera.names, adjusted, strict=True)
-            if one and abs(values[name]) > SURE_SIGMAS * sigma[name]
+            if one and abs(values[name]) > EXPECTED_SIGMAS * sigma[name]
         }
         if camera.free[camera.parts[0]].sum() == 2:  # a focal length for each direction
             first, second = np.flatnonzero(camera.parts[0])
             ratio = camera.parameters[second] / camera.parameters[first]
             ratio *= camera.pixel_mm[1] / camera.pixel_mm[0]
             of_ratio = np.hypot(*(sigma[camera.names[k]] / camera.parameters[k] for k in (first, second)))
-            if abs(ratio - 1) > SURE_SIGMAS * of_ratio:
+            if abs(ratio - 1) > EXPECTED_SIGMAS * of_ratio:
                 shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
         for name, value in shares.items():
             found += unless_note(

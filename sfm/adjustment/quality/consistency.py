@@ -30,8 +30,8 @@ from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import FAMILY, LEVEL, chi2_isf, chi2_sf, f_sf, normal_ppf, share_of, t_ppf
 from sfm.network import Estimate, rows_of
+from sfm.remarks.kind import EXPECTED_SIGMAS
 
-MOVED_SIGMAS = 3.0  # smallest relevant shift of the point by the other explanation, standard deviations
 # Ratio of the largest component of a photograph to the median below which a difference does not matter.
 MIN_UNEVEN_RATIO = 1.5
 MIN_PART = 2  # photographs, and rays of a point, with which a part determines it
@@ -241,7 +241,10 @@ def doubtful_points(
             for s in range(len(kept))
         ]
         other, r, instead = min(others)
-        if other - left < limit and _moved(parts, kept, np.append(kept[kept != instead], r)) > MOVED_SIGMAS:
+        if (
+            other - left < limit
+            and _moved(parts, kept, np.append(kept[kept != instead], r)) > EXPECTED_SIGMAS
+        ):
             names = images[seen.image[r]], images[seen.image[instead]]
             found.append(DoubtfulPoint(adjustment.network.points[j], *names, left, other))
     return tuple(sorted(found, key=lambda one: one.other - one.misfit))

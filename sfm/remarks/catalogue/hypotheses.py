@@ -6,10 +6,13 @@ from dataclasses import replace
 
 from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
-# sigma_px is a rough guess, so the global test alone says little. A ratio of 2 deserves a warning. A ratio of
-# 5 is not explained by the guess, but by a wrong model, wrong names or wrong control.
+# sigma_px is a rough guess, so the global test alone says little. Of the planted faults of
+# tests/survey/faults.py, three of each kind, a coordinate was wrong by more than WRONG_SIGMAS in 7 of 95 with
+# a ratio below 1.2, in 9 of 20 below 2, where other tests name the cause, in 4 of 8 beyond 2, and in 2 of 3
+# beyond 5.
 SIGMA0 = Grade("ratio", warning=2.0, error=5.0)
-# Data snooping removes residuals beyond 4 or 5 sigma. Ten sigma is an outlier, thirty a mistake left in.
+# Of 60 networks of 4 to 12 photographs with one gross error that was kept, a coordinate shifted by more than
+# WRONG_SIGMAS in 1 of 14 below 10, in 7 of 13 up to 30, and in 31 of 33 beyond.
 RESIDUAL = Grade("over_sigma", warning=10.0, error=30.0)
 REJECTED = Grade("share", warning=0.05)  # of the image points; usually 1 % are gross errors
 SOLUTION = Grade("moved", error=WRONG_SIGMAS)  # the result is wrong if the other solution is the true one

@@ -34,7 +34,7 @@ from sfm.survey.sources.source import Correspondences
 
 POSE = 6  # parameters of the pose of a photograph
 OF_CAMERAS = ("other_camera", "camera_varies", "camera_drift")
-# Ratio of principal distances by focusing, from far to about 15 c. A difference up to this ratio is only
+# Ratio of principal distances by focusing a thin lens from far to 34 c. A difference up to this ratio is only
 # reported. With c free in each photograph, photographs that determine it badly do more harm than good: two
 # halves of a video whose c differs by 2 % then differ by 4 % of the distance, and by 0.04 % with one c.
 MAX_FOCUS_CHANGE = 1.03

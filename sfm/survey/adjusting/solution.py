@@ -20,6 +20,7 @@ from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
+from sfm.distributions import normal_ppf
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.given.free_network import FreeNetwork
@@ -79,7 +80,6 @@ from sfm.survey.rigs import hold_mounts, split_blocks
 from sfm.survey.sources.source import Correspondences
 from sfm.targets.codes.plates import points_of_plates
 
-PAIR_TOLERANCE = 10.0  # standard deviations within which image points fit another orientation of a pair
 GIVEN_IMAGE_POINTS = 3  # of a photograph with given orientation, which selects one of the four solutions
 
 
@@ -498,8 +498,9 @@ def _solutions_of_pair(final: Adjustment) -> tuple[Estimate, ...]:
     if len(final.network.images) > 2 or final.datum == "control":
         return ()
     accepted = replace(final.network, image_points=final.network.image_points.select(~final.rejected))
+    critical = -float(normal_ppf(final.test_alpha / 2))
     return pair_solutions(
-        accepted, final.estimate, tolerance_px=PAIR_TOLERANCE * max(final.sigma0, 1.0) * final.sigma_px
+        accepted, final.estimate, tolerance_px=critical * max(final.sigma0, 1.0) * final.sigma_px
     )
 
 

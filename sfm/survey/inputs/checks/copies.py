@@ -30,7 +30,9 @@ from sfm.distributions import LEVEL, f_sf, share_of
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
 
-MIN_CORRELATION = 0.7  # of the errors; it is 0.99 for real photographs saved as JPEG of quality 40
+# Correlation from which half of the variance of the errors is common. Real photographs saved again as JPEG of
+# quality 40 reach 0.99.
+MIN_CORRELATION = 0.5**0.5
 SAME_PLACE = 1e-3  # of the distance, and rad: photographs that differ by more are not copies
 MIN_COMMON = 4  # image points that must agree
 DIGIT_PX = 1e-6  # smaller differences are from writing, not from measuring, px
