@@ -79,12 +79,17 @@ def test_what_is_not_determined_comes_first_and_without_precision(
     assert len(unknown["subjects"]["unknown"]) == 1 and unknown["numbers"]["more"]["value"] >= 1
 
 
-def test_the_first_command_of_the_guide_determines_its_network(tmp_path: Path) -> None:
+def test_the_first_command_of_the_guide_prints_what_it_shows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     guide = (ROOT / "docs/planning.md").read_text(encoding="utf-8")
     words = next(line for line in guide.splitlines() if line.startswith("kolinear plan network")).split()[3:]
     assert plan(*words, "--out", tmp_path / "plan") == 0
     found = json.loads((tmp_path / "plan" / "plan.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "good"
+    shown = guide.partition("```text\n")[2].partition("```")[0]
+    printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert printed[: shown.count("\n")] == shown.splitlines()
 
 
 def assumed(out: Path) -> set[str]:
