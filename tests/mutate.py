@@ -1,6 +1,6 @@
 """Strength of the tests: small changes of the program, each of which a test must notice.
 
-    python -m tests.mutate [COUNT [SEED [ROOM ...]]]       `make mutate`
+    python -m tests.mutate [COUNT [SEED [FOLDER ...]]]       `make mutate`
 
 draws mutations of the rooms below: a comparison turned round, a sum in place of a difference, a threshold
 doubled or halved, a condition negated. Each is written into a copy of the project, the tests of its room run
@@ -98,6 +98,39 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             "tests/judgement/test_given_model.py",
         )
         for module in ("tables", "mounts", "free_network")
+    },
+    **{
+        f"sfm/judgement/{module}.py": tests
+        for module, tests in (
+            ("choices", ("tests/judgement/test_choices.py",)),
+            (
+                "verdict",
+                (
+                    "tests/judgement/test_verdict.py",
+                    "tests/report/test_findings.py",
+                    "tests/report/test_statistics.py",
+                    "tests/report/test_camera_remarks.py",
+                    "tests/survey/test_unchecked.py",
+                ),
+            ),
+            ("cameras", ("tests/report/test_camera_remarks.py", "tests/report/test_statistics.py")),
+            (
+                "calibrated_cameras",
+                ("tests/report/test_camera_remarks.py", "tests/report/test_statistics.py"),
+            ),
+            (
+                "checks",
+                (
+                    "tests/judgement/test_verdict.py",
+                    "tests/report/test_statistics.py",
+                    "tests/report/test_findings.py",
+                ),
+            ),
+            (
+                "bundle_statistics",
+                ("tests/report/test_statistics.py", "tests/report/test_findings.py"),
+            ),
+        )
     },
     "sfm/judgement/stated_precision.py": ("tests/judgement/test_stated_precision.py",),
     "sfm/judgement/given/groups.py": (
@@ -331,8 +364,9 @@ def run_unchanged(room: str, folder: Path) -> tuple[str, float]:
 
 
 def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> int:
-    """Run the mutations and print those that survive."""
-    some, found = drawn(count, seed, rooms or ROOMS), Counter[tuple[str, Ended]]()
+    """Run the mutations of the rooms, or of those in these folders, and print those that survive."""
+    chosen = [room for room in ROOMS if room.startswith(rooms or "")]
+    some, found = drawn(count, seed, chosen), Counter[tuple[str, Ended]]()
     files = {one.file for one in some}
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(processes) as pool:
         folders: Queue[Path] = Queue()
@@ -355,7 +389,7 @@ def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> in
             with a_copy() as folder:
                 return run_unchanged(room, folder)
 
-        drawn_rooms = [room for room in ROOMS if files & set(files_of(room))]
+        drawn_rooms = [room for room in chosen if files & set(files_of(room))]
         before = dict(zip(drawn_rooms, pool.map(unchanged, drawn_rooms), strict=True))
         failed = [why for why, _ in before.values() if why]
         if failed:
