@@ -113,14 +113,19 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
                     "tests/survey/test_unchecked.py",
                 ),
             ),
-            ("cameras", ("tests/report/test_camera_remarks.py", "tests/report/test_statistics.py")),
+            ("cameras", ("tests/report/test_camera_remarks.py", "tests/report/test_findings.py")),
             (
                 "calibrated_cameras",
-                ("tests/report/test_camera_remarks.py", "tests/report/test_statistics.py"),
+                (
+                    "tests/judgement/test_calibrated_cameras.py",
+                    "tests/report/test_camera_remarks.py",
+                    "tests/report/test_statistics.py",
+                ),
             ),
             (
                 "checks",
                 (
+                    "tests/judgement/test_calibrated_cameras.py",
                     "tests/judgement/test_verdict.py",
                     "tests/report/test_statistics.py",
                     "tests/report/test_findings.py",
@@ -128,7 +133,11 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             ),
             (
                 "bundle_statistics",
-                ("tests/report/test_statistics.py", "tests/report/test_findings.py"),
+                (
+                    "tests/report/test_geometry.py",
+                    "tests/report/test_statistics.py",
+                    "tests/report/test_findings.py",
+                ),
             ),
         )
     },

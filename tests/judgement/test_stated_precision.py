@@ -72,3 +72,10 @@ def test_right_standard_deviations_are_not(factor: float, gross: float) -> None:
         network = replace(network, image_points=replace(seen, xy=xy))
     a = sfm.adjust(network, truth, datum=Datum("free"), reject="tau")
     assert "image_sigmas" not in {one.kind for one in a.verdict.remarks}
+
+
+@pytest.mark.parametrize(("points", "named"), [(1, False), (12, True)])
+def test_few_image_points_that_scatter_more_may_do_so_by_chance(points: int, named: bool) -> None:
+    network, truth = stated("by chance", 3.5, points=points)
+    a = sfm.adjust(network, truth, datum=Datum("free"), reject="none")
+    assert bool(of_kind(a.verdict.remarks, "image_sigmas")) == named
