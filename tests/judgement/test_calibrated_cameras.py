@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.result import Adjustment
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import FloatArray
 from sfm.judgement.calibrated_cameras import interior_parameters, rigs_of
 from sfm.judgement.checks import precision_of
 from sfm.network import Estimate
@@ -28,6 +31,23 @@ def test_parameters_that_are_adjusted_or_held_at_a_value_are_listed_once() -> No
     assert listed[0].sigma > 0 and not listed[1].sigma > 0
 
 
+def distances_by_points(a: Adjustment) -> FloatArray:
+    """Return the distances from the images of two points on the ray of the first camera, px."""
+    seen, found, (left, right) = a.network.image_points, [], a.estimate.cameras
+    mount, R = a.estimate.mounts.position[1], a.estimate.mounts.rotation[1]  # type: ignore[union-attr]
+    for i in range(0, len(a.network.images), 2):
+        rows = [np.flatnonzero((seen.image == i + side) & ~a.rejected) for side in (0, 1)]
+        for j in np.intersect1d(*(seen.point[row] for row in rows)):
+            k, l = (int(row[seen.point[row] == j][0]) for row in rows)
+            ray = np.append(tangents_from_pixel(left, seen.xy[k][None])[0], -1.0)
+            ends = np.array([3.0, 30.0])[:, None] * ray - mount
+            near, far = (ends @ R)[:, :2] / -(ends @ R)[:, 2:]
+            along, to = far - near, tangents_from_pixel(right, seen.xy[l][None])[0] - near
+            cross = along[0] * to[1] - along[1] * to[0]
+            found.append(abs(cross) / np.linalg.norm(along) * right.c_px)
+    return np.array(found)
+
+
 def test_the_base_of_a_rig_has_its_precision_and_epipolar_distances_that_of_two_image_points() -> None:
     network, truth = make_rig(seed_of("mounts"), moments=8)
     a = sfm.adjust(network, truth, reject="none")
@@ -41,6 +61,7 @@ def test_the_base_of_a_rig_has_its_precision_and_epipolar_distances_that_of_two_
     assert mount.base_sigma == pytest.approx(expected, rel=1e-4)
     assert mount.epipolar is not None
     assert mount.epipolar.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.15)
+    np.testing.assert_allclose(np.sort(np.abs(mount.epipolar.px)), np.sort(distances_by_points(a)), rtol=1e-6)
     assert [row.epipolar for row in rigs_of(a, planned=True)[0].mounts] == [None]
     assert rigs_of(replace(a, network=replace(a.network, moment=None))) == ()
 
