@@ -125,7 +125,7 @@ def test_another_probability_of_a_false_alarm_rejects_and_judges_otherwise(
 def test_the_key_of_a_survey_is_the_level_of_its_adjustment() -> None:
     network, truth = make_network(seed_of("level of a survey"), images=6, points=30)
     for level in (0.05, 1e-3):
-        adjust = {"reject": "tau"} if level == 0.05 else {"reject": "tau", "false_alarm": level}
+        adjust = {"reject": "tau", "false_alarm": level}
         a = run_survey(survey_of(network, truth, adjust=adjust)).adjustment
         assert a.false_alarm == level
         coordinates = 2 * len(network.image_points)

@@ -175,6 +175,8 @@ def test_a_false_calibration_certificate_is_noticed_where_it_shifts_points(
     )
     found = given_of(result.adjustment, "m").interior
     assert found is not None and found.names == (f"c of camera {camera.name}",)
+    counts = count_observations(result.adjustment)
+    assert (counts.interior, counts.scale_bars) == (1, 0)
     v = -sigmas * sigma  # of the parameter, if the photographs had no error
     own = adjust(network, truth, datum=Datum("free"), reject="none")
     q = own.covariance.interior[0][0, 0] / own.sigma0**2
