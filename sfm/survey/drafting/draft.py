@@ -284,8 +284,8 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
     kinds = _kinds_of_codes().splitlines()
     if trial.plate is not None:
         return [*kinds, *_plate_lines(trial.plate, pitch)]
-    counted = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
-    tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {counted}"
+    common = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
+    tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {common}"
     lines = [tried, *kinds]
     if trial.codes == "none":
         lines += ["# No coded targets: points of natural texture take their place.", "[tie_points]"]
