@@ -226,3 +226,18 @@ def test_dots_in_rows_that_are_cut_are_offered_as_a_plate(tmp_path: Path) -> Non
     section = draft.text.partition("in place of [tie_points]:\n")[2].split("\n\n")[0]
     offered = tomllib.loads("\n".join(line.removeprefix("# ") for line in section.splitlines()))
     assert offered["targets"]["codes"] == "grid" and offered["targets"]["columns"] == 5
+
+
+@pytest.mark.parametrize(("codes", "both"), [((6, 6, 1), True), ((6, 6, 4), False)])
+def test_texture_is_drafted_beside_targets_where_a_photograph_shows_few(
+    tmp_path: Path, codes: tuple[int, ...], both: bool
+) -> None:
+    for k, count in enumerate(codes):
+        photograph = scene(f"both {k}", (700, 1000))
+        for number in range(count):
+            row, column = divmod(number, 3)
+            paste(photograph, ring(3 + 7 * number, 24.0), 200 + 250 * column, 200 + 250 * row)
+        cv2.imwrite(str(tmp_path / f"{k}.png"), photograph)
+    drafted = tomllib.loads(draft_survey(tmp_path).text)
+    assert drafted["targets"]["codes"] == "ring14"
+    assert ("tie_points" in drafted) == both
