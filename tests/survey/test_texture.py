@@ -87,16 +87,19 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
     )
-    monkeypatch.setattr(solution, "explain_rejections", lambda *_, **__: (moved[1],))
+    twice = remark("two_places", point="9", distance=0.1, sigmas=9.0, photographs=["image 3"])
+    monkeypatch.setattr(solution, "explain_rejections", lambda *_, **__: (moved[1], twice))
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(POINTS, 2))
-    assert of_kind(solve_survey(survey, matched).remarks, "points_moved") == tuple(moved)
+    of_targets = solve_survey(survey, matched).remarks
+    assert of_kind(of_targets, "points_moved") == tuple(moved) and of_kind(of_targets, "two_places")
     of_texture = solve_survey(survey, textured(network, truth)).remarks
     found = of_kind(of_texture, "windows_elsewhere")
     assert [one.names("points") for one in found] == [("7",), ("17",)]
     assert [one.severity for one in found] == ["warning", "warning"] and not of_kind(
         of_texture, "points_moved"
     )
+    assert not of_kind(of_texture, "two_places")  # nobody can measure a point without a name again
 
 
 @pytest.mark.parametrize(("left", "stays"), [(9, False), (30, True)])

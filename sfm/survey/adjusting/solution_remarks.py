@@ -89,13 +89,17 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
 
 
 def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
-    """Return the remarks; points of texture did not move, but are seen at other positions."""
+    """Return the remarks; points of texture did not move, but are seen at other positions.
+
+    A single one that is seen at two is left out: it has no name that a person could correct.
+    """
     texture = network.automatic_points
     return tuple(
         replace(said, kind="windows_elsewhere")
         if said.kind == "points_moved" and texture.issuperset(said.names("points"))
         else said
         for said in remarks
+        if said.kind != "two_places" or said.names("point")[0] not in texture
     )
 
 
