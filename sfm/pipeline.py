@@ -15,6 +15,7 @@ from pathlib import Path
 
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
+from sfm.photographs.masks import Masks
 from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.survey.adjusting.choices import solve_survey
@@ -95,6 +96,7 @@ def _measure(
     survey, clocks = moments_from_exif(survey, files)
     survey, positions = exterior_from_exif(survey, files)
     refuse_unknown_photographs(survey, files.names)
+    Masks(survey.masks).refuse_without(files.names)
     sizes = separate_sizes(survey, files)
     survey = sizes.survey
     if survey.start_cameras is None:

@@ -78,6 +78,13 @@ class Targets:
     def __len__(self) -> int:
         return len(self.xy)
 
+    def select(self, rows: BoolArray) -> Targets:
+        """Return some of the targets, with all rejected candidates."""
+        if rows.all():
+            return self
+        of_targets = (one.name for one in fields(self) if not one.name.startswith("rejected"))
+        return replace(self, **{name: getattr(self, name)[rows] for name in of_targets})
+
     def __repr__(self) -> str:
         coded, rejected = int((self.code >= 0).sum()), len(self.rejected_xy)
         return f"<{len(self)} targets, {coded} of them coded, {rejected} candidates rejected>"

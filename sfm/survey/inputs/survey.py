@@ -128,6 +128,7 @@ class Survey:
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
     start_cameras: StartCameras | None = None
+    masks: Path | None = None  # folder of masks NAME.png, of which black parts are ignored
     folder: Path = Path()  # base folder of the globs of photographs
     allow_outside: bool = True  # whether photographs may be outside the folder
     source: str = ""  # name of the survey in error messages; else its name
@@ -159,6 +160,7 @@ class Survey:
             ),
             "tables": tuple(table for table in self.tables if table.kind != DISTANCE),
             "folder": Path(self.folder),
+            "masks": None if self.masks is None else Path(self.masks),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
             "rigs": tuple(_section(RigSettings, one, f"{where}: rig") for one in self.rigs),
             "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
@@ -316,6 +318,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         ),
         observations=_given_image_points(file),
         diameters=read(read_diameters, file.targets.diameters),
+        masks=None if file.head.masks is None else file.beside(file.head.masks),
         start_orientations=read(read_exterior, file.approximate.images),
         start_points=read(read_points, file.approximate.points),
         start_cameras=read(read_start_cameras, file.approximate.cameras),

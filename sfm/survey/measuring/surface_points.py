@@ -22,8 +22,9 @@ from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface
-from sfm.network import Estimate, ImagePoints, Network, without_given
+from sfm.network import Estimate, ImagePoints, Network, rows_of, without_given
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark, unless_note
@@ -106,7 +107,7 @@ def cover_photographs(
         side_px=_side(estimate, windows.side_px, settings.max_points),
         threads=jobs,
     )
-    found = without_far_points(found, estimate)
+    found = without_far_points(_visible(Masks(survey.masks), found, network, estimate), estimate)
     if len(found.image_points) < fits.sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
@@ -198,6 +199,17 @@ def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & enough[seen.point])
 
 
+def _visible(masks: Masks, found: CoveringPoints, network: Network, estimate: Estimate) -> CoveringPoints:
+    """Return the covering points that two photographs show where these are not masked."""
+    seen = found.image_points
+    kept = np.ones(len(seen), dtype=bool)
+    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
+        size_px = estimate.cameras[network.camera[i]].size_px
+        kept[rows] = masks.visible(network.images[i], seen.xy[rows], size_px)
+    good = np.bincount(seen.point[kept], minlength=len(found.points)) >= 2
+    return _some_points(found, good, kept)
+
+
 def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoints:
     """Return the points without two-ray points that are off the surface of their neighbours.
 
@@ -210,11 +222,17 @@ def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoi
     seen, n = found.image_points, len(found.points)
     two = np.bincount(seen.point, minlength=n) < MIN_RAYS
     good = on_surface(seen, replace(estimate, points=found.points), two)
-    kept = good[seen.point]
-    number = np.cumsum(good) - 1
+    return _some_points(found, good, np.ones(len(seen), dtype=bool))
+
+
+def _some_points(found: CoveringPoints, points: BoolArray, rays: BoolArray) -> CoveringPoints:
+    """Return some points (n,) and rays (k,) of covering points."""
+    seen = found.image_points
+    kept = points[seen.point] & rays
+    number = np.cumsum(points) - 1
     return CoveringPoints(
         replace(seen.select(kept), point=number[seen.point[kept]]),
-        found.points[good],
+        found.points[points],
         found.residuals[kept],
         found.matched - int((~kept).sum()),
     )

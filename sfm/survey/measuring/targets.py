@@ -22,6 +22,7 @@ from sfm.conventions import AnyArray, FloatArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
 from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.masks import Masks
 from sfm.photographs.reading import linearise_srgb, read_photograph
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage
@@ -96,7 +97,10 @@ def measure_photographs(
             names,
             survey.start_cameras,
         ),
-        tuple(found[k][1] for k in order),
+        tuple(
+            found[k][1].select(Masks(survey.masks).visible(name, found[k][1].xy, found[k][0].size_px))
+            for k, name in zip(order, names, strict=True)
+        ),
         failed,
         tuple(found[k][2] for k in order),
     )

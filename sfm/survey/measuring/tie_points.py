@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -21,9 +21,10 @@ from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
 from sfm.matching.tracks.features import PARTNERS
-from sfm.matching.tracks.interest import NaturalPoints, natural_points
+from sfm.matching.tracks.interest import Features, NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
+from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles, read_photograph
 from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
@@ -90,7 +91,10 @@ def tie_photographs(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([files.paths[k] for k in read])
-    natural = [found[k][2] for k in read]
+    natural = [
+        _visible(Masks(survey.masks), name, found[k][2], found[k][0].size_px)
+        for k, name in zip(read, names, strict=True)
+    ]
 
     neighbours = (
         neighbours_by_position(metadata, PARTNERS),
@@ -115,7 +119,8 @@ def tie_photographs(
     if scarce and "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
         for a in reported("photographs searched for more features", scarce, len(scarce)):
-            natural[a] = natural_points_of(files.paths[read[a]], more, store)[0]
+            again = natural_points_of(files.paths[read[a]], more, store)[0]
+            natural[a] = _visible(Masks(survey.masks), names[a], again, metadata[a].size_px)
         for pair in [pair for pair in matches if not set(pair).isdisjoint(scarce)]:
             del matches[pair]
     if scarce:
@@ -142,6 +147,15 @@ def tie_photographs(
         files,
         remarks=_remarks_on_pairs(len(matches), neighbours),
     )
+
+
+def _visible(masks: Masks, name: str, found: NaturalPoints, size_px: tuple[int, int]) -> NaturalPoints:
+    """Return the natural points of a photograph that are not masked."""
+    rows, corners = (masks.visible(name, xy, size_px) for xy in (found.xy, found.corners))
+    if rows.all() and corners.all():
+        return found
+    of_features = {one.name: getattr(found, one.name)[rows] for one in fields(Features)}
+    return NaturalPoints(**of_features, corners=found.corners[corners])
 
 
 def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remark, ...]:

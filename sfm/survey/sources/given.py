@@ -19,6 +19,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
 from sfm.display import listed
 from sfm.errors import SurveyFileError
 from sfm.network import ImagePoints, Network, rows_of
+from sfm.photographs.masks import Masks
 from sfm.remarks.remark import remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
@@ -97,6 +98,10 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
     seen, outside = ImagePoints.joined(parts), np.concatenate(outside_parts)
     gross = [f"{points[seen.point[k]]} in {images[seen.image[k]]}" for k in np.flatnonzero(outside)]
     refuse_unknown_photographs(survey, (*files.names, *images))
+    masked = np.zeros(len(seen), dtype=bool)
+    for i, rows in enumerate(rows_of(seen.image, len(images))):
+        size_px = cameras[owner[i]].size_px
+        masked[rows] = ~Masks(survey.masks).visible(images[i], seen.xy[rows], size_px)
     every = images
     copies = same_photographs(seen.image, seen.point, seen.xy, owner)
     distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
@@ -106,7 +111,7 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
         for i, j in copies.items()
     )
     images, owner = tuple(name for name, keep in zip(images, distinct, strict=True) if keep), owner[distinct]
-    kept = seen.select(distinct[seen.image] & ~outside)
+    kept = seen.select(distinct[seen.image] & ~outside & ~masked)
     merged = merge_repeated(replace(kept, image=number[kept.image]))
     if len(files):  # what the survey gives besides is part of the network of all sources
         network = Network(images, owner, points, merged.image_points)
