@@ -22,7 +22,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values
-from sfm.conventions import BoolArray
+from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, solve_likeliest
 from sfm.likelihood import areas_of_photographs, log_likelihood
@@ -195,6 +195,7 @@ def _orient_on_control(
     given: whether the image points were given; the adjustment, not the orientation, then judges
     contradictions.
     """
+    named = network.named[network.image_points.point]  # those of texture cannot contradict the control
 
     def orient_part(part: Network) -> Orientation:
         values = estimate
@@ -204,13 +205,13 @@ def _orient_on_control(
         return _orient_strongest(part, values, measured=measured, contradicting=given)
 
     def without_control(found: Orientation | None) -> Iterator[Network]:
-        if len(network.control) and (found is None or not _fits(network, found).all()):
+        if len(network.control) and (found is None or not _fits(network, found)[named].all()):
             yield replace(network, control=ObjectPoints())
 
     def more_fit(before: Orientation | None, after: Orientation | None) -> float:
         if before is None or after is None:
             return math.inf
-        return float(_fits(network, after).sum() - _fits(network, before).sum())
+        return float(_fits(network, after)[named].sum() - _fits(network, before)[named].sum())
 
     def placed(_: Orientation | None, found: Orientation | None) -> Orientation | None:
         with suppress(GeometryError):  # fewer than three control points, or on a line
@@ -268,13 +269,8 @@ def _circle_judge(measured: Measurements, network: Network) -> Judge | None:
     photographs, naming = of_targets.photographs, of_targets.naming
     if photographs is None or naming.corners:
         return None
-    images, points = (
-        np.array([{name: k for k, name in enumerate(names)}.get(name, -1) for name in of], dtype=np.int64)
-        for names, of in (
-            (network.images, of_targets.network.images),
-            (network.points, of_targets.network.points),
-        )
-    )
+    images = _places(network.images, of_targets.network.images)
+    points = _places(network.points, of_targets.network.points)
 
     def misfit(estimate: Estimate) -> float:
         position, xyz = estimate.position[images], estimate.points[points]
@@ -283,6 +279,12 @@ def _circle_judge(measured: Measurements, network: Network) -> Judge | None:
         return circle_misfit(photographs, naming, of_targets.network, of_part)
 
     return misfit
+
+
+def _places(names: Sequence[str], of: Sequence[str]) -> IntArray:
+    """Return the index of names among others, -1 for those that are not there."""
+    index = {name: k for k, name in enumerate(names)}
+    return np.array([index.get(name, -1) for name in of], dtype=np.int64)
 
 
 def _orient_strongest(

@@ -89,12 +89,12 @@ XY = np.array([[0.1, 2.0], [1 / 3, 4.0]])
 
 
 def test_groups_that_are_not_known_are_left_out_and_read_as_unknown(tmp_path: Path) -> None:
-    IMAGE_POINTS.write(tmp_path, OWNERS, XY, None, None, None, None)
+    IMAGE_POINTS.write(tmp_path, OWNERS, XY, None, None, None, None, None)
     table = IMAGE_POINTS.read(tmp_path)
     assert table.texts == OWNERS and (table.part(("x_px", "y_px")) == XY).all()
     assert np.isnan(table.part(("sx_px", "cxy_px2", "rejected"))).all()
     sigma = np.array([[0.1, np.nan], [0.3, 0.4]])
-    IMAGE_POINTS.write(tmp_path, OWNERS, XY, sigma, [None, 0.01], XY, [0, 1])
+    IMAGE_POINTS.write(tmp_path, OWNERS, XY, sigma, [None, 0.01], XY, [0, 1], ["a", "b"])
     table = IMAGE_POINTS.read(tmp_path)
     np.testing.assert_array_equal(table.part(("sx_px", "sy_px")), sigma)
     assert np.isnan(table.part(("cxy_px2",))[0, 0]) and table.part(("cxy_px2",))[1, 0] == 0.01
@@ -123,7 +123,7 @@ def test_an_empty_table_has_its_header(tmp_path: Path) -> None:
 def test_values_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="2 columns of values for 3"):
         POINTS.write(tmp_path, ("A", "B"), XY, None, None)
-    with pytest.raises(ValueError, match="expected one of name, number"):
+    with pytest.raises(ValueError, match="expected one of name, label, number"):
         ResultTable("points", "names: id")
 
 

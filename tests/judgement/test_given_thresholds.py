@@ -163,6 +163,18 @@ def test_bars_of_the_same_ends_are_one_scale_if_they_agree_at_the_level(apart: f
     assert kinds_of(said) == (("scale_unchecked",) if agree else ("scale_contradicted",))
 
 
+@pytest.mark.parametrize("copies", [1, 2, 6])
+def test_a_bar_given_several_times_counts_once(copies: int) -> None:
+    """It is 3 standard deviations from another bar, which is no contradiction however often it is written."""
+    network, truth = make_network(seed_of("twice"), images=8, points=30)
+    length = [float(np.linalg.norm(truth.points[i] - truth.points[j])) for i, j in ((8, 19), (3, 12))]
+    off = 3 * np.sqrt(2) * 1e-3
+    first = ScaleBar("9", "20", (1 + off) * length[0], 1e-3 * length[0])
+    bars = (*[first] * copies, ScaleBar("4", "13", length[1], 1e-3 * length[1]))
+    said = remarks_on_given(run_survey(survey_of(network, truth, scale_bars=bars)))
+    assert "scale_contradicted" not in kinds_of(said)
+
+
 @pytest.mark.parametrize(("false_alarm", "found"), [(0.05, True), (1e-4, False)])
 def test_the_level_of_given_values_follows_the_false_alarm_of_the_survey(
     false_alarm: float, found: bool

@@ -113,12 +113,13 @@ def write_given(path: Path, xyz: dict[str, tuple[float, ...]], off_px: float = 0
     path.write_text("\n".join(lines) + "\n", "utf-8")
 
 
-def test_given_image_points_stand_beside_targets(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by_hand", ["a3.csv", "g.csv"])  # of these seeds, rejection lost right image points
+def test_given_image_points_stand_beside_targets(tmp_path: Path, by_hand: str) -> None:
     """Corners by hand, and those of codes by a program that counts pixels from their corners."""
     codes = {str(code): tuple(X.tolist()) for code, X in code_centres().items()}
-    write_given(tmp_path / "corners.csv", CORNERS)
+    write_given(tmp_path / by_hand, CORNERS)
     write_given(tmp_path / "codes.csv", codes, off_px=0.5)
-    more = '[[observations]]\nfile = "corners.csv"\nsigma_px = 0.2\n[[observations]]\nfile = "codes.csv"\n'
+    more = f'[[observations]]\nfile = "{by_hand}"\nsigma_px = 0.2\n[[observations]]\nfile = "codes.csv"\n'
     result = run_survey(read_survey(write(tmp_path, more)))
     alone = run_survey(read_survey(write(tmp_path)))
     a, b = result.adjustment, alone.adjustment
@@ -175,6 +176,8 @@ def test_what_two_sources_measure_is_used_once() -> None:
     agreeing = both(0.1, 0.1)
     assert (agreeing.image_points.xy == xy).all() and not agreeing.contradicting and not agreeing.remarks
     assert not both(1.0, 0.1).contradicting  # sigmas that are too small contradict nothing
+    (said,) = both(300.0, 0.1).remarks  # other names
+    assert said.kind == "sources_contradict" and said.severity == "error"
     wrong = both(0.1, 0.1, wrong_px=5.0)
     assert wrong.contradicting == ((3, 3),) and len(wrong.image_points) == n - 1
 

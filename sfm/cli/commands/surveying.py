@@ -256,11 +256,12 @@ def _run_survey(
         from_photographs = reads_photographs(described)
     if from_photographs and not reads_photographs(described):
         raise KolinearError(
-            f"{survey_file}: has [observations] instead of photographs; run kolinear adjust {survey_file}"
+            f"{survey_file}: has [observations] instead of photographs; run kolinear adjust {survey_file}, "
+            "or write [[observations]] for image points beside targets or texture"
         )
     if not from_photographs and reads_photographs(described):
         raise KolinearError(
-            f"{survey_file}: has no [observations]; with photographs, run kolinear run {survey_file}"
+            f"{survey_file}: has no [observations] alone; with photographs, run kolinear run {survey_file}"
         )
     with working_on(str(survey_file)):
         survey = survey_of_file(described)

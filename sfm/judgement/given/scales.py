@@ -305,7 +305,10 @@ class Comparison(NamedTuple):
         """
         first, *others = (source for k, source in enumerate(self.sources) if k not in self.judgement.wrong)
         scales = Scales.joined([first.scales, *(source.scales for source in others)])
-        scales = scales._replace(variance=self.factor**2 * scales.variance)
+        variance = self.factor**2 * scales.variance
+        if not (first.table or first.is_plate):  # of the same ends: giving a length twice does not improve it
+            variance = np.full(len(variance), len(variance) * variance.min())
+        scales = scales._replace(variance=variance)
         name, is_table = (table, True) if first.table and others else (first.name, False)
         bars = tuple(b for source in (first, *others) for b in source.bars)
         return first._replace(name=name, scales=scales, bars=bars, is_table=is_table)

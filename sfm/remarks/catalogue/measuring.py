@@ -84,6 +84,22 @@ POINTS = (
         "Correct the table of image points, or leave it out; the others in it are off as well.",
     ),
     Kind(
+        "sources_contradict",
+        "error",
+        "{sources:@} contradict one another: {common:image point} that both have {common:is|are} {distance} "
+        "apart (median); the first were left out there.",
+        "other names of points, or of photographs, or other photographs",
+        "Correct the table of image points, or leave it out; the others in it are used.",
+    ),
+    Kind(
+        "photographs_without_file",
+        "note",
+        "{photographs:photograph} with given image points {photographs:is|are} not among the files: "
+        "{photographs}.",
+        "only their image points were handed over, or a name in the table differs from that of the file",
+        "Correct the name if the photograph is here.",
+    ),
+    Kind(
         "codes_at_several_places",
         "warning",
         "{codes:code} {codes:has|have} rays that do not meet at one position: {codes}, in "

@@ -329,8 +329,9 @@ def _adjust_with_components(
 
     Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.2.4.
     """
-    names = (IMAGE_POINTS,) if len(part.sources) == 1 else tuple(source.name for source in part.sources)
-    final, _, settled = estimate_components(adjust_part, part.source, names, start=start)
+    present, group = np.unique(part.source, return_inverse=True)
+    names = (IMAGE_POINTS,) if len(present) == 1 else tuple(part.sources[k].name for k in present)
+    final, _, settled = estimate_components(adjust_part, group, names, start=start)
     if not settled:
         unsettled = remark("rejection_not_converging", groups=names)
         final = replace(final, remarks=(*final.remarks, unsettled))

@@ -41,6 +41,8 @@ from sfm.survey.inputs.settings import (
 from sfm.survey.inputs.sources import tables_of
 from sfm.targets.codes.plates import is_table
 
+BESIDE = "[[observations]]"  # key of tables of image points beside photographs
+
 
 class SurveyFile(Section):
     """Content of a survey file; its tables are not read yet."""
@@ -58,9 +60,10 @@ class SurveyFile(Section):
     rigs: Annotated[tuple[RigSettings, ...], Field(strict=False, max_length=MAX_RIGS, alias="rig")] = ()
     scale_bars: Annotated[tuple[ScaleBarSettings, ...], Field(strict=False, alias="scale_bar")] = ()
     equipment: Annotated[tuple[EquipmentSettings, ...], Field(strict=False, max_length=MAX_TABLES)] = ()
-    observations: (
-        ObservationSettings | Annotated[tuple[ObservationSettings, ...], Field(strict=False)] | None
-    ) = None  # [observations] in place of photographs, or [[observations]] beside them
+    image_points: ObservationSettings | None = Field(None, alias="observations")  # in place of photographs
+    more_image_points: Annotated[  # beside them
+        tuple[ObservationSettings, ...], Field(strict=False, max_length=MAX_TABLES, alias=BESIDE)
+    ] = ()
     observation_tables: Annotated[
         tuple[ObservationTableSettings, ...],
         Field(strict=False, max_length=MAX_TABLES, alias="survey_observations"),
@@ -101,6 +104,11 @@ class SurveyFile(Section):
         """Code family, or the path of the table file."""
         codes = self.targets.codes
         return codes if not is_table(codes) else str(self.beside(codes))
+
+    @property
+    def observations(self) -> ObservationSettings | tuple[ObservationSettings, ...] | None:
+        """Tables of image points: one in place of photographs, or several beside them."""
+        return self.image_points or self.more_image_points or None
 
     @property
     def start_points(self) -> str | None:
@@ -217,6 +225,8 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
     fields = SurveyFile.model_fields.items()
     repeated = {one.alias or name for name, one in fields if get_origin(one.annotation) is tuple}
     text, table = read_toml(path, "a survey file", repeated=repeated)
+    if isinstance(table.get("observations"), list):
+        table[BESIDE] = table.pop("observations")
     try:
         survey = SurveyFile.model_validate(table)
     except ValidationError as error:

@@ -8,7 +8,7 @@ y exchanged, another unit, or a larger photograph.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
@@ -18,9 +18,9 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
 from sfm.display import listed
 from sfm.errors import SurveyFileError
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.network import ImagePoints, Network, Source, rows_of
 from sfm.photographs.masks import Masks
-from sfm.remarks.remark import remark
+from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
 from sfm.survey.inputs.checks.copies import same_photographs
@@ -35,7 +35,7 @@ from sfm.survey.inputs.measurements import (
 from sfm.survey.inputs.sources import tables_of
 from sfm.survey.inputs.start import network_of, refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.sources.repeated import merge_repeated
+from sfm.survey.sources.repeated import MergedImagePoints, merge_repeated, without_repeated
 from sfm.survey.sources.source import SurveySource, complete_as_measured
 
 MARGIN_PX = 1.0  # difference to programs that count pixels from 1 or from corners
@@ -72,8 +72,8 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
         tuple(files.names[k] for k in readable),
         survey.start_cameras,
     )
-    full = _full_names(files)
-    images, image = _numbered([full.get(name, name) for table in tables for name in table.image])
+    tables = tuple(_with_full_names(table, files) for table in tables)
+    images, image = _numbered([name for table in tables for name in table.image])
     refuse_many(str(tables[0].table.path), images)
     points, point = _numbered([name for table in tables for name in table.point])
     of_file = dict(zip(files.names, files.camera.tolist(), strict=True))
@@ -98,32 +98,32 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
     seen, outside = ImagePoints.joined(parts), np.concatenate(outside_parts)
     gross = [f"{points[seen.point[k]]} in {images[seen.image[k]]}" for k in np.flatnonzero(outside)]
     refuse_unknown_photographs(survey, (*files.names, *images))
-    masked = np.zeros(len(seen), dtype=bool)
-    for i, rows in enumerate(rows_of(seen.image, len(images))):
-        size_px = cameras[owner[i]].size_px
-        masked[rows] = ~Masks(survey.masks).visible(images[i], seen.xy[rows], size_px)
-    every = images
-    copies = same_photographs(seen.image, seen.point, seen.xy, owner)
-    distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
-    number = np.cumsum(distinct) - 1
+    # of photographs that are here, copies are found by their pictures
+    copies = {} if len(files) else same_photographs(seen.image, seen.point, seen.xy, owner)
+    every, used = images, _used_photographs(images, files, copies)
+    number = np.cumsum(used) - 1
     failed = tuple(
         FailedImage(every[i], remark("copies", original=every[j], same="image points"))
         for i, j in copies.items()
     )
-    images, owner = tuple(name for name, keep in zip(images, distinct, strict=True) if keep), owner[distinct]
-    kept = seen.select(distinct[seen.image] & ~outside & ~masked)
-    merged = merge_repeated(replace(kept, image=number[kept.image]))
+    kept = used[seen.image] & ~outside & _visible(survey, seen, images, cameras, owner)
+    table_of = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    images, owner = tuple(name for name, keep in zip(images, used, strict=True) if keep), owner[used]
+    seen = replace(seen.select(kept), image=number[seen.image[kept]], source=table_of[kept])
+    merged, offsets = _merge_tables(seen, tables)
     if len(files):  # what the survey gives besides is part of the network of all sources
         network = Network(images, owner, points, merged.image_points)
     else:
         network = network_of(survey, images, owner, points, merged.image_points)
-    times = Counter(zip(number[kept.image].tolist(), kept.point.tolist(), strict=True))
+    times = Counter(zip(seen.image.tolist(), seen.point.tolist(), strict=True))
     contradicting = tuple(
         LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
         for i, j in merged.dropped
         for name in [f"{points[j]} in {images[i]}"]
     )
     outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
+    no_file = [name for name in images if len(files) and name not in of_file]
+    without_file = (remark("photographs_without_file", photographs=no_file),) if no_file else ()
     return Measurements(
         network,
         cameras,
@@ -131,11 +131,59 @@ def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
         np.full(len(points), MIN_RAYS),
         failed,
         _overlays(network, files, readable),
-        remarks=(*merged.remarks(images, points), *outside_remark),
+        remarks=(*offsets, *merged.remarks(images, points), *outside_remark, *without_file),
         left_out=(
             *contradicting,
             *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
         ),
+    )
+
+
+def _with_full_names(table: Observations, files: PhotographList) -> Observations:
+    """Return the image points of a table with the names that the files of their photographs have."""
+    full = _full_names(files)
+    return replace(table, image=tuple(full.get(name, name) for name in table.image))
+
+
+def _used_photographs(images: Sequence[str], files: PhotographList, copies: Collection[int]) -> BoolArray:
+    """Return which photographs take part, (m,): no copies, and no files that were left out for their size."""
+    known = set(files.names)
+    left_out = [name not in known and bool(known) and (files.folder / name).is_file() for name in images]
+    return np.isin(np.arange(len(images)), list(copies), invert=True) & ~np.array(left_out, dtype=bool)
+
+
+def _visible(
+    survey: Survey, seen: ImagePoints, images: Sequence[str], cameras: Sequence[Camera], owner: IntArray
+) -> BoolArray:
+    """Return which image points are not masked, (k,)."""
+    visible = np.ones(len(seen), dtype=bool)
+    for name, camera, rows in zip(images, owner.tolist(), rows_of(seen.image, len(images)), strict=True):
+        visible[rows] = Masks(survey.masks).visible(name, seen.xy[rows], cameras[camera].size_px)
+    return visible
+
+
+def _merge_tables(
+    seen: ImagePoints, tables: Sequence[Observations]
+) -> tuple[MergedImagePoints, tuple[Remark, ...]]:
+    """Merge what a table has several times, and use the first of tables that have the same image point."""
+    if len(tables) == 1:
+        return merge_repeated(replace(seen, source=None)), ()
+    merged = [merge_repeated(seen.select(seen.source == k)) for k in range(len(tables))]
+    every = ImagePoints.joined([part.image_points for part in merged])
+    once = without_repeated(every, tuple(Source(table.table.path.name) for table in tables))
+    same, averaged, dropped = (
+        tuple(pair for part in merged for pair in getattr(part, name))
+        for name in ("same", "averaged", "dropped")
+    )
+    return (
+        MergedImagePoints(
+            replace(once.image_points, source=None),
+            same,
+            averaged,
+            (*dropped, *once.contradicting),
+            sum(part.dropped_rows for part in merged) + 2 * len(once.contradicting),
+        ),
+        once.remarks,
     )
 
 

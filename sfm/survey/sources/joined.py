@@ -93,21 +93,28 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
     """Return the measurements of all sources as those of one network."""
     if len(parts) == 1:
         return replace(parts[0], network=_of_one_source(survey, parts[0].network))
+    named = [part.network.points for part in parts]
     parts = [replace(part, network=network) for part, network in zip(parts, _renamed(parts), strict=True)]
-    network, repeated = _joined(survey, [part.network for part in parts])
+    network, repeated = _joined(survey, [part.network for part in parts], named)
+    lost = {failed.image: failed for part in parts for failed in part.failed}
     seen = set(network.images)
-    failed = {lost.image: lost for part in parts for lost in part.failed if lost.image not in seen}
+    by_points = [  # they take part with given image points
+        name
+        for name, failed in lost.items()
+        if name in seen and failed.reason.kind == "photographs_unreadable"
+    ]
+    unread = (remark("photographs_unreadable", photographs=by_points),) if by_points else ()
     return Measurements(
         network,
         parts[0].cameras,
         tuple(dict.fromkeys(name for part in parts for name in part.images)),
         _fewest_rays(network, parts),
-        tuple(failed.values()),
+        tuple(failed for name, failed in lost.items() if name not in by_points),
         _joined_overlays([part.overlays for part in parts]),
         next((part.files for part in parts if part.files is not None), None),
         next((part.photographs for part in parts if part.photographs is not None), None),
         next((part.naming for part in parts if part.naming.names), NO_NAMES),
-        (*(remark for part in parts for remark in part.remarks), *repeated.remarks),
+        (*(said for part in parts for said in part.remarks), *repeated.remarks, *unread),
         (*(point for part in parts for point in part.left_out), *repeated.left_out),
         tuple(parts),
     )
@@ -149,20 +156,25 @@ class _Repeated:
     left_out: tuple[LeftOutPoint, ...]
 
 
-def _joined(survey: Survey, networks: Sequence[Network]) -> tuple[Network, _Repeated]:
-    """Return the network of the image points of all sources, with everything else that the survey gives."""
+def _joined(
+    survey: Survey, networks: Sequence[Network], named: Sequence[Sequence[str]]
+) -> tuple[Network, _Repeated]:
+    """Return the network of the image points of all sources, with everything else that the survey gives.
+
+    named: names that the points of each network had before running names were changed.
+    """
     sources = tuple(row.source for row in declared(survey))
     images = tuple(dict.fromkeys(name for network in networks for name in network.images))
     points = tuple(dict.fromkeys(name for network in networks for name in network.points))
     camera = np.zeros(len(images), dtype=np.int64)
     parts, bars = [], [scale_bars(survey.scale_bars, points)]
-    for k, network in enumerate(networks):
+    for k, (network, before) in enumerate(zip(networks, named, strict=True)):
         of_image, of_point = _indices(network.images, images), _indices(network.points, points)
         camera[of_image] = network.camera
         seen = network.image_points
         source = np.full(len(seen), k)
         parts.append(replace(seen, image=of_image[seen.image], point=of_point[seen.point], source=source))
-        stated = len(scale_bars(survey.scale_bars, network.points))
+        stated = len(scale_bars(survey.scale_bars, before))  # all others are of the source alone
         bars.append(
             network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
         )
@@ -250,10 +262,11 @@ def _joined_correspondences(
     """Return the image points of all sources in the orientation of all photographs."""
     if len(completed) == 1:
         return replace(completed[0], network=_of_one_source(survey, completed[0].network))
+    named = [matched.network.points for matched in completed]
     completed = [
         replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
     ]
-    network, _ = _joined(survey, [matched.network for matched in completed])
+    network, _ = _joined(survey, [matched.network for matched in completed], named)
     images = _indices(network.images, measured.network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
     elsewhere = {
@@ -321,11 +334,16 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px
 
         def adjust_with(factor: FloatArray) -> Adjustment:
             alpha = level_of_single(FALSE_ALARM, 2 * len(factor))
-            return adjust(part, start, sigma_px=sigma_px, image_sigma_factor=factor, alpha=alpha)
+            # rejection with weights that are far off would lose the image points of the less precise source
+            return adjust(
+                part, start, sigma_px=sigma_px, image_sigma_factor=factor, alpha=alpha, reject="huber"
+            )
 
         present, group = np.unique(part.source, return_inverse=True)
         names = tuple(network.sources[k].name for k in present)
-        _, found, _ = estimate_components(adjust_with, group, names)
+        _, found, converged = estimate_components(adjust_with, group, names)
+        if not converged:
+            return network
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     factors = np.ones(len(network.sources))

@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import LEVEL, chi2_isf, chi2_ppf
+from sfm.judgement.given.values import MAX_FACTOR
 from sfm.network import ImagePoints, Source, rows_of
 from sfm.remarks.remark import Quantity, Remark, remark
 
@@ -123,7 +124,19 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
         offset = np.zeros(2)
         if len(of_a) >= FEWEST_COMMON:  # of fewer the stated sigmas decide
             offset = np.median(difference, axis=0)
-            C = C * max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
+            scale = max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
+            if scale > MAX_FACTOR**2:  # beyond any that a wrong standard deviation explains
+                distance = float(np.median(np.linalg.norm(difference, axis=1)))
+                remarks.append(
+                    remark(
+                        "sources_contradict",
+                        sources=[sources[b].name, sources[a].name],
+                        distance=Quantity(distance, "px"),
+                        common=len(of_a),
+                    )
+                )
+                continue
+            C = C * scale
             # the variance of a median is pi / 2 of that of a mean; what is below one sigma does not matter
             together = _squares(offset[None], np.median(C, axis=0)[None])[0]
             if together > max(1.0, np.pi / 2 * chi2_isf(LEVEL, 2) / len(of_a)):
