@@ -147,7 +147,7 @@ def test_given_image_points_stand_beside_targets(tmp_path: Path, by_hand: str) -
     assert np.abs(moved).max() < 3 * sigma[: len(common)].max()
     # the corner that has the number of an uncoded target is another point
     assert network.source[network.image_points.point == network.points.index("u001")].tolist() == [1] * 6
-    assert a.sigma_of_sources[1] == pytest.approx(0.2, rel=0.4)
+    assert 0.15 < a.sigma_of_sources[1] < 0.5  # few of its image points are off by 0.5 px
     folder = tmp_path / "out"
     write_result(result, folder)
     read = read_result(folder)

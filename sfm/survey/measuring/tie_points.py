@@ -20,8 +20,8 @@ from sfm.conventions import AnyArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
-from sfm.matching.tracks.features import PARTNERS
-from sfm.matching.tracks.interest import Features, NaturalPoints, natural_points
+from sfm.matching.tracks.features import PARTNERS, Features
+from sfm.matching.tracks.interest import NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
 from sfm.photographs.masks import Masks

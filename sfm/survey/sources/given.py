@@ -149,7 +149,8 @@ def _used_photographs(images: Sequence[str], files: PhotographList, copies: Coll
     """Return which photographs take part, (m,): no copies, and no files that were left out for their size."""
     known = set(files.names)
     left_out = [name not in known and bool(known) and (files.folder / name).is_file() for name in images]
-    return np.isin(np.arange(len(images)), list(copies), invert=True) & ~np.array(left_out, dtype=bool)
+    distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
+    return np.asarray(distinct & ~np.array(left_out, dtype=bool))
 
 
 def _visible(
@@ -168,7 +169,8 @@ def _merge_tables(
     """Merge what a table has several times, and use the first of tables that have the same image point."""
     if len(tables) == 1:
         return merge_repeated(replace(seen, source=None)), ()
-    merged = [merge_repeated(seen.select(seen.source == k)) for k in range(len(tables))]
+    of_table = np.zeros(len(seen), dtype=np.int64) if seen.source is None else seen.source
+    merged = [merge_repeated(seen.select(np.asarray(of_table == k))) for k in range(len(tables))]
     every = ImagePoints.joined([part.image_points for part in merged])
     once = without_repeated(every, tuple(Source(table.table.path.name) for table in tables))
     same, averaged, dropped = (
