@@ -97,7 +97,7 @@ POINTS = (
         "{photographs:photograph} with given image points {photographs:is|are} not among the files: "
         "{photographs}.",
         "only their image points were handed over, or a name in the table differs from that of the file",
-        "Correct the name if the photograph is here.",
+        "Correct the table if the photograph is here.",
     ),
     Kind(
         "codes_at_several_places",
