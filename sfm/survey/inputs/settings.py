@@ -124,10 +124,10 @@ class Head(Section):
 
     name: Name  # of the survey, in the report and its file names
     unit: Unit  # of the object coordinates
-    masks: Name | None = None  # folder of masks NAME.png of photographs; what is black in them is ignored
     equipment: Name | None = None  # equipment file with the bars and frames of [[equipment]]
     temperature: Temperature | None = None  # of the equipment during the survey, deg C
     temperature_sigma: Length = 1.0  # standard deviation of temperature, K
+    masks: Name | None = None  # folder of masks NAME.png of photographs; what is black in them is ignored
 
 
 class CameraSettings(Section):
