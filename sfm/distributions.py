@@ -17,8 +17,8 @@ from scipy import special
 FALSE_ALARM = 0.05  # that the tests of one kind, together, report anything in a result without errors
 LEVEL = 0.001  # that one question is answered wrongly although nothing is wrong; Baarda (1968)
 POWER = 0.8  # that an error of the size that is called detectable is found; Baarda (1968)
-# Level of each of five families of tests, which share a false alarm: alternatives and choices of model;
-# points; photographs; divisions of the photographs; cameras, and the outlines of targets.
+# Level of a question about a whole survey, as if five shared a false alarm: alternatives, choices of model,
+# points, photographs, divisions of these, cameras. More are asked; not all are open in one survey.
 FAMILY = FALSE_ALARM / 5
 MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
 MIN_LEAD = np.log(100)  # difference of ln likelihood below which two alternatives cannot be separated
