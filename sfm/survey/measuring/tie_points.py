@@ -151,7 +151,8 @@ def tie_photographs(
 
 def _visible(masks: Masks, name: str, found: NaturalPoints, size_px: tuple[int, int]) -> NaturalPoints:
     """Return the natural points of a photograph that are not masked."""
-    rows, corners = (masks.visible(name, xy, size_px) for xy in (found.xy, found.corners))
+    visible = masks.visible(name, np.vstack([found.xy, found.corners]), size_px)
+    rows, corners = visible[: len(found.xy)], visible[len(found.xy) :]
     if rows.all() and corners.all():
         return found
     of_features = {one.name: getattr(found, one.name)[rows] for one in fields(Features)}
