@@ -34,6 +34,7 @@ from sfm.matching.conjugate_patches import (
     match_warped,
 )
 from sfm.matching.correlation import (
+    MIN_CORRELATION,
     LsmFlag,
     NccFlag,
     ambiguous,
@@ -71,7 +72,6 @@ SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
 SAME_PX = 5.0  # peaks of two shapes closer than this are the same position
 REACH_PX = 3  # of the match that follows
 OWN_PX = 500  # around a point, within which similar patches are searched for
-MIN_CORRELATION = 0.7  # one patch then explains half of the variance of the other
 BACK_PX = 1.0  # a match whose way back ends farther than this from its start is another point
 MIN_TEMPLATE_PX = 7  # smaller templates match almost anything once they are rotated and scaled
 REACH_SIGMAS = 3.0  # of the position that key points predict

@@ -307,6 +307,6 @@ def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: 
     assert [one.kind for one in judge_alternatives(a).unchecked] == ["assumptions_tested"]
     monkeypatch.setattr(hypotheses, "MAX_PHOTOGRAPHS", 5)
     (one,) = judge_alternatives(a).unchecked
-    assert one.kind == "too_many_to_test" and one.names("photographs") == a.network.images
+    assert one.kind == "photographs_untested" and one.names("photographs") == a.network.images
     monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
     assert contradicted_parameters(a) == ()

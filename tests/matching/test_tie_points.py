@@ -735,6 +735,8 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
     assert result.refined >= 0.8 * (result.key_points - 13) and result.after_px < 0.1 < result.before_px
     text = refinement_text(result)
     assert "RMS before" in text and "RMS after" in text
+    lenient = refine_model(beside, lost, tmp_path, RefineSettings(false_alarm=0.9))
+    assert lenient.adjustment.false_alarm == 0.9 and lenient.refined < result.refined
     (tmp_path / "b" / "2.png").unlink()
     with pytest.raises(SurveyFileError, match=r"photograph 'b/2\.png' of the model is not in this folder"):
         refine_model(network, estimate, tmp_path)
@@ -747,6 +749,7 @@ def test_refining_what_another_program_wrote(tmp_path: Path) -> None:
         ({"window_px": 16}, "16"),
         ({"min_correlation": float("nan")}, "smallest correlation is nan, needed 0 to 1"),
         ({"min_correlation": 7.0}, "smallest correlation is 7, needed 0 to 1"),
+        ({"false_alarm": 7.0}, "false_alarm = 7.0, expected a number between 0 and 1"),
     ):
         with pytest.raises(GeometryError, match=message):
             RefineSettings(**wrong)

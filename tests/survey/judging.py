@@ -52,7 +52,7 @@ SURE_LEVEL, SURE_POWER = 1e-6, 0.999
 UNCHECKED = {
     *("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested"),
     "calibrated_from_few",
-    *("assumptions_untested", "photographs_untested", "too_many_to_test"),
+    *("assumptions_untested", "photographs_untested"),
 }
 OF_GIVEN = {row.name for row in given_values.ROWS}
 CAUSES = {row.name for row in hypotheses.ROWS} - UNCHECKED - {"photographs_differ"} | {

@@ -125,7 +125,7 @@ def test_given_image_points_stand_beside_targets(tmp_path: Path, by_hand: str) -
     a, b = result.adjustment, alone.adjustment
     network = a.network
     assert [one.name for one in network.sources] == ["targets", "given"]
-    (offset,) = [one for one in result.verdict.remarks if one.kind == "sources_offset"]
+    (offset,) = [one for one in result.verdict.remarks if one.kind == "sources_contradict"]
     assert offset.numbers["x"].value == pytest.approx(0.5, abs=0.1)
     # given image points of codes are left out where the code was measured, and in no place twice
     seen, seen_alone = (

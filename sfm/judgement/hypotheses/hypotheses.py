@@ -19,7 +19,6 @@ import numpy as np
 
 from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
@@ -108,7 +107,8 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
         return JudgedAssumptions()  # no result, or an exact one, which nothing contradicts
     if len(photographs) > MAX_PHOTOGRAPHS:
-        return JudgedAssumptions(unchecked=(remark("too_many_to_test", photographs=photographs),))
+        many = remark("photographs_untested", photographs=photographs, most=MAX_PHOTOGRAPHS)
+        return JudgedAssumptions(unchecked=(many,))
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     free = free_network(final)
@@ -311,7 +311,9 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     """
     if len(free.rejected) < len(held.rejected):
         start, factor = held.estimate, held.image_sigma_factor
-        sample = adjust_image_points(held.network, start, held.rejected, factor, datum="control")
+        sample = adjust_image_points(
+            held.network, start, held.rejected, factor, held.false_alarm, datum="control"
+        )
         if sample is None:
             return []
         held = sample
@@ -432,7 +434,9 @@ def free_network(final: Adjustment) -> Adjustment | None:
     tested = final.rejected.any() and not final.reweighted and not final.undetermined
     if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
         return final
-    free = adjust_image_points(network, final.estimate, final.rejected, final.image_sigma_factor)
+    free = adjust_image_points(
+        network, final.estimate, final.rejected, final.image_sigma_factor, final.false_alarm
+    )
     return free if free is None or correlation is None else with_error_correlation(free, correlation)
 
 
@@ -441,6 +445,7 @@ def adjust_image_points(
     estimate: Estimate,
     rejected: BoolArray,
     factor: FloatArray,
+    false_alarm: float = FALSE_ALARM,
     *,
     datum: Literal["free", "control"] = "free",
 ) -> Adjustment | None:
@@ -451,6 +456,7 @@ def adjust_image_points(
         estimate: start values.
         rejected: image points left out at the start, (k,).
         factor: factor on the standard deviations of image points, (k,).
+        false_alarm: probability that right image points are called wrong.
         datum: "control" to adjust them with the given points.
     """
     alone = without_given(network)
@@ -464,7 +470,7 @@ def adjust_image_points(
             datum=Datum(datum),
             image_sigma_factor=factor[rows],
             reject="tau",
-            alpha=level_of_single(FALSE_ALARM, 2 * int(rows.sum())),
+            false_alarm=false_alarm,
             rejected=rejected[rows],
         )
     except (GeometryError, np.linalg.LinAlgError):

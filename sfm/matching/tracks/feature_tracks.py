@@ -21,6 +21,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled
 from sfm.kernels.threads import in_threads
+from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks.features import (
@@ -74,7 +75,7 @@ def find_tie_points(
     window_px: int = WINDOW_PX,
     min_rays: int = 3,
     min_image_points: int = 0,
-    min_correlation: float = 0.7,
+    min_correlation: float = MIN_CORRELATION,
     seed: int = 0,
     threads: int = 1,
     known: Matches | None = None,
@@ -241,7 +242,7 @@ def measure_tracks(
     window_px: int = WINDOW_PX,
     min_rays: int = 3,
     min_image_points: int = 0,
-    min_correlation: float = 0.7,
+    min_correlation: float = MIN_CORRELATION,
     threads: int = 1,
 ) -> TiePoints:
     """Measure the points of tracks by least squares matching from their references.

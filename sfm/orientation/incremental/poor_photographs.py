@@ -34,7 +34,7 @@ from sfm.similarity import reverse_depth
 DOUBTFUL = 30.0  # multiple of the median residual of a solution below which its reversal casts doubt on it
 SMALLER_TOLERANCES = (1 / 3, 1 / 10)  # shares of the first start tolerance, for a solution in doubt
 FAR_WORSE = 3.0  # multiple of the median residual from which a photograph may not belong to the others
-CONTRADICTING, MIRRORED = "photograph_against_the_others", "photograph_mirrored"
+CONTRADICTING, MIRRORED = remark("photograph_contradicting"), "photograph_mirrored"
 BOUND = 6.0  # multiple of the median residual of the best solution to which residuals are limited
 MIN_OTHERS = 3  # oriented photographs needed to judge another one
 WORSE = 1.5  # multiple of the typical median residual from which a photograph is tested turned over
@@ -53,7 +53,7 @@ def judge_misfits(growth: Growth, refine: Refine | None) -> bool:
     """
     changed = False
     for i, reason in list(growth.reasons.items()):
-        if not _is_mirrored(growth, i) and reason.kind == CONTRADICTING and growth.resect([i]):
+        if not _is_mirrored(growth, i) and reason == CONTRADICTING and growth.resect([i]):
             growth.dropped[i], changed = False, True
     looked_at = ~growth.estimate.oriented
     while growth.estimate.oriented.sum() > MIN_OTHERS:
@@ -178,7 +178,7 @@ def reversed_growth(growth: Growth, empty: Growth, refine: Refine, without: Bool
     empty.fixed, empty.tolerance_px = growth.fixed.copy(), growth.tolerance_px.copy()
     empty.dropped, empty.reasons = growth.dropped | without, dict(growth.reasons)
     for i in np.flatnonzero(without).tolist():
-        empty.reasons[i] = remark(CONTRADICTING)
+        empty.reasons[i] = CONTRADICTING
     empty.adjust(refine, everything=True)
     return empty
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.kind import Grade, Kind, Unless
 
 POINTS = (
     Kind(
@@ -76,19 +76,12 @@ POINTS = (
         "Correct the names.",
     ),
     Kind(
-        "sources_offset",
-        "warning",
-        "{sources:@} differ by {x:+} in x and {y:+} in y at {common:image point} that both have; the first "
-        "were left out there.",
-        "another origin of pixels: the corner of the first pixel is half a pixel from its centre",
-        "Correct the table of image points, or leave it out; the others in it are off as well.",
-    ),
-    Kind(
         "sources_contradict",
-        "error",
+        Unless(("x",), "error", "warning"),
         "{sources:@} contradict one another: {common:image point} that both have {common:is|are} {distance} "
-        "apart (median); the first were left out there.",
-        "other names of points, or of photographs, or other photographs",
+        "apart (median)[[, {x:+} in x and {y:+} in y alike]]; the first were left out there.",
+        "other names of points or photographs; if alike, another origin of pixels: the corner of the first "
+        "pixel is half a pixel from its centre",
         "Correct the table of image points, or leave it out; the others in it are used.",
     ),
     Kind(

@@ -52,12 +52,6 @@ ROWS = (
         "{causes:contradiction}",
     ),
     Tested(
-        "too_many_to_test",
-        "constant cameras and object",
-        "{photographs:photograph}",
-        "not tested: too many photographs for joint normal equations",
-    ),
-    Tested(
         "assumptions_untested",
         "constant cameras and object",
         "all photographs",
@@ -65,9 +59,9 @@ ROWS = (
     ),
     Tested(
         "photographs_untested",
-        "constant object",
+        "constant object[[ and cameras, of at most {most:photograph}]]",
         "{photographs:photograph}",
-        "not tested: the test needs {needed:photograph}",
+        "not tested[[: the test needs {needed:photograph}]]",
     ),
     Tested("cameras_untested", "constant cameras", "{cameras:camera}", "not tested: too many cameras"),
     Tested(

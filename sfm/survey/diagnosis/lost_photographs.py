@@ -69,7 +69,9 @@ MAX_RADIAL = 0.2
 STEP = 0.02  # first step of the radial distortion
 EVALUATIONS = 80  # of the parallax, by the simplex method of Nelder and Mead
 C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # of the given principal distance: a crop factor, an extender, a zoom
-MISFIT = 3.0  # RMS residual, in standard deviations of image points, that suggests another minimum
+# RMS residual, in standard deviations of image points, from which another minimum is searched. It saves the
+# search where nothing calls for one; the likelihood of the solutions decides.
+MISFIT = 3.0
 
 
 @dataclass(frozen=True)

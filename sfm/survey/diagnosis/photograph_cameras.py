@@ -133,7 +133,7 @@ def find_photograph_cameras(
         cameras[: len(estimate.cameras)] = [_with_parameter_groups(camera) for camera in estimate.cameras]
         own_network = replace(network, camera=owner)
         own_estimate = replace(estimate, cameras=tuple(cameras), position=position, rotation=rotation)
-        if _explained_otherwise(network, estimate, own_network, own_estimate, accepted, ~out):
+        if _explained_otherwise(network, estimate, own_network, own_estimate, accepted, ~out, false_alarm):
             changed, remarks = [], []
         else:
             network, estimate = own_network, own_estimate
@@ -158,6 +158,7 @@ def _explained_otherwise(
     own_estimate: Estimate,
     accepted: BoolArray,
     kept: BoolArray,
+    false_alarm: float,
 ) -> bool:
     """Return whether another cause makes the image points likelier than per-photograph cameras do.
 
@@ -169,7 +170,10 @@ def _explained_otherwise(
     start = ~accepted[rows]
     found = [
         adjust_image_points(
-            *reduce_network(one, values, images, points, rows), rejected, np.ones(int(rows.sum()))
+            *reduce_network(one, values, images, points, rows),
+            rejected,
+            np.ones(int(rows.sum())),
+            false_alarm,
         )
         for one, values, rejected in (
             (network, estimate, start),

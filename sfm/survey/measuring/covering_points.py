@@ -18,6 +18,7 @@ import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.threads import in_threads
+from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
@@ -35,7 +36,6 @@ MIN_COSINE = 0.35  # between a ray and the normal of the plane; below it windows
 SCALES = (0.4, 2.5)  # smallest and largest scale of a window relative to the reference
 BORDER_PX = 4  # between a window and the border of a photograph
 RETURN_FACTOR = 3.0  # largest return error of a match that is matched back, over the median error, in sigmas
-MIN_CORRELATION = 0.7  # smallest correlation coefficient r of a match
 MIN_RAYS = 3  # of a point; two where only two photographs see the surface
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 

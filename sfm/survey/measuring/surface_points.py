@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
-from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface
@@ -31,7 +29,7 @@ from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.settings import TiePointSettings
+from sfm.survey.inputs.settings import AdjustSettings, TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
@@ -121,9 +119,7 @@ def cover_photographs(
         replace(found.image_points, covariance=covariance).select(order),
     )
     placed = replace(estimate, points=found.points)
-    covering = _with_common_part(
-        covering, placed, found.image_points.covariance[order], survey.adjust.sigma_px
-    )
+    covering = _with_common_part(covering, placed, found.image_points.covariance[order], survey.adjust)
     control = covering.control.complete
     if start.kind != "given" and len(control) >= MIN_CONTROL:  # tie points cannot be placed on control
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
@@ -137,7 +133,9 @@ def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
     return unless_note(remark("windows_disagree", share=1 - len(found.image_points) / max(found.matched, 1)))
 
 
-def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray, sigma_px: float) -> Network:
+def _with_common_part(
+    network: Network, estimate: Estimate, matching: FloatArray, settings: AdjustSettings
+) -> Network:
     """Return the network with the share of matching in its covariances estimated from the residuals.
 
     The median covariance does not change: sigma0 still shows how much worse the image points are than
@@ -147,7 +145,7 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
         network: covering points with the expected weights.
         estimate: approximate values.
         matching: covariance from matching, px^2, (k, 2, 2).
-        sigma_px: expected sigma of errors that matching does not see, px.
+        settings: has the expected sigma of errors that matching does not see, px, and the level of the tests.
     """
     seen = network.image_points
     every = max(1, len(seen) // RAYS_OF_NOISE)
@@ -158,12 +156,12 @@ def _with_common_part(network: Network, estimate: Estimate, matching: FloatArray
     def adjust_with(covariance: FloatArray) -> Adjustment:
         nonlocal start
         weighted = replace(part, image_points=replace(part.image_points, covariance=covariance))
-        found = adjust(weighted, start, alpha=level_of_single(FALSE_ALARM, 2 * len(covariance)))
+        found = adjust(weighted, start, false_alarm=settings.false_alarm)
         start = found.estimate
         return found
 
     try:
-        factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], sigma_px)
+        factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], settings.sigma_px)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     shown = factor**2 * matching + common_px**2 * np.eye(2)

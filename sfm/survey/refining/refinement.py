@@ -14,7 +14,6 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import with_neighbours
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -27,9 +26,11 @@ from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import judge_given
+from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window
 from sfm.network import Estimate, Network, without_given
+from sfm.reduced_network import check_number
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.adjusting.settling import MANY_ITERATIONS, MAX_ITERATIONS
@@ -184,15 +185,17 @@ class RefineSettings:
     """
 
     window_px: int | None = None  # odd side of the windows, at most MAX_WINDOW_PX; None: chosen by trial
-    min_correlation: float = 0.7  # smallest coefficient r of a window and its template, 0 to 1
+    min_correlation: float = MIN_CORRELATION  # smallest coefficient r of a window and its template, 0 to 1
     fixed: tuple[str, ...] = ()  # interior parameters held at the values of the model, such as fx, cx or k1
     masks_dir: Path | None = None
     """folder of masks, named like their photographs plus .png; key points on black take no part"""
+    false_alarm: float = FALSE_ALARM  # probability that right image points and given values are called wrong
 
     def __post_init__(self) -> None:
         """Refuse impossible settings before any photograph is read."""
         if self.window_px is not None and odd_window("refine", self.window_px) > MAX_WINDOW_PX:
             raise GeometryError(f"refine: window is {self.window_px} px, needed at most {MAX_WINDOW_PX} px")
+        check_number("refine: false_alarm", self.false_alarm, 0.0, 1.0)
         if not 0 <= self.min_correlation <= 1:
             raise GeometryError(f"refine: smallest correlation is {self.min_correlation:g}, needed 0 to 1")
 
@@ -293,6 +296,7 @@ def refine_model(
         Datum("free") if targets is None else targets.datum,
         matched=int(points[: len(network.points)].sum()),
         unit="" if targets is None else targets.unit,
+        false_alarm=settings.false_alarm,
     )
     refuse_undetermined(part, final, oriented.lost)
     final = with_neighbours(final)
@@ -396,7 +400,7 @@ def _lengths(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArr
 
 
 def adjust_finally(
-    part: Network, start: Estimate, datum: Datum, *, matched: int, unit: str
+    part: Network, start: Estimate, datum: Datum, *, matched: int, unit: str, false_alarm: float
 ) -> tuple[Adjustment, tuple[Remark, ...]]:
     """Return the final adjustment with its covariance, and remarks on control and scale bars left out.
 
@@ -410,8 +414,8 @@ def adjust_finally(
         datum: datum of position, attitude and scale.
         matched: number of points before the targets.
         unit: object unit.
+        false_alarm: probability that right image points, or right given values, are called wrong.
     """
-    alpha = level_of_single(FALSE_ALARM, 2 * len(part.image_points))
 
     def tested(network: Network, factor: float | FloatArray, *, reject: str) -> Adjustment:
         return adjust(
@@ -419,7 +423,7 @@ def adjust_finally(
             start,
             datum=datum,
             reject=reject,
-            alpha=alpha,
+            false_alarm=false_alarm,
             image_sigma_factor=factor,
             max_iterations=MAX_ITERATIONS,
         )
@@ -430,11 +434,11 @@ def adjust_finally(
         without_given(part),
         start,
         reject="tau",
-        alpha=alpha,
+        false_alarm=false_alarm,
         covariance=False,
         max_iterations=MANY_ITERATIONS,
     )
-    given = judge_given(part, FreeNetwork(free), GivenSettings(datum, unit))
+    given = judge_given(part, FreeNetwork(free), GivenSettings(datum, unit, false_alarm=false_alarm))
     part, datum = given.network, given.datum
     remarks = list(given.remarks)
     if given.placing is not None and datum.kind == "control":

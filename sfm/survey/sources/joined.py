@@ -13,12 +13,10 @@ from typing import cast
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, without_given
 from sfm.orientation.image_rays import intersect_image_points
@@ -28,6 +26,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import LeftOutPoint, PhotographTargets
 from sfm.runtime.progress import StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
+from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.sources import Declared, declared
 from sfm.survey.inputs.start import network_of, scale_bars
 from sfm.survey.inputs.survey import Survey
@@ -288,7 +287,7 @@ def _joined_correspondences(
     )
     estimate = replace(estimate, points=rays.points)
     if survey.adjust.weights == "components":
-        network = _balanced(network, estimate, min_rays, survey.adjust.sigma_px)
+        network = _balanced(network, estimate, min_rays, survey.adjust)
     return Correspondences(
         network,
         estimate,
@@ -310,7 +309,7 @@ def _joined_correspondences(
     )
 
 
-def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px: float) -> Network:
+def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings: AdjustSettings) -> Network:
     """Return the network with the weights of its sources relative to one another, from their residuals.
 
     The median covariance does not change: sigma0 still shows how much worse the image points are than
@@ -333,10 +332,14 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, sigma_px
         part, start = reduce_network(without_given(network), estimate, images, points, rays)
 
         def adjust_with(factor: FloatArray) -> Adjustment:
-            alpha = level_of_single(FALSE_ALARM, 2 * len(factor))
             # rejection with weights that are far off would lose the image points of the less precise source
             return adjust(
-                part, start, sigma_px=sigma_px, image_sigma_factor=factor, alpha=alpha, reject="huber"
+                part,
+                start,
+                sigma_px=settings.sigma_px,
+                image_sigma_factor=factor,
+                false_alarm=settings.false_alarm,
+                reject="huber",
             )
 
         present, group = np.unique(part.source, return_inverse=True)

@@ -8,6 +8,7 @@ points show; by these, also an offset is found, such as another origin of pixels
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -122,33 +123,26 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
         keep[of_b] = False
         difference, C = seen.xy[of_b] - seen.xy[of_a], seen.covariance[of_a] + seen.covariance[of_b]
         offset = np.zeros(2)
+        distance = Quantity(float(np.median(np.linalg.norm(difference, axis=1))), "px")
+        said = partial(
+            remark,
+            "sources_contradict",
+            sources=[sources[b].name, sources[a].name],
+            distance=distance,
+            common=len(of_a),
+        )
         if len(of_a) >= FEWEST_COMMON:  # of fewer the stated sigmas decide
             offset = np.median(difference, axis=0)
             scale = max(1.0, float(np.median(_squares(difference - offset, C)) / chi2_ppf(0.5, 2)))
             if scale > MAX_FACTOR**2:  # beyond any that a wrong standard deviation explains
-                distance = float(np.median(np.linalg.norm(difference, axis=1)))
-                remarks.append(
-                    remark(
-                        "sources_contradict",
-                        sources=[sources[b].name, sources[a].name],
-                        distance=Quantity(distance, "px"),
-                        common=len(of_a),
-                    )
-                )
+                remarks.append(said())
                 continue
             C = C * scale
             # the variance of a median is pi / 2 of that of a mean; what is below one sigma does not matter
             together = _squares(offset[None], np.median(C, axis=0)[None])[0]
             if together > max(1.0, np.pi / 2 * chi2_isf(LEVEL, 2) / len(of_a)):
-                remarks.append(
-                    remark(
-                        "sources_offset",
-                        sources=[sources[b].name, sources[a].name],
-                        x=Quantity(float(offset[0]), "px"),
-                        y=Quantity(float(offset[1]), "px"),
-                        common=len(of_a),
-                    )
-                )
+                x, y = (Quantity(float(one), "px") for one in offset)
+                remarks.append(said(x=x, y=y))
         wrong = _squares(difference - offset, C) > chi2_isf(LEVEL / len(of_a), 2)
         keep[of_a[wrong]] = False
         contradicting += zip(seen.image[of_a[wrong]].tolist(), seen.point[of_a[wrong]].tolist(), strict=True)
