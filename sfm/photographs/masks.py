@@ -35,17 +35,34 @@ class Masks:
             SurveyFileError: the mask has another size than the photograph.
             PhotographError: the mask cannot be read.
         """
+        black = self.black(name, size_px)
+        if black is None:
+            return np.ones(len(xy), dtype=bool)
+        last = np.array(size_px) - 1
+        column, row = np.clip(np.rint(np.nan_to_num(xy)).astype(np.int64), 0, last).T
+        return np.asarray(~black[row, column])
+
+    def black(self, name: str, size_px: tuple[int, int]) -> BoolArray | None:
+        """Return which pixels of a photograph are masked, (H, W); None if it has no mask.
+
+        Args:
+            name: name of the photograph.
+            size_px: width and height of the photograph, px.
+
+        Raises:
+            SurveyFileError: the mask has another size than the photograph.
+            PhotographError: the mask cannot be read.
+        """
         path = None if self.folder is None else self.folder / f"{name}.png"
         if path is None or not path.is_file():
-            return np.ones(len(xy), dtype=bool)
+            return None
         mask = read_photograph(path)
         height, width = mask.shape[:2]
         if (width, height) != tuple(size_px):
             raise SurveyFileError(
                 f"{path}: the mask has {width} x {height} px, its photograph {size_px[0]} x {size_px[1]} px"
             )
-        column, row = np.clip(np.rint(np.nan_to_num(xy)).astype(np.int64), 0, [width - 1, height - 1]).T
-        return np.asarray(mask[row, column] > 0)
+        return np.asarray(mask == 0)
 
     def refuse_without(self, names: tuple[str, ...]) -> None:
         """Raise SurveyFileError if the folder has a mask of no photograph.

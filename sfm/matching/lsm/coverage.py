@@ -6,7 +6,7 @@ reported as too precise, and no residual would show it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -48,10 +48,24 @@ def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
 class CoveredPixels:
     """A record of the pixels that have been measured in each photograph, one bit each."""
 
-    def __init__(self, shapes: Sequence[tuple[int, ...]]) -> None:
-        """Start with nothing covered, for photographs of these shapes (height, width)."""
+    def __init__(self, shapes: Sequence[tuple[int, ...]], covered: Iterable[BoolArray | None] = ()) -> None:
+        """Start with nothing covered, or with what is covered, for photographs of shapes (height, width).
+
+        Args:
+            shapes: shapes of the photographs.
+            covered: pixels of each photograph, (H, W); None where nothing is covered.
+        """
         self.shapes = [shape[:2] for shape in shapes]
         self._bits = [np.zeros((height, -(-width // 8)), np.uint8) for height, width in self.shapes]
+        for bits, pixels in zip(self._bits, covered, strict=False):
+            if pixels is not None:
+                bits[:] = np.packbits(pixels, axis=1)
+
+    def copy(self) -> CoveredPixels:
+        """Return another record that begins with the same pixels."""
+        other = CoveredPixels(self.shapes)
+        other._bits = [bits.copy() for bits in self._bits]
+        return other
 
     def pixels(self, image: int) -> AnyArray:
         """Return a photograph with 1 where it is covered, uint8, (H, W)."""

@@ -93,6 +93,7 @@ def find_covering_points(
     windows: Windows,
     side_px: int,
     references: Sequence[int] | None = None,
+    hidden: CoveredPixels | None = None,
     threads: int = 1,
 ) -> CoveringPoints:
     """Measure points in all photographs that see them, until the texture of the photographs is covered.
@@ -105,6 +106,7 @@ def find_covering_points(
         windows: side and model of the windows.
         side_px: side of the squares around the windows, px; no two squares share pixels.
         references: photographs to take points from; by default all, those with the most tie points first.
+        hidden: masked pixels, which show nothing of the surface.
         threads: number of photographs processed in parallel.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
@@ -113,7 +115,8 @@ def find_covering_points(
     margin = windows.side_px // 2 + BORDER_PX
     tie_rows = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
-    covered = CoveredPixels([estimate.cameras[lens].size_px[::-1] for lens in camera])
+    shapes = [estimate.cameras[lens].size_px[::-1] for lens in camera]
+    covered = CoveredPixels(shapes) if hidden is None else hidden.copy()
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_no_points()]
 
@@ -123,7 +126,7 @@ def find_covering_points(
         points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
         squares = _Squares(i, xy, normal, points).select(known)
-        visible, free = _visible(estimate, camera, squares, covered, margin, side_px)
+        visible, free = _visible(estimate, camera, squares, hidden, covered, margin, side_px)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
@@ -152,6 +155,7 @@ def _visible(
     estimate: Estimate,
     camera: IntArray,
     squares: _Squares,
+    hidden: CoveredPixels | None,
     covered: CoveredPixels,
     margin: int,
     side_px: int,
@@ -170,6 +174,8 @@ def _visible(
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
         rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
+        if hidden is not None:
+            rows = rows[hidden.is_free(j, at[rows], side_px)]
         visible[j, rows] = True
         free[j, rows] = covered.is_free(j, at[rows], side_px)
     visible[squares.image] = free[squares.image] = True

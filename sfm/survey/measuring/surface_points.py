@@ -18,7 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import Windows, first_alike, project_points
+from sfm.matching.lsm.coverage import CoveredPixels, Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import Estimate, ImagePoints, Network, rows_of, without_given
 from sfm.orientation.incremental.sequence import Orientation
@@ -95,7 +95,9 @@ def cover_photographs(
     paths = [path_of[name] for name in network.images]
     photographs = PhotographFiles(paths)
     surface = seen.select(fits)
-    windows = _best_windows(photographs, network, estimate, surface, settings, jobs)
+    masks = Masks(survey.masks)
+    hidden = _hidden(masks, network, estimate)
+    windows = _best_windows(photographs, network, estimate, surface, settings, jobs, hidden)
     found = find_covering_points(
         photographs,
         estimate,
@@ -103,9 +105,10 @@ def cover_photographs(
         surface,
         windows=windows,
         side_px=_side(estimate, windows.side_px, settings.max_points),
+        hidden=hidden,
         threads=jobs,
     )
-    found = without_far_points(_visible(Masks(survey.masks), found, network, estimate), estimate)
+    found = without_far_points(_visible(masks, found, network, estimate), estimate)
     if len(found.image_points) < fits.sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
@@ -197,6 +200,15 @@ def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & enough[seen.point])
 
 
+def _hidden(masks: Masks, network: Network, estimate: Estimate) -> CoveredPixels | None:
+    """Return the masked pixels of the photographs; None if there are no masks."""
+    if masks.folder is None:
+        return None
+    sizes = [estimate.cameras[lens].size_px for lens in network.camera]
+    black = (masks.black(name, size) for name, size in zip(network.images, sizes, strict=True))
+    return CoveredPixels([size[::-1] for size in sizes], black)
+
+
 def _visible(masks: Masks, found: CoveringPoints, network: Network, estimate: Estimate) -> CoveringPoints:
     """Return the covering points that two photographs show where these are not masked."""
     seen = found.image_points
@@ -249,6 +261,7 @@ def _best_windows(
     surface: ImagePoints,
     settings: TiePointSettings,
     jobs: int,
+    hidden: CoveredPixels | None = None,
 ) -> Windows:
     """Return the windows of TRIED_WINDOWS whose rays together have the smallest standard deviation."""
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
@@ -265,6 +278,7 @@ def _best_windows(
             windows=windows,
             side_px=trial_side,
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),
+            hidden=hidden,
             threads=jobs,
         )
         if len(trial.residuals) >= TRIAL_RAYS:
