@@ -178,6 +178,11 @@ class Network:
         return any(source.has_common_errors for source in self.sources)
 
     @property
+    def handed_over(self) -> BoolArray:
+        """Which image points were handed over with their standard deviations, (k,)."""
+        return np.array([source.is_exact for source in self.sources])[self.source]
+
+    @property
     def automatic_points(self) -> frozenset[str]:
         """Names of the points that may have other names in later runs."""
         return frozenset(name for name, named in zip(self.points, self.named, strict=True) if not named)

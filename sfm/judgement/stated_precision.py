@@ -18,7 +18,7 @@ import numpy as np
 
 from sfm.adjustment.quality.consistency import MIN_UNEVEN_RATIO
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
+from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import LEVEL, chi2_isf, normal_ppf, share_of
 from sfm.remarks.remark import Remark, remark
 
@@ -28,21 +28,29 @@ DENSITY = np.exp(-MEDIAN / 2) / np.sqrt(2 * np.pi * MEDIAN)  # f, of chi-square 
 SPREAD = 1 / (4 * DENSITY * MEDIAN)  # standard deviation of ln of a scale by the median of n, times sqrt(n)
 
 
-def stated_precision_remarks(a: Adjustment) -> tuple[Remark, ...]:
+def stated_precision_remarks(a: Adjustment, among: BoolArray | None = None) -> tuple[Remark, ...]:
     """Return the remark on image points whose stated standard deviations are too small beside the others.
 
     Args:
         a: finished adjustment.
+        among: image points that are compared with one another, (k,); all if None.
     """
     seen = a.network.image_points
     if not len(a.standardised) or a.is_exact:
         return ()
     stated = np.linalg.det(seen.covariance) ** 0.25
-    _, of, count = np.unique(np.round(np.log(stated) / STEP), return_inverse=True, return_counts=True)
+    compared = np.ones(len(seen), dtype=bool) if among is None else among
+    if not compared.any():
+        return ()
+    _, numbers, count = np.unique(
+        np.round(np.log(stated[compared]) / STEP), return_inverse=True, return_counts=True
+    )
+    of = np.full(len(seen), -1)
+    of[compared] = numbers
     level = share_of(LEVEL, a.false_alarm)
     worst, factor = -1, MIN_UNEVEN_RATIO
     for k in np.flatnonzero(count > 1).tolist() if len(count) > 1 else []:
-        (here, n), (others, m) = _scale(a.standardised[of == k]), _scale(a.standardised[of != k])
+        (here, n), (others, m) = _scale(a.standardised[of == k]), _scale(a.standardised[compared & (of != k)])
         limit = -normal_ppf(level / len(count)) * SPREAD * np.sqrt(1 / max(n, 1) + 1 / max(m, 1))
         if here > factor * others > 0 and np.log(here / others) > limit:
             worst, factor = k, here / others
