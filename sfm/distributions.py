@@ -8,6 +8,7 @@ Source: Abramowitz, Stegun (1964), Handbook of Mathematical Functions, 26.4, 26.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,14 +25,40 @@ MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an
 MIN_LEAD = np.log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 
 
-def share_of(level: float, false_alarm: float) -> float:
-    """Return the level of a test for a user's probability that a right result is called wrong.
+@dataclass(frozen=True)
+class Levels:
+    """Levels of the tests of a survey or an adjustment, `levels` of its settings and of `Adjustment`.
+
+    All have the same share of the probability that the user states.
+    """
+
+    false_alarm: float = FALSE_ALARM  # that a right result is called wrong; tests of one kind share it
+
+    @property
+    def question(self) -> float:
+        """Level of one question: LEVEL, for FALSE_ALARM."""
+        return LEVEL * (self.false_alarm / FALSE_ALARM)
+
+    @property
+    def family(self) -> float:
+        """Level of a question about the whole survey: FAMILY, for FALSE_ALARM."""
+        return FAMILY * (self.false_alarm / FALSE_ALARM)
+
+    def of_each(self, tests: int) -> float:
+        """Level of each of several tests that share the false alarm, see `level_of_single`."""
+        return level_of_single(self.false_alarm, tests)
+
+
+def level_of_single(family: float, tests: int) -> float:
+    """Return the level of each single test for a given probability that any of several tests rejects wrongly.
 
     Args:
-        level: level of the test for FALSE_ALARM; the other one has the same share.
-        false_alarm: the probability that the user states.
+        family: probability of a wrong rejection in all tests together.
+        tests: number of tests.
+
+    Source: Sidak (1967), J. Am. Stat. Assoc. 62.
     """
-    return level * (false_alarm / FALSE_ALARM)
+    return float(1 - (1 - family) ** (1 / max(tests, 1)))
 
 
 def chi2_sf(x: Any, r: Any) -> Any:

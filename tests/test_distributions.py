@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from sfm import distributions
-from sfm.judgement.given.values import NONCENTRALITY
+from sfm.adjustment.quality.statistics import non_centrality
 from tests.places import ROOT
 
 LEVELS = (
@@ -56,8 +56,9 @@ def test_f_is_exceeded_with_the_probability_asked_for() -> None:
 def test_an_error_that_is_called_detectable_is_found_with_the_stated_power() -> None:
     """Baarda (1968): 4.13 standard deviations at 0.1 % with 80 %."""
     critical = -distributions.normal_ppf(distributions.LEVEL / 2)
-    assert pytest.approx(4.13, abs=0.005) == NONCENTRALITY
-    found = distributions.normal_sf(critical - NONCENTRALITY)
+    delta0 = non_centrality()
+    assert delta0 == pytest.approx(4.13, abs=0.005)
+    found = distributions.normal_sf(critical - delta0)
     assert found == pytest.approx(distributions.POWER, abs=1e-6)
 
 
@@ -76,3 +77,36 @@ def test_levels_have_one_home() -> None:
         if (named := re.match(LEVELS, line))
     ]
     assert found == theirs
+
+
+def test_the_tests_of_a_survey_have_its_levels() -> None:
+    """`Levels` of the adjustment or of the survey file; others have no survey, or are asked before it."""
+    without = {
+        "targets/fits/": "targets are measured",
+        "survey/sources/repeated.py": "tables of image points are read",
+        "survey/drafting/": "there is no survey file yet",
+        "survey/diagnosis/photograph_cameras.py": "a number of trials",
+        "planning/": "a plan",
+        "report/planning.py": "a plan",
+        "comparison/": "two results",
+        "epochs/": "several results",
+        "geometry/": "a shape",
+    }
+    users = set()
+    for path in sorted((ROOT / "sfm").rglob("*.py")):
+        name = path.relative_to(ROOT / "sfm").as_posix()
+        code = re.sub(r"#.*", "", path.read_text(encoding="utf-8"))
+        code = re.sub(
+            r'""".*?"""|^(?:from|import) [^(\n]*\n|^from [^\n]*\([^)]*\)\n', "", code, flags=re.S | re.M
+        )
+        if re.search(r"(?<!: float = )\b(?:LEVEL|FAMILY|FALSE_ALARM)\b", code):
+            users.add(next((prefix for prefix in without if name.startswith(prefix)), name))
+    assert users - {"distributions.py", "survey/inputs/settings.py"} == set(without)
+
+
+def test_all_levels_have_the_share_of_the_user() -> None:
+    usual, strict = distributions.Levels(), distributions.Levels(distributions.FALSE_ALARM / 10)
+    assert (usual.question, usual.family) == (distributions.LEVEL, distributions.FAMILY)
+    assert strict.question == pytest.approx(usual.question / 10)
+    assert strict.family == pytest.approx(usual.family / 10)
+    assert strict.of_each(1000) == pytest.approx(usual.of_each(1000) / 10, rel=0.03)

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
-from sfm.distributions import FALSE_ALARM, LEVEL
+from sfm.distributions import FALSE_ALARM, LEVEL, Levels
 from sfm.network import Estimate, Network, values_of
 from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
@@ -183,6 +183,11 @@ class Adjustment:
             sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
             judged=self._judged,
         )
+
+    @property
+    def levels(self) -> Levels:
+        """Levels of all tests of the adjustment."""
+        return Levels(self.false_alarm)
 
     @property
     def group_parameters(self) -> tuple[GroupParameters, ...]:

@@ -40,19 +40,18 @@ from sfm.adjustment.quality.gross_errors.robust import (
     tukey_slopes,
 )
 from sfm.adjustment.quality.rank import rank_defect, undetermined_of
+from sfm.adjustment.quality.statistics import redundancy_numbers as numbers_of
 from sfm.adjustment.quality.statistics import (
-    level_of_single,
     residual_weights,
     residuals_of_observed,
     standardised_residuals,
 )
-from sfm.adjustment.quality.statistics import redundancy_numbers as numbers_of
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
-from sfm.distributions import FALSE_ALARM, LEVEL, normal_sf
+from sfm.distributions import FALSE_ALARM, level_of_single, normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
@@ -76,8 +75,8 @@ def adjust(
     sigma_px: float = 0.1,
     image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
-    alpha: float = LEVEL,
-    false_alarm: float | None = None,
+    alpha: float | None = None,
+    false_alarm: float = FALSE_ALARM,
     rejected: BoolArray | None = None,
     method: str = "levenberg-marquardt",
     max_iterations: int = 50,
@@ -101,9 +100,10 @@ def adjust(
             The network of the result keeps the stated ones.
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight starts
             from Huber's result and rejects image points with weight 0) or "none".
-        alpha: probability that the test of one image coordinate rejects a good one.
-        false_alarm: probability that right image points are called wrong. It is divided among the tests of
-            their coordinates, in place of `alpha`, and is the level of the verdict; 0.05 if not given.
+        alpha: probability that the test of one image coordinate rejects a good one; if not given, such that
+            all of them together reject any with the probability `false_alarm`.
+        false_alarm: probability that a right result is called wrong; the level of every test of the result
+            follows from it.
         rejected: image points that data snooping leaves out at the start, such as those rejected before,
             (k,). They return if they pass the test. The other options of `reject` start with all image
             points.
@@ -127,10 +127,10 @@ def adjust(
     datum = Datum(datum) if isinstance(datum, str) else datum
     check_network(network, estimate)
     check_number("sigma_px", sigma_px, 0.0)
-    check_number("alpha", alpha, 0.0, 1.0)
-    if false_alarm is not None:
-        check_number("false_alarm", false_alarm, 0.0, 1.0)
+    check_number("false_alarm", false_alarm, 0.0, 1.0)
+    if alpha is None:
         alpha = level_of_single(false_alarm, 2 * len(network.image_points))
+    check_number("alpha", alpha, 0.0, 1.0)
     if reject not in REJECTS:
         raise GeometryError(f"adjustment: reject '{reject}', expected one of {', '.join(REJECTS)}")
     if method not in METHODS:
@@ -163,7 +163,7 @@ def adjust(
                 result,
                 image_sigma_factor=factor,
                 test_alpha=_level_of(reject, alpha, result.test_alpha),
-                false_alarm=FALSE_ALARM if false_alarm is None else false_alarm,
+                false_alarm=false_alarm,
             )
         )
 

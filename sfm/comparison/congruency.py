@@ -35,6 +35,7 @@ from sfm.comparison.stable_points import (
 )
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.similarity import extended_axes, mean_distance, similarity_motions
 
@@ -80,7 +81,7 @@ def congruency(
     motion: str = "rigid",
     redundancy: int | None = None,
     reference: BoolArray | None = None,
-    alpha: float = 0.05,
+    alpha: float = FALSE_ALARM,
 ) -> Congruency:
     """Test whether points have moved, and find these points.
 

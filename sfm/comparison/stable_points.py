@@ -24,7 +24,7 @@ from scipy.linalg.lapack import dpotri
 from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
-from sfm.distributions import chi2_isf, f_isf
+from sfm.distributions import FALSE_ALARM, chi2_isf, f_isf
 from sfm.errors import GeometryError
 
 ROBUST_ROUNDS = 100  # of weighting, which converges long before
@@ -97,7 +97,7 @@ def find_stable_points(
     least: int,
     start: BoolArray | None = None,
     redundancy: int | None = None,
-    alpha: float = 0.05,
+    alpha: float = FALSE_ALARM,
     alpha_single: float | None = None,
 ) -> StablePoints:
     """Remove points until the rest passes the global test of congruency.

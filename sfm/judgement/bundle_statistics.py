@@ -111,7 +111,7 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
         for s, name in enumerate(camera.names)
     }
     return Statistics(
-        global_tests=component_tests(kinds, reweighted=adjustment.reweighted)
+        global_tests=component_tests(kinds, alpha=adjustment.false_alarm, reweighted=adjustment.reweighted)
         if len(kinds.names) > 1
         else (global_test(adjustment),),
         w=w,

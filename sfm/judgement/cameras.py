@@ -11,7 +11,6 @@ from sfm.adjustment.quality.consistency import Consistency, larger_than_the_othe
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.distributions import FAMILY, share_of
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
 from sfm.remarks.kind import EXPECTED_SIGMAS
 from sfm.remarks.remark import Quantity, Remark, remark, unless_note
@@ -154,7 +153,7 @@ def sharpness_remarks(
     a = result.adjustment
     m, n = len(a.network.images), len(a.network.points)
     unseen = n - np.bincount(a.network.image_points.image[~a.rejected], minlength=m)
-    level = share_of(FAMILY, a.false_alarm)
+    level = a.levels.family
     few = np.flatnonzero(more_than_chance(unseen, np.full(m, n), level))
     suspected = {one.image for one in result.failed} | {a.network.images[i] for i in few}
     if consistency.uneven is not None:

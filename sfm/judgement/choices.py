@@ -21,7 +21,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from sfm.distributions import FALSE_ALARM, FAMILY, share_of
+from sfm.distributions import FALSE_ALARM, Levels
 from sfm.errors import GeometryError
 from sfm.likelihood import price_of
 
@@ -77,7 +77,7 @@ def choose(
     """
     for choice in choices:
         models, best, most = list(choice.models(present)), None, 0.0
-        search = float(np.log(max(len(models), 1) * choice.behind / share_of(FAMILY, false_alarm)))
+        search = float(np.log(max(len(models), 1) * choice.behind / Levels(false_alarm).family))
         for model in models:
             try:
                 solution = solve(model)

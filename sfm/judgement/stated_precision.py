@@ -19,7 +19,7 @@ import numpy as np
 from sfm.adjustment.quality.consistency import MIN_UNEVEN_RATIO
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import LEVEL, chi2_isf, normal_ppf, share_of
+from sfm.distributions import chi2_isf, normal_ppf
 from sfm.remarks.remark import Remark, remark
 
 STEP = 0.01  # relative difference below which two stated standard deviations are equal
@@ -47,7 +47,7 @@ def stated_precision_remarks(a: Adjustment, among: BoolArray | None = None) -> t
     )
     of = np.full(len(seen), -1)
     of[compared] = numbers
-    level = share_of(LEVEL, a.false_alarm)
+    level = a.levels.question
     worst, factor = -1, MIN_UNEVEN_RATIO
     for k in np.flatnonzero(count > 1).tolist() if len(count) > 1 else []:
         (here, n), (others, m) = _scale(a.standardised[of == k]), _scale(a.standardised[compared & (of != k)])

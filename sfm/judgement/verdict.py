@@ -28,7 +28,7 @@ from sfm.adjustment.quality.variance_components import (
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import METRES, BoolArray
 from sfm.display import counted, program_name
-from sfm.distributions import FAMILY, LEVEL, binomial_sf, normal_ppf, share_of
+from sfm.distributions import binomial_sf, normal_ppf
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
 from sfm.judgement.cameras import camera_remarks, edges_of, sharpness_remarks
@@ -274,7 +274,7 @@ def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
 
 def gross_error_remarks(a: Adjustment, *, rejects: bool) -> tuple[Remark, ...]:
     """Return the test of the accepted image coordinates; as a remark if nothing was rejected."""
-    found = robust_test(a, alpha=share_of(LEVEL, a.false_alarm))
+    found = robust_test(a)
     numbers = {
         "beyond": found.beyond,
         "tested": found.tested,
@@ -295,7 +295,7 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
     took_part = _took_part(a)
     lost = np.bincount(point[rejected & took_part], minlength=n)
     rays = np.bincount(point[took_part], minlength=n)
-    most = np.flatnonzero(more_than_chance(lost, rays, share_of(FAMILY, a.false_alarm)))
+    most = np.flatnonzero(more_than_chance(lost, rays, a.levels.family))
     by_rays = np.ones(n, dtype=bool)
     if a.datum == "control":
         by_rays[network.control.complete.point] = False
@@ -392,7 +392,7 @@ def given_remarks(
         statistics: statistics of the adjustment.
         checks: coordinates that took no part.
     """
-    level = share_of(LEVEL, result.adjustment.false_alarm)
+    level = result.adjustment.levels.question
     return (
         *_differing(given, level),
         *_kinds(statistics, {test.what for test in result.given_tests}, level),

@@ -15,7 +15,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.conventions import SUPERSCRIPTS, FloatArray
 from sfm.conventions import finer_unit as finer_unit
 from sfm.display import NO_BREAK, counted, listed
-from sfm.distributions import FALSE_ALARM, normal_ppf
+from sfm.distributions import normal_ppf
 from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
 from sfm.judgement.checks import Precision, Sigma0
 from sfm.remarks.kind import probability as probability
@@ -48,6 +48,11 @@ def describe_neighbours(a: Adjustment) -> str:
     )
 
 
+def percent(probability: float) -> str:
+    """Return a probability in percent, exact to the last digit that is not 0."""
+    return f"{100 * probability:.6g} %"
+
+
 def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str:
     """Return the outcome of a global test, and what would fit if the stated values are too cautious.
 
@@ -63,7 +68,7 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         said = f"better than stated, {_fitting_sigmas(test, adjustment)} would fit"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
-        f"{test.upper:.2f} ({100 * (1 - FALSE_ALARM):.0f} %)"
+        f"{test.upper:.2f} ({percent(1 - test.alpha)})"
     )
 
 

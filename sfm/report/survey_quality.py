@@ -41,6 +41,7 @@ from sfm.report.phrases import (
     fixed,
     general,
     or_unlimited,
+    percent,
     probability,
     raised,
     significant,
@@ -217,7 +218,7 @@ def _reliability(f: Findings) -> Iterator[Part]:
         ),
         [
             (
-                f"{name}, {100 * one.alpha:.1f} %",
+                f"{name}, {percent(one.alpha)}",
                 *(one.tested, one.critical, one.beyond, one.expected, largest),
             )
             for name, one, largest in tests
@@ -352,11 +353,12 @@ def _correlations(f: Findings) -> Iterator[Part]:
         f"{one.parameter} of {one.camera} ({fixed(one.t, 1)}, p {fixed(one.probability, 2)})"
         for one in s.not_significant
     )
+    level = percent(f.result.adjustment.false_alarm)
     yield Paragraph(
-        "Not significantly different from 0 (t test, 5 %; in brackets the value over its standard "
+        f"Not significantly different from 0 (t test, {level}; in brackets the value over its standard "
         f"deviation): {tests}. Holding any one of them at 0 would worsen the fit by no more than chance."
         if tests
-        else "All adjusted parameters differ significantly from 0 (t test, 5 %)."
+        else f"All adjusted parameters differ significantly from 0 (t test, {level})."
     )
 
 

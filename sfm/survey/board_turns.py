@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, f_isf, share_of
+from sfm.distributions import f_isf
 from sfm.network import Estimate, rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
@@ -89,7 +89,7 @@ def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -
     ):
         return AgreedTurns(None, None)
     codes = [target.code for target in photographs.targets]
-    level = share_of(LEVEL, survey.adjust.false_alarm)
+    level = survey.adjust.levels.question
     unsure = np.zeros(len(measured.network.images), dtype=bool)
     for camera in cameras[1:].tolist():
         tried = [

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.conventions import IntArray
-from sfm.distributions import LEVEL, f_isf, share_of
+from sfm.distributions import f_isf
 from sfm.network import Estimate
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
@@ -43,7 +43,7 @@ def agree_on_clocks(
     now, count = rotation_spread(measured.network.camera, measured.network.moment, estimate)
     then, of_other = rotation_spread(network.camera, network.moment, estimate)
     dof = 3 * (min(count, of_other) - 1)
-    level = share_of(LEVEL, survey.adjust.false_alarm)
+    level = survey.adjust.levels.question
     if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(level, dof, dof):
         return None
     said = tuple(

@@ -75,6 +75,7 @@ def choose_free_parameters(
     silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
+    alarm = survey.adjust.false_alarm
     names: Chosen = [
         _candidates(survey, one) if a in silent else None for a, one in enumerate(survey.cameras)
     ]
@@ -91,7 +92,7 @@ def choose_free_parameters(
         part, start = reduce_network(network, estimate, images, points, everything)
         alone = None
         if images.sum() >= MIN_DETERMINING_C:  # control may be wrong, and hide what the image points demand
-            alone = _determined_parameters(without_given(part), start, names, "free", extend=extend)
+            alone = _determined_parameters(without_given(part), start, names, "free", alarm, extend=extend)
         elif datum != "control":
             seen = set(silent) & set(part.camera.tolist())
             settings = tuple(
@@ -100,9 +101,9 @@ def choose_free_parameters(
             )
             of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
             part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
-            alone = _determined_parameters(part, start, names, "free", extend=extend)
+            alone = _determined_parameters(part, start, names, "free", alarm, extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
-            with_control = _determined_parameters(part, start, names, datum, extend=extend)
+            with_control = _determined_parameters(part, start, names, datum, alarm, extend=extend)
             if alone is None or _has_each_c(start, names, with_control):
                 alone = with_control
         names = [
@@ -153,10 +154,10 @@ def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
 
 
 def _determined_parameters(
-    part: Network, start: Estimate, names: Chosen, datum: str, *, extend: bool
+    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float, *, extend: bool
 ) -> Chosen:
     """Return the candidates that a network determines, and other parameters that its image points demand."""
-    names, adjusted = _hold_undetermined(part, start, names, datum)
+    names, adjusted = _hold_undetermined(part, start, names, datum, false_alarm)
     index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
         demanded = () if adjusted is None else contradicted_parameters(adjusted)
@@ -166,7 +167,7 @@ def _determined_parameters(
                 wider[index[camera]] = (wider[index[camera]] or set()) | {parameter}
         if adjusted is None or wider == names:
             break
-        tried, adjusted = _hold_undetermined(part, adjusted.estimate, wider, datum)
+        tried, adjusted = _hold_undetermined(part, adjusted.estimate, wider, datum, false_alarm)
         if adjusted is None or tried == names:
             break
         names = tried
@@ -174,7 +175,7 @@ def _determined_parameters(
 
 
 def _hold_undetermined(
-    part: Network, start: Estimate, names: Chosen, datum: str
+    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float
 ) -> tuple[Chosen, Adjustment | None]:
     """Hold the worst parameters one by one until all others are determined; also the last adjustment.
 
@@ -182,7 +183,7 @@ def _hold_undetermined(
     """
     observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
     while any(names):
-        adjusted = _adjust_or_none(part, _with_free(start, names), datum)
+        adjusted = _adjust_or_none(part, _with_free(start, names), datum, false_alarm)
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
@@ -199,10 +200,10 @@ def _hold_undetermined(
     return names, None
 
 
-def _adjust_or_none(part: Network, start: Estimate, datum: str) -> Adjustment | None:
+def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: float) -> Adjustment | None:
     """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
-        found = adjust(part, start, datum=Datum(datum), reject="tau", redundancy_numbers=False)
+        found = adjust(part, start, datum=Datum(datum), false_alarm=false_alarm, redundancy_numbers=False)
     except (GeometryError, np.linalg.LinAlgError):
         return None
     allowed = found.expected_defect + _defect_of_points(part, found)

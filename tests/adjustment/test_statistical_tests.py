@@ -26,6 +26,7 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
+from sfm.distributions import Levels, level_of_single
 from tests.synthetic import make_network, seed_of
 
 
@@ -57,7 +58,7 @@ def test_groups_with_more_events_than_chance_makes() -> None:
 def test_the_robust_test_needs_no_stated_standard_deviation(stated: float) -> None:
     w = np.random.default_rng(5).standard_normal((2000, 2))
     w[:100] += 50.0
-    a = stub(standardised=stated * w, redundancy_numbers=np.ones((2000, 2)), is_exact=False)
+    a = stub(standardised=stated * w, redundancy_numbers=np.ones((2000, 2)), is_exact=False, levels=Levels())
     found = robust_test(a)
     assert found.tested == 4000 and 200 <= found.beyond <= 210  # 3.8 by chance
     a.is_exact = True  # residuals are rounding
@@ -65,12 +66,15 @@ def test_the_robust_test_needs_no_stated_standard_deviation(stated: float) -> No
 
 
 def test_the_global_test_is_by_chi_square() -> None:
-    found = global_test(stub(sigma0=1.1, redundancy=50, reweighted=False))
+    found = global_test(stub(sigma0=1.1, redundancy=50, false_alarm=0.05, reweighted=False))
     assert found.statistic == pytest.approx(60.5) and found.passed
     assert (found.lower, found.upper) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], 50)))
     for sigma0, passed in ((0.80, False), (0.81, True), (1.19, True), (1.20, False)):
-        assert global_test(stub(sigma0=sigma0, redundancy=50, reweighted=False)).passed == passed
-    assert global_test(stub(sigma0=1.1, redundancy=50, reweighted=True)).passed is None
+        assert (
+            global_test(stub(sigma0=sigma0, redundancy=50, false_alarm=0.05, reweighted=False)).passed
+            == passed
+        )
+    assert global_test(stub(sigma0=1.1, redundancy=50, false_alarm=0.05, reweighted=True)).passed is None
     components = stub(
         names=(IMAGE_POINTS, "scale bars"), sigma0=np.array([1.1, 2.0]), redundancy=np.array([50.0, 3.0])
     )
@@ -83,7 +87,7 @@ def test_the_global_test_is_by_chi_square() -> None:
 def test_coordinates_are_tested_that_have_a_check() -> None:
     r = np.array([[0.5, 2e-6], [0.7e-6, np.nan], [1.5e-6, 0.3]])
     w = np.array([[3.4, -3.3], [9.0, 9.0], [3.2, -3.1]])
-    found = unwrap(w_test)(stub(redundancy_numbers=r, standardised=w))
+    found = unwrap(w_test)(stub(redundancy_numbers=r, standardised=w, levels=Levels()))
     assert (found.tested, found.beyond) == (4, 2)
     assert found.critical == pytest.approx(stats.norm.ppf(1 - 0.0005))
     np.testing.assert_array_equal(found.statistic, [[3.4, -3.3], [9.0, np.nan], [3.2, -3.1]])
@@ -123,7 +127,7 @@ def test_significance_is_students_t_against_none() -> None:
     camera = truth.cameras[0]
     Q = np.diag([1e-6, (0.03 / 2.3) ** 2, (8e-4 / 1.9) ** 2, (2e-4 / 2.0) ** 2, 0.0])
     a = stub(
-        estimate=stub(cameras=(camera,)), covariance=stub(interior=(Q,)), redundancy=20,
+        estimate=stub(cameras=(camera,)), covariance=stub(interior=(Q,)), redundancy=20, false_alarm=0.05,
     )  # fmt: skip
     found = {one.parameter: one for one in significance(a)}
     assert set(found) == {"x0", "K1", "b1"}  # c has none, b2 is not determined
@@ -135,7 +139,10 @@ def test_significance_is_students_t_against_none() -> None:
     assert [found[name].significant for name in ("x0", "K1", "b1")] == [True, False, False]
     # a camera that took no part has no covariance
     none = stub(
-        estimate=stub(cameras=(camera,)), covariance=stub(interior=(np.zeros((0, 0)),)), redundancy=20
+        estimate=stub(cameras=(camera,)),
+        covariance=stub(interior=(np.zeros((0, 0)),)),
+        redundancy=20,
+        false_alarm=0.05,
     )
     assert significance(none) == ()
 
@@ -195,8 +202,8 @@ def test_given_unknowns_are_standardised_by_hand() -> None:
 
 def test_the_level_of_single_tests_is_that_of_all() -> None:
     """Pope (1976) and Sidak (1967): 5 % that any of them rejects what is good."""
-    assert numbers.level_of_single(0.05, 1) == pytest.approx(0.05)
-    assert numbers.level_of_single(0.05, 1000) == pytest.approx(5.129e-5, rel=1e-4)
+    assert level_of_single(0.05, 1) == pytest.approx(0.05)
+    assert level_of_single(0.05, 1000) == pytest.approx(5.129e-5, rel=1e-4)
 
 
 def test_tau_by_students_t() -> None:

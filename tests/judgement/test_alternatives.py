@@ -509,7 +509,8 @@ def test_cells_divide_the_format() -> None:
 def test_the_level_is_shared_by_rows_and_lowered_by_the_search() -> None:
     one = made(Gain(20.0, 2, np.zeros(2)))
     rows = 0.01 / np.exp(one.log_p + one.search)
-    assert is_significant(one, int(0.9 * rows)) and not is_significant(one, int(1.1 * rows) + 1)
+    assert is_significant(one, int(0.9 * rows), 0.01)
+    assert not is_significant(one, int(1.1 * rows) + 1, 0.01)
 
 
 def test_photographs_that_differ_are_the_fewer_ones() -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm.adjustment.quality.statistics import non_centrality
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.distributions import LEVEL
 from sfm.judgement.given import points as given_points
@@ -88,7 +89,7 @@ def test_the_level_and_the_noncentrality_are_those_of_baarda() -> None:
 
     assert LEVEL == 0.001 and pytest.approx(2 * np.log(1 / LEVEL)) == given_values.MARGIN
     delta = normal_ppf(1 - LEVEL / 2) + normal_ppf(0.8)
-    assert pytest.approx(delta, abs=0.01) == given_values.NONCENTRALITY
+    assert pytest.approx(delta, abs=0.01) == non_centrality()
 
 
 def test_a_weak_value_does_not_check_a_strong_one() -> None:

@@ -219,6 +219,18 @@ def test_held_parameters_that_are_wrong_are_found_and_right_ones_are_not() -> No
     assert contradicted_parameters(solved(network, truth)) == ()
 
 
+def test_another_probability_of_a_false_alarm_needs_more_evidence() -> None:
+    """x0 that is off by 40 %, which has chance probabilities between these levels."""
+    network, truth = make_network(seed_of("somewhat wrong"), images=10, points=50, free=())
+    camera = truth.cameras[0]
+    p = camera.parameters.copy()
+    p[camera.names.index("x0")] *= 1.4
+    wrong = replace(truth, cameras=(camera.with_parameters(p),))
+    usual, strict = (adjust(network, wrong, false_alarm=level) for level in (0.05, 1e-12))
+    assert contradicted_parameters(usual)[0] == ("camera 1", "x0")
+    assert contradicted_parameters(strict) == ()
+
+
 def test_a_principal_point_that_a_rotation_and_decentring_nearly_take_up_is_found() -> None:
     """They leave less than 1e-5 of the squares of x0, which is free of rounding nevertheless."""
     one = planted("held x0", 7004)

@@ -44,7 +44,7 @@ def test_points_stated_too_precise_are_named(factor: float, severity: tuple[str,
         assert said.number("stated") == pytest.approx(0.1 / factor)
 
 
-@pytest.mark.parametrize(("factor", "points", "severity"), [(8.5, 12, "error"), (4.0, 16, "warning")])
+@pytest.mark.parametrize(("factor", "points", "severity"), [(12.0, 12, "error"), (4.0, 16, "warning")])
 def test_they_are_an_error_if_others_were_rejected_for_them(
     factor: float, points: int, severity: str
 ) -> None:

@@ -34,12 +34,12 @@ def adjusted(points: int = 30, images: int = 10, noise_px: float = 0.1) -> Adjus
 
 def test_the_gain_that_is_needed_is_that_of_the_test_and_of_the_price() -> None:
     # 1 parameter, 2 image points: ln 4 / 2 and ln 100 in ln likelihood; the test asks for more with many rows
-    assert needed_gain(1, 2, 0.0, 1) == pytest.approx(np.log(4) + 2 * np.log(100))
-    assert needed_gain(1, 2, 0.0, 10_000) == pytest.approx(stats.chi2.isf(1e-6, 1))
-    assert needed_gain(1, 2, np.log(100), 100) == pytest.approx(
+    assert needed_gain(1, 2, 0.0, 1, 0.01) == pytest.approx(np.log(4) + 2 * np.log(100))
+    assert needed_gain(1, 2, 0.0, 10_000, 0.01) == pytest.approx(stats.chi2.isf(1e-6, 1))
+    assert needed_gain(1, 2, np.log(100), 100, 0.01) == pytest.approx(
         max(stats.chi2.isf(1e-6, 1), np.log(4) + 4 * np.log(100))
     )
-    assert needed_gain(3, 500, 2.0, 30) == pytest.approx(3 * np.log(1000) + 4.0 + 2 * np.log(100))
+    assert needed_gain(3, 500, 2.0, 30, 0.01) == pytest.approx(3 * np.log(1000) + 4.0 + 2 * np.log(100))
 
 
 def shift_of(a: Adjustment, moved_px: FloatArray) -> tuple[float, float]:
@@ -66,11 +66,13 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
     D = interior_columns(a, [(0, s)])[0][:, :, 0]
     H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
-    needed = needed_gain(1, len(D), 0.0, count_alternatives(a))
+    needed = needed_gain(1, len(D), 0.0, count_alternatives(a), 0.01)
     least = next(x for x in np.linspace(needed, 2 * needed, 2000) if stats.ncx2.sf(needed, 1, x) > 0.8)
     shift, gained = shift_of(a, D * np.sqrt(least / H))
     assert gained == pytest.approx(least, rel=0.02)
     assert reach == pytest.approx(shift, rel=0.1)
+    strict = replace(a, false_alarm=a.false_alarm / 1e6)
+    assert reach_of(one, strict, reduced, columns, rows=count_alternatives(a)) > 1.2 * reach
 
 
 def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
@@ -83,7 +85,7 @@ def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
     reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
     D = reduced.whiten(one.columns(a, columns))
     H = reduced.project(D)[0]
-    needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, count_alternatives(a))
+    needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, count_alternatives(a), 0.01)
     least = next(x for x in np.linspace(needed / 2, 2 * needed, 3000) if stats.ncx2.sf(needed, 5, x) > 0.8)
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     rng, farthest = seed_of("directions"), 0.0

@@ -13,15 +13,27 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.quality.statistics import (
+    global_test,
+    robust_test,
+    significance,
+    tau_test,
+    w_test,
+)
 from sfm.adjustment.result import Adjustment
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError, KolinearError, SurveyFileError
 from sfm.judgement import verdict as verdicts
+from sfm.judgement.bundle_statistics import statistics_of
 from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import Verdict
+from sfm.report.phrases import describe_test
+from sfm.report.survey_report import text_report
 from sfm.result import FailedImage, SurveyResult
+from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
@@ -120,6 +132,36 @@ def test_another_probability_of_a_false_alarm_rejects_and_judges_otherwise(
     for wrong in (0.0, 1.0):
         with pytest.raises(GeometryError, match="false_alarm"):
             sfm.adjust(*made, false_alarm=wrong)
+
+
+def test_the_usual_probability_of_a_false_alarm_is_that_stated(made: tuple[Network, Estimate]) -> None:
+    """Left out it was 0.1 % of each coordinate, and 0.05 of all only where the user wrote 0.05."""
+    plain, stated = sfm.adjust(*made), sfm.adjust(*made, false_alarm=FALSE_ALARM)
+    assert plain.test_alpha == stated.test_alpha < 2e-4
+    assert sfm.adjust(*made, alpha=1e-3).test_alpha == 1e-3
+    judged = sfm.adjust(*made, alpha=1e-3, false_alarm=0.01)
+    assert (judged.test_alpha, judged.false_alarm) == (1e-3, 0.01)
+
+
+def test_every_test_of_an_adjustment_has_a_tenth_of_the_level(made: tuple[Network, Estimate]) -> None:
+    usual, strict = (sfm.adjust(*made, false_alarm=level) for level in (0.05, 0.005))
+    for test in (w_test, tau_test, robust_test, global_test):
+        assert test(strict).alpha == pytest.approx(test(usual).alpha / 10)
+    assert [one.alpha for one in statistics_of(strict).global_tests] == [0.005]
+    assert "(99.5 %)" in describe_test(global_test(strict))
+    assert "(95 %)" in describe_test(global_test(usual))
+    for a in (usual, strict):
+        assert all(one.significant == (one.probability < a.false_alarm) for one in significance(a))
+
+
+def test_the_report_of_a_survey_states_its_levels(tmp_path: Path) -> None:
+    network, truth = make_network(seed_of("words of levels"), images=6, points=30)
+    result = run_survey(survey_of(network, truth, adjust={"reject": "tau", "false_alarm": 0.005}))
+    words = " ".join(text_report(findings_of(result)).split())
+    assert "(99.5 %)" in words and "t test, 0.5 %" in words
+    assert "Baarda's w (sigma of the weights), 0.01 %" in words
+    assert "Pope's tau (sigma0 as found), 0.01 %" in words
+    assert not any(usual in words for usual in ("(95 %)", "t test, 5 %", "weights), 0.1 %"))
 
 
 def test_the_key_of_a_survey_is_the_level_of_its_adjustment() -> None:

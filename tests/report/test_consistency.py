@@ -44,10 +44,10 @@ def _components(largest: float, redundancy: float) -> VarianceComponents:
 
 
 def test_photographs_are_uneven_from_half_as_large_again() -> None:
-    assert consistency._uneven(_components(1.4, 1e4)) is None
-    found = consistency._uneven(_components(1.6, 1e4))
+    assert consistency._uneven(_components(1.4, 1e4), 0.01) is None
+    found = consistency._uneven(_components(1.6, 1e4), 0.01)
     assert found is not None and (found.worst, found.largest, found.median) == ("h", 1.6, 1.0)
-    every = [consistency._uneven(_components(1.6, r)) for r in np.arange(2, 100, 0.5)]
+    every = [consistency._uneven(_components(1.6, r), 0.01) for r in np.arange(2, 100, 0.5)]
     assert 0.008 < max(one.probability for one in every if one is not None) <= 0.01
 
 

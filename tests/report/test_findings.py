@@ -298,7 +298,7 @@ def photograph(name: str, blur: FloatArray | None, camera: str = "A") -> Photogr
 @pytest.mark.parametrize("count", [5, 8, 20, 60])
 def test_chance_calls_one_survey_in_a_hundred_blurred(count: int) -> None:
     rng = seed_of("sharp")
-    surveys = [larger_than_the_others(rng.normal(0, 0.1, count)).any() for _ in range(1500)]
+    surveys = [larger_than_the_others(rng.normal(0, 0.1, count), level=0.01).any() for _ in range(1500)]
     assert 0.003 < np.mean(surveys) < 0.025
 
 
@@ -306,12 +306,12 @@ def test_chance_calls_one_survey_in_a_hundred_blurred(count: int) -> None:
 def test_a_few_blurred_photographs_do_not_hide_one_another(blurred: int) -> None:
     values = np.log(0.8) + seed_of("blurred").normal(0, 0.05, 12)
     values[:blurred] += np.log(2)
-    assert np.flatnonzero(larger_than_the_others(values)).tolist() == list(range(blurred))
+    assert np.flatnonzero(larger_than_the_others(values, level=0.01)).tolist() == list(range(blurred))
 
 
 @pytest.mark.parametrize("values", [[], [1.0], [1.0, 9.0], [1.0, 1.0, 1.0, 1.0]])
 def test_too_few_or_equal_values_have_no_outlier(values: list[float]) -> None:
-    assert not larger_than_the_others(np.array(values)).any()
+    assert not larger_than_the_others(np.array(values), level=0.01).any()
 
 
 def test_blurred_photographs_are_named_where_that_explains_something() -> None:

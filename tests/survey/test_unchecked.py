@@ -9,6 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.distributions import LEVEL
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings, remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
@@ -125,7 +126,7 @@ def test_three_control_points_are_partly_checked() -> None:
     )
     for one, kind in ((three, "given_partly_checked"), (two, "given_unchecked")):
         model = one.points.model(Similarity(1.0, np.eye(3), np.zeros(3)), estimated=False)
-        (said,) = remarks_on_unchecked("control", ["1", "2", "3"], model)
+        (said,) = remarks_on_unchecked("control", ["1", "2", "3"], model, (), LEVEL)
         assert said.kind == kind and len(said.names("given")) == len(one.given)
 
 
@@ -133,9 +134,11 @@ def test_what_is_weakly_checked_is_one_remark() -> None:
     """Of two pairs the better values have redundancy numbers of 1 / 3 and 1 / 10."""
     A = np.array([[1.0, 0], [1, 0], [0, 1], [0, 1]])
     model = GivenModel(np.zeros(4), np.zeros((4, 4)), np.diag([1.0, 2, 1, 9]), A, np.arange(4), 500)
-    (said,) = remarks_on_unchecked("lengths", ["a", "b", "c", "control"], model)
+    (said,) = remarks_on_unchecked("lengths", ["a", "b", "c", "control"], model, (), LEVEL)
     assert said.kind == "given_weakly_checked" and said.names("given") == ("a", "c")
     assert said.number("sigmas") == pytest.approx(4.13 * 3, rel=0.01)
+    (strict,) = remarks_on_unchecked("lengths", ["a", "b", "c", "control"], model, (), LEVEL / 10)
+    assert strict.number("sigmas") == pytest.approx(said.number("sigmas") * 4.73 / 4.13, rel=0.01)
 
 
 def test_fixed_control_is_held_against_the_free_network() -> None:

@@ -23,12 +23,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment, computed_once
 from sfm.camera import pixel_jacobian, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FAMILY, LEVEL, chi2_isf, chi2_sf, f_sf, normal_ppf, share_of, t_ppf
+from sfm.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
 from sfm.network import Estimate, rows_of
 from sfm.remarks.kind import EXPECTED_SIGMAS
 
@@ -87,7 +86,7 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
     of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
     fixed = {name for name, covariance in of_point if not covariance.any()}
     doubtful = tuple(one for one in doubtful_points(adjustment, parts, rays) if one.point not in fixed)
-    level = share_of(FAMILY, adjustment.false_alarm)
+    level = adjustment.levels.family
     large, outlying, tested = _large(adjustment, parts, rays, level)
     uneven = _uneven(by_photograph(adjustment), level)
     return Consistency(large, uneven, outlying, tested, doubtful, *_change(adjustment, parts, level))
@@ -159,7 +158,7 @@ def _change(adjustment: Adjustment, parts: PointNormals, level: float) -> tuple[
     return len(ends), best
 
 
-def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> BoolArray:
+def larger_than_the_others(values: FloatArray, *, level: float) -> BoolArray:
     """Return which values exceed the others by more than chance explains, fewer than half of them, (n,).
 
     Args:
@@ -187,7 +186,7 @@ def larger_than_the_others(values: FloatArray, *, level: float = FAMILY) -> Bool
     return large
 
 
-def _uneven(photographs: VarianceComponents, level: float = FAMILY) -> Uneven | None:
+def _uneven(photographs: VarianceComponents, level: float) -> Uneven | None:
     """Test by Bartlett's test whether all photographs have the same variance component."""
     known = np.isfinite(photographs.sigma0) & (photographs.redundancy > 1)
     s2, r = photographs.sigma0[known] ** 2, photographs.redundancy[known]
@@ -228,7 +227,7 @@ def doubtful_points(
         rows_of: usable image points of each object point.
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
-    limit = float(chi2_isf(share_of(LEVEL, adjustment.false_alarm), 1))
+    limit = float(chi2_isf(adjustment.levels.question, 1))
     found = []
     for j in np.unique(seen.point[adjustment.rejected]).tolist():
         rows = rows_of[j]

@@ -27,7 +27,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import LEVEL, f_isf, share_of
+from sfm.distributions import f_isf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network
 from sfm.similarity import fit_similarity, reverse_depth
@@ -86,7 +86,7 @@ def other_solutions(
     base = search.adjusted(a.estimate)
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
-    limit = 1 + _allowed(base, share_of(LEVEL, a.false_alarm)) / base.vPv
+    limit = 1 + _allowed(base, a.levels.question) / base.vPv
     result = _Place(a)
     found: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))

@@ -59,6 +59,7 @@ class GlobalTest:
     lower: float  # acceptance region of v'Pv
     upper: float
     passed: bool | None  # None if not tested
+    alpha: float  # probability of rejecting right standard deviations
     untested: Untested | None = None  # reason why it was not tested
 
 
@@ -119,13 +120,14 @@ class Correlation:
     value: float
 
 
-def global_test(adjustment: Adjustment, *, alpha: float = FALSE_ALARM) -> GlobalTest:
+def global_test(adjustment: Adjustment, *, alpha: float | None = None) -> GlobalTest:
     """Return the two-sided chi-square test of v'Pv of all observations.
 
     Args:
         adjustment: finished adjustment.
-        alpha: probability of rejecting a correct model.
+        alpha: probability of rejecting a correct model; the false alarm of the adjustment if not given.
     """
+    alpha = adjustment.false_alarm if alpha is None else alpha
     test = _chi_square("all observations", adjustment.sigma0, adjustment.redundancy, alpha)
     return replace(test, passed=None, untested="reweighted") if adjustment.reweighted else test
 
@@ -159,36 +161,40 @@ def component_tests(
 
 def _chi_square(of: str, sigma0: float, redundancy: float, alpha: float) -> GlobalTest:
     if not np.isfinite(sigma0):
-        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, "redundancy")
+        return GlobalTest(of, np.nan, redundancy, np.nan, np.nan, None, alpha, "redundancy")
     statistic = float(sigma0**2 * redundancy)
     lower, upper = (float(x) for x in chi2_ppf([alpha / 2, 1 - alpha / 2], redundancy))
-    return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper)
+    return GlobalTest(of, statistic, redundancy, lower, upper, lower <= statistic <= upper, alpha)
 
 
 @checked_arguments()
-def w_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
+def w_test(adjustment: Adjustment, *, alpha: float | None = None) -> CoordinateTest:
     """Return Baarda's test of each image coordinate; w is standard normal if the stated sigma0 is correct.
 
     Args:
         adjustment: finished adjustment.
-        alpha: probability of rejecting a good image coordinate.
+        alpha: probability of rejecting a good image coordinate; that of one question of the adjustment if not
+            given.
     """
+    alpha = adjustment.levels.question if alpha is None else alpha
     return _coordinate_test(adjustment, adjustment.standardised, float(normal_ppf(1 - alpha / 2)), alpha)
 
 
 @checked_arguments()
-def tau_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
+def tau_test(adjustment: Adjustment, *, alpha: float | None = None) -> CoordinateTest:
     """Return Pope's test of each image coordinate, which uses sigma0 of the adjustment.
 
     Args:
         adjustment: finished adjustment.
-        alpha: probability of rejecting a good image coordinate.
+        alpha: probability of rejecting a good image coordinate; that of one question of the adjustment if not
+            given.
     """
+    alpha = adjustment.levels.question if alpha is None else alpha
     critical = tau_critical(alpha, adjustment.redundancy)
     return _coordinate_test(adjustment, adjustment.tau, critical, alpha)
 
 
-def robust_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTest:
+def robust_test(adjustment: Adjustment, *, alpha: float | None = None) -> CoordinateTest:
     """Return the test of w over its standard deviation from the median, which half of the coordinates fix.
 
     It finds gross errors that were not rejected. Tau misses them if they are so many that they determine
@@ -197,10 +203,12 @@ def robust_test(adjustment: Adjustment, *, alpha: float = LEVEL) -> CoordinateTe
 
     Args:
         adjustment: finished adjustment.
-        alpha: probability of rejecting a good image coordinate.
+        alpha: probability of rejecting a good image coordinate; that of one question of the adjustment if not
+            given.
 
     Source: Rousseeuw and Leroy (1987), Robust Regression and Outlier Detection, sec. 1.2.
     """
+    alpha = adjustment.levels.question if alpha is None else alpha
     w = np.full_like(adjustment.standardised, np.nan) if adjustment.is_exact else adjustment.standardised
     known = np.abs(w[np.isfinite(w)])
     sigma = MAD_TO_SIGMA * float(np.median(known)) if len(known) else 0.0
@@ -291,15 +299,17 @@ def reliability(adjustment: Adjustment, *, alpha: float | None = None, power: fl
     )
 
 
-def significance(adjustment: Adjustment, *, alpha: float = FALSE_ALARM) -> tuple[Significance, ...]:
+def significance(adjustment: Adjustment, *, alpha: float | None = None) -> tuple[Significance, ...]:
     """Return the t-test against 0 of each free parameter of distortion and principal point in mm.
 
     A parameter shared by several cameras is tested once, under the name of their group.
 
     Args:
         adjustment: finished adjustment.
-        alpha: probability that a parameter is called significant although it is 0.
+        alpha: probability that a parameter is called significant although it is 0; the false alarm of the
+            adjustment if not given.
     """
+    alpha = adjustment.false_alarm if alpha is None else alpha
     tests: dict[tuple[str, str], Significance] = {}
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
         for s, sigma in zip(_free(camera, Q), np.sqrt(np.diagonal(Q)), strict=True):
@@ -468,18 +478,6 @@ def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> Floa
             mixed = np.where(r & ~c, mixed, 0.0)
             Q += mixed + np.swapaxes(mixed, 1, 2)
     return np.asarray(J @ Q @ np.swapaxes(J, 1, 2))
-
-
-def level_of_single(family: float, tests: int) -> float:
-    """Return the level of each single test for a given probability that any of several tests rejects wrongly.
-
-    Args:
-        family: probability of a wrong rejection in all tests together.
-        tests: number of tests.
-
-    Source: Sidak (1967), J. Am. Stat. Assoc. 62.
-    """
-    return float(1 - (1 - family) ** (1 / max(tests, 1)))
 
 
 def tau_critical(alpha: float, redundancy: float) -> float:

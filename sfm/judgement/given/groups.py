@@ -10,7 +10,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.conventions import FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM, LEVEL, share_of
+from sfm.distributions import FALSE_ALARM, Levels
 from sfm.judgement.given.free_network import FreeNetwork, Reference
 from sfm.judgement.given.points import (
     GivenPoints,
@@ -49,7 +49,7 @@ class GivenSettings:
     @property
     def level(self) -> float:
         """Probability of reporting one kind of right values as wrong."""
-        return share_of(LEVEL, self.false_alarm)
+        return Levels(self.false_alarm).question
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def are_in_space(xyz: FloatArray) -> bool:
 
 
 def remarks_on_unchecked(
-    of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...] = ()
+    of: str, names: Sequence[str], model: GivenModel, without: tuple[int, ...], level: float
 ) -> Iterator[Remark]:
     """Yield remarks on given values whose errors nothing, or hardly anything, would reveal.
 
@@ -229,8 +229,9 @@ def remarks_on_unchecked(
         names: names of the given values.
         model: differences of the given values.
         without: indices of values that are left out.
+        level: level of the test of a value.
     """
-    reach, rank = model.external(without), model.kept(without).decreases()[1]
+    reach, rank = model.external(without, level=level), model.kept(without).decreases()[1]
     for kind, some in (
         ("given_unchecked", np.isinf(reach) & (rank == 0)),
         ("given_partly_checked", np.isinf(reach) & (rank > 0)),

@@ -16,6 +16,7 @@ import numpy as np
 
 from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.quality.statistics import non_centrality
 from sfm.conventions import BoolArray, FloatArray
 from sfm.judgement.given.free_network import FreeNetwork, confirmed, thinned
 from sfm.judgement.given.groups import (
@@ -31,7 +32,7 @@ from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.tables import Table, as_judged, judge_tables
-from sfm.judgement.given.values import NONCENTRALITY, GivenModel
+from sfm.judgement.given.values import GivenModel
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.kind import CoordinateKind
 from sfm.observations.point_pairs import Distances
@@ -294,7 +295,7 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
         else:
             yield remark("given_not_exact", of=of, sigma=sigma, shift=shift)
     if task.in_control:
-        yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong)
+        yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong, task.level)
     if found.factor == 1.0 or group.scatter or group.placed.model.estimated:
         return
     covariance = (task.network.control if of == "control" else task.network.exterior).covariance
@@ -352,7 +353,7 @@ def _doubtful(task: Task, group: Group) -> Remark:
 def _shifts(model: GivenModel) -> FloatArray:
     """Return the largest effect of each given value on the parameters, in their standard deviations."""
     reach = model.external()
-    found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / NONCENTRALITY
+    found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / non_centrality()
     return np.where(np.isfinite(reach), found, np.inf)
 
 

@@ -295,7 +295,7 @@ class Comparison(NamedTuple):
     @property
     def unchecked(self) -> Iterator[Remark]:
         """Remarks on right sources whose errors hardly anything would reveal."""
-        return remarks_on_unchecked("lengths", self.names, self.model, self.judgement.wrong)
+        return remarks_on_unchecked("lengths", self.names, self.model, self.judgement.wrong, self.level)
 
     def as_one(self, table: str) -> Source:
         """Return the right ones as one source, with standard deviations that fit.

@@ -24,9 +24,8 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import non_centrality
 from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
-from sfm.distributions import MARGIN, MIN_LEAD, f_sf
+from sfm.distributions import LEVEL, MARGIN, MIN_LEAD, f_sf
 
-NONCENTRALITY = non_centrality()  # of an error that a test at LEVEL finds with POWER: 4.13, Baarda (1968)
 # An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
 # not explain are errors of the values. The best-fitting factor may be larger by chance.
 MAX_FACTOR = 10.0
@@ -309,7 +308,7 @@ class GivenModel:
             confirmed=len(np.unique(self.item[c])),
         )
 
-    def external(self, some: tuple[int, ...] = ()) -> FloatArray:
+    def external(self, some: tuple[int, ...] = (), *, level: float = LEVEL) -> FloatArray:
         """Return the external reliability of each given value, infinite if nothing checks it, (items,).
 
         It is the largest shift that a just detectable error of the value causes in the parameters that only
@@ -317,8 +316,9 @@ class GivenModel:
 
         Args:
             some: values left out.
+            level: level of the test of a value.
         """
-        out = np.full(self.items, np.nan)
+        out, delta0 = np.full(self.items, np.nan), non_centrality(level)
         part = self.part(~np.isin(self.item, some))
         S, N = part.network + part.stated, part._left
         M, P = part.precision, np.linalg.pinv(S, rcond=RANK, hermitian=True)
@@ -330,7 +330,7 @@ class GivenModel:
             L = np.linalg.cholesky(W + RANK * np.trace(W) * np.eye(len(rows)))
             checked = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, M_rows).T)).min()
             r = float(np.clip(checked, 0.0, 1.0))
-            out[one] = NONCENTRALITY * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
+            out[one] = delta0 * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
         return out
 
     def factor(self) -> tuple[float, float]:
@@ -428,7 +428,7 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         sets = _sets(model, cost)
         # with few values, one wrong value would look like standard deviations that are too small, unless each
         # single error is too small for its test to find
-        unseen = float(np.sqrt(every.decreases()[0].max())) < NONCENTRALITY
+        unseen = float(np.sqrt(every.decreases()[0].max())) < non_centrality(level)
         if sets and (unseen or of_factor + 2 * MIN_LEAD < min(one.score for one in sets)):
             return replace(found, factor=factor, score=of_factor)
         return replace(found, doubtful=tuple(range(model.items)), score=of_factor)

@@ -22,7 +22,7 @@ from scipy.special import gammaln
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.distributions import FAMILY, chi2_isf
+from sfm.distributions import chi2_isf
 from sfm.judgement.hypotheses.columns import Columns, interior_columns, rigid_motions
 from sfm.judgement.hypotheses.families import (
     BODY,
@@ -53,7 +53,6 @@ from sfm.judgement.hypotheses.score import (
 from sfm.likelihood import price_of
 from sfm.network import sum_rows
 
-ALPHA = FAMILY  # probability of naming any alternative if none is true
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms
 MAX_PRODUCTS = 2e11  # multiplications for all splits, about ten seconds
@@ -83,9 +82,11 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
             *moved_points(a, reduced),
         ]
 
+    needed = np.log(1 / a.levels.family)
+
     def tested(one: Alternative) -> Alternative:
         priced = one.priced(reduced)
-        if reduced.correlation is None or not priced.evidence_beside_spread > np.log(1 / ALPHA):
+        if reduced.correlation is None or not priced.evidence_beside_spread > needed:
             return priced  # not significant in any case
         effect = reduced.design_effect(reduced.whiten(one.columns(a, columns)))
         return replace(priced, design_effect=effect)
@@ -114,17 +115,18 @@ def count_alternatives(a: Adjustment) -> int:
     return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, BODY))
 
 
-def is_significant(one: Alternative, rows: int) -> bool:
-    """Return whether chance would produce such a gain in fewer than ALPHA of all surveys.
+def is_significant(one: Alternative, rows: int, level: float) -> bool:
+    """Return whether chance would produce such a gain in a smaller share of all surveys than the level.
 
     Args:
         one: alternative.
         rows: number of alternatives tested together.
+        level: probability of naming any alternative if none is true, `Levels.family`.
     """
-    return bool(one.log_p < np.log(ALPHA / rows) - one.search)
+    return bool(one.log_p < np.log(level / rows) - one.search)
 
 
-def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
+def needed_gain(rank: int, touched: int, search: float, rows: int, level: float) -> float:
     """Return the smallest gain for which an alternative is named, with a known variance factor.
 
     Args:
@@ -132,9 +134,10 @@ def needed_gain(rank: int, touched: int, search: float, rows: int) -> float:
         touched: number of image points that they move.
         search: ln of the number of patterns from which it was chosen.
         rows: number of alternatives tested together.
+        level: probability of naming any alternative if none is true, `Levels.family`.
     """
-    level = np.exp(np.log(ALPHA / rows) - search)
-    return float(max(chi2_isf(level, rank), 2 * (price_of(rank, touched, search) + np.log(1 / ALPHA))))
+    single = np.exp(np.log(level / rows) - search)
+    return float(max(chi2_isf(single, rank), 2 * (price_of(rank, touched, search) + np.log(1 / level))))
 
 
 def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tuple[tuple[int, int], ...]]]:
@@ -218,7 +221,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     run = runs_of(camera)
     whole = Part(*reduced.project_by_run(reduced.whiten(columns.freedoms), run))
     if len(whole.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
-        yield from _of_each(reduced, whole, run)
+        yield from _of_each(reduced, whole, run, a.levels.family)
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
@@ -249,7 +252,7 @@ def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
 
 
-def _of_each(reduced: Reduced, whole: Part, run: IntArray) -> Iterator[Alternative]:
+def _of_each(reduced: Reduced, whole: Part, run: IntArray, level: float) -> Iterator[Alternative]:
     """Yield the alternatives of a per-photograph camera.
 
     Such a camera must exceed, by an F test, the effect of all other freedoms of the photographs once it is
@@ -263,7 +266,7 @@ def _of_each(reduced: Reduced, whole: Part, run: IntArray) -> Iterator[Alternati
         H = whole.H[:, some][:, :, :, some].reshape(q, q)
         squares = whole.squares[:, some].ravel()
         gain = gain_of(H, whole.g[:, some].ravel(), squares)
-        if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(ALPHA):
+        if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(level):
             continue
         cross = whole.H[:, rest][:, :, :, some].reshape(p, q)
         others = gain_of(

@@ -26,10 +26,9 @@ from scipy.spatial.transform import Rotation
 from sfm.adjustment.covariance import JointOnDemand, marginal_of
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.correlated import linearise
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray, angles_from_rotation, rotation_from_angles
-from sfm.distributions import LEVEL, chi2_sf
+from sfm.distributions import chi2_sf, level_of_single
 from sfm.judgement.hypotheses.score import gain_of
 from sfm.kernels.threads import own_threads
 from sfm.remarks.remark import Remark, remark
@@ -68,7 +67,7 @@ def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...
     tested = _testable(a) if a.error_correlation is None else np.zeros(0, dtype=np.int64)
     stated = moment if stated is None else stated
     freed = np.flatnonzero(moment != stated)
-    critical = level_of_single(LEVEL, max(len(tested) + len(freed), 1))
+    critical = level_of_single(a.levels.question, max(len(tested) + len(freed), 1))
     with own_threads():
         every = [*_of_freed(a, freed, stated), *_of_mounted(a, tested, critical)]
     found = [bump for bump in every if bump.probability < critical]

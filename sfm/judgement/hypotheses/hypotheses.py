@@ -22,10 +22,9 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import FALSE_ALARM, MIN_LEAD
+from sfm.distributions import MIN_LEAD
 from sfm.errors import GeometryError
 from sfm.judgement.hypotheses.alternatives import (
-    ALPHA,
     MIN_GROUP,
     alternatives_of,
     cameras_of_photographs,
@@ -249,14 +248,14 @@ def _best(
     before = [(one.alternative, one.refit.beta) for one in causes]
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
-    every = alternatives_of(current, reduced, columns)
+    every, level = alternatives_of(current, reduced, columns), plain.levels.family
     once: dict[tuple[object, ...], Alternative] = {}
     for one in every:
-        if is_significant(one, len(every)) and one.evidence > np.log(1 / ALPHA):
+        if is_significant(one, len(every), level) and one.evidence > np.log(1 / level):
             once.setdefault(one.family.cause(one), one)
     if once:  # if one parameter of all photographs explains the errors, no other cause is needed
         for one in every:
-            if isinstance(one.family, InteriorFamily) and one.evidence_beside_spread > np.log(1 / ALPHA):
+            if isinstance(one.family, InteriorFamily) and one.evidence_beside_spread > np.log(1 / level):
                 once.setdefault(one.family.cause(one), one)
     of_kind: Counter[object] = Counter()
     to_try = []
@@ -283,18 +282,18 @@ def _best(
         if found is not None
     ]
     most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
-    if best is None or adjusted is None or not most > np.log(1 / ALPHA):
+    if best is None or adjusted is None or not most > np.log(1 / level):
         return None
     if not adjusted.finished:
         adjusted = refit(plain, best, current, before) or adjusted
-    level = {id(one): evidence for evidence, one, _ in holding}
+    evidence_of = {id(one): evidence for evidence, one, _ in holding}
     near = tuple(
         one
         for one in once.values()
         if one.kind != best.kind
         and (
-            most - level[id(one)] < MIN_LEAD
-            if id(one) in level
+            most - evidence_of[id(one)] < MIN_LEAD
+            if id(one) in evidence_of
             else abs(best.evidence - one.evidence) < MIN_LEAD
         )
     )
@@ -312,7 +311,7 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     if len(free.rejected) < len(held.rejected):
         start, factor = held.estimate, held.image_sigma_factor
         sample = adjust_image_points(
-            held.network, start, held.rejected, factor, held.false_alarm, datum="control"
+            held.network, start, held.rejected, factor, datum="control", false_alarm=held.false_alarm
         )
         if sample is None:
             return []
@@ -370,7 +369,7 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) ->
         if alone is None:
             continue
         gain = cause.alternative.deflated(-alone.gain, plain.redundancy)
-        if gain - cause.alternative.price < np.log(1 / ALPHA):
+        if gain - cause.alternative.price < np.log(1 / plain.levels.family):
             causes, found = tuple(one for one, _ in before), replace(found, refit=alone)
     joint = zip(causes, found.refit.before, strict=True)
     return (*(replace(one, refit=replace(one.refit, beta=beta)) for one, beta in joint), found)
@@ -411,8 +410,9 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     except np.linalg.LinAlgError:
         return ()
     single = [one for one in interiors(plain, reduced, HELD) if len(one.gain.beta) == 1]
-    every = [one.priced(reduced) for one in single]
-    found = sorted((one for one in every if is_significant(one, len(every))), key=lambda one: -one.gain.value)
+    every, level = [one.priced(reduced) for one in single], plain.levels.family
+    significant = [one for one in every if is_significant(one, len(every), level)]
+    found = sorted(significant, key=lambda one: -one.gain.value)
     names = []
     for one in found:
         index, s = one.parameters[0]
@@ -435,7 +435,7 @@ def free_network(final: Adjustment) -> Adjustment | None:
     if alone and tested and final.datum != "control" and len(final.rejected) <= MAX_IMAGE_POINTS:
         return final
     free = adjust_image_points(
-        network, final.estimate, final.rejected, final.image_sigma_factor, final.false_alarm
+        network, final.estimate, final.rejected, final.image_sigma_factor, false_alarm=final.false_alarm
     )
     return free if free is None or correlation is None else with_error_correlation(free, correlation)
 
@@ -445,9 +445,9 @@ def adjust_image_points(
     estimate: Estimate,
     rejected: BoolArray,
     factor: FloatArray,
-    false_alarm: float = FALSE_ALARM,
     *,
     datum: Literal["free", "control"] = "free",
+    false_alarm: float,
 ) -> Adjustment | None:
     """Adjust the image points of a network alone, or a sample of many; None if they determine no solution.
 
@@ -456,8 +456,8 @@ def adjust_image_points(
         estimate: start values.
         rejected: image points left out at the start, (k,).
         factor: factor on the standard deviations of image points, (k,).
-        false_alarm: probability that right image points are called wrong.
         datum: "control" to adjust them with the given points.
+        false_alarm: probability that right image points are called wrong.
     """
     alone = without_given(network)
     if datum == "control":

@@ -157,6 +157,7 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
             image_sigma_factor=plain.image_sigma_factor,
             reject="tau",
             alpha=plain.test_alpha,
+            false_alarm=plain.false_alarm,
             rejected=start.rejected,
             max_iterations=MAX_ITERATIONS,
         )
@@ -371,7 +372,7 @@ def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
-    needed = needed_gain(rank, touched, one.search, rows)
+    needed = needed_gain(rank, touched, one.search, rows, a.levels.family)
     least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # detected noncentrality
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, MIN_DETERMINED_SHARE))
     X = a.estimate.points

@@ -16,7 +16,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import project
 from sfm.conventions import IntArray
 from sfm.distributions import chi2_isf, chi2_sf
-from sfm.judgement.hypotheses.alternatives import ALPHA
 from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 
@@ -73,7 +72,7 @@ def _other_points(a: Adjustment) -> dict[int, int]:
     """Return the rejected image points that lie where another point is expected, with that point."""
     network, estimate, seen = a.network, a.estimate, a.network.image_points
     rejected = np.flatnonzero(a.rejected)
-    tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(ALPHA, 2))) * a.sigma0_px
+    tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(a.levels.family, 2))) * a.sigma0_px
     found: dict[int, int] = {}
     for i, rows in enumerate(rows_of(seen.image[rejected], len(network.images))):
         if not len(rows):
@@ -122,11 +121,11 @@ def _second_places(a: Adjustment, explained: set[int]) -> list[SecondPlace]:
             continue
         X, Q, misfit = intersect_rays(a, out)
         first, Q0, _ = intersect_rays(a, kept)
-        if not np.isfinite(misfit) or chi2_sf(misfit, 2 * len(out) - 3) < ALPHA:
+        if not np.isfinite(misfit) or chi2_sf(misfit, 2 * len(out) - 3) < a.levels.family:
             continue
         apart = X - first
         over = float(np.sqrt(apart @ np.linalg.pinv(Q + Q0) @ apart))
-        if chi2_sf(over**2, 3) < ALPHA / len(left):
+        if chi2_sf(over**2, 3) < a.levels.family / len(left):
             places.append(SecondPlace(j, float(np.linalg.norm(apart)), over, np.sort(seen.image[out])))
     return places
 

@@ -16,7 +16,6 @@ import numpy as np
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.camera import base_name
 from sfm.conventions import IntArray
-from sfm.distributions import FAMILY, share_of
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.verdict import judge_adjustment
 from sfm.network import Mounts
@@ -105,7 +104,7 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
     np.minimum.at(least, stated, share)
     names = [name for one in of_kind(found.remarks, "rig_contradicted") for name in one.names("photographs")]
     named = np.isin(network.images, names)  # never all of a moment
-    level = share_of(FAMILY, found.adjustment.false_alarm)
+    level = found.adjustment.levels.family
     free = oriented & (more_than_chance(against, count, level) & (share > least[stated]) | named)
     left = np.bincount(stated[oriented & ~free], minlength=len(least))
     free &= (left[stated] > 0) | named

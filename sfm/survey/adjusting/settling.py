@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.quality.statistics import level_of_single
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -349,7 +348,7 @@ def _wrong_windows(adjustment: Adjustment) -> BoolArray:
     P = np.linalg.inv(adjustment.image_covariance[used])
     vPv = np.bincount(seen.point, np.einsum("ka,kab,kb->k", v, P, v), minlength=n)
     redundancy = 2 * np.bincount(seen.point, minlength=n) - 3  # with cameras held: slightly too cautious
-    limit = chi2_isf(level_of_single(adjustment.false_alarm, n), np.maximum(redundancy, 1))
+    limit = chi2_isf(adjustment.levels.of_each(n), np.maximum(redundancy, 1))
     large = ~network.named & (redundancy > 1) & (vPv > adjustment.sigma0**2 * limit)
     bars = network.scale_bars
     large[np.concatenate([network.control.point, bars.start, bars.end])] = False

@@ -30,7 +30,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
-from sfm.distributions import FALSE_ALARM, FAMILY, share_of
+from sfm.distributions import FALSE_ALARM, FAMILY, Levels
 from sfm.errors import GeometryError
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
@@ -90,7 +90,7 @@ def find_photograph_cameras(
     against = np.bincount(seen.image[known & ~accepted], minlength=m)
     enough = count > MAJORITY_FRACTION * np.bincount(seen.image, minlength=m)
     lost = against > MAJORITY_FRACTION * count
-    unusual = more_than_chance(against, count, share_of(FAMILY, false_alarm))
+    unusual = more_than_chance(against, count, Levels(false_alarm).family)
     doubtful = enough & (unusual | (np.isin(network.images, suspected) & estimate.oriented))
     if not doubtful.any() or (doubtful & lost).sum() > MAJORITY_FRACTION * m:
         return None
@@ -173,7 +173,7 @@ def _explained_otherwise(
             *reduce_network(one, values, images, points, rows),
             rejected,
             np.ones(int(rows.sum())),
-            false_alarm,
+            false_alarm=false_alarm,
         )
         for one, values, rejected in (
             (network, estimate, start),

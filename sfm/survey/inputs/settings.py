@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
-from sfm.distributions import FALSE_ALARM
+from sfm.distributions import FALSE_ALARM, Levels
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
 from sfm.observations.tables import TABLES
 
@@ -321,6 +321,11 @@ class AdjustSettings(Section):
     weights: Literal["components", "stated"] = "components"  # of image points beside other observations
     # probability that a right survey is called wrong: its share is the level of each test
     false_alarm: Probability = FALSE_ALARM
+
+    @property
+    def levels(self) -> Levels:
+        """Levels of all tests of the survey."""
+        return Levels(self.false_alarm)
 
 
 class CompareSettings(Section):

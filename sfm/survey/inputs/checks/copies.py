@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
-from sfm.distributions import LEVEL, f_sf, share_of
+from sfm.distributions import f_sf
 from sfm.errors import GeometryError
 from sfm.network import Estimate, Network, rows_of
 
@@ -51,7 +51,7 @@ def find_copies(adjustment: Adjustment) -> dict[str, tuple[str, float]]:
     place = np.hstack(
         [estimate.position / max(float(np.median(distance)), 1e-300), estimate.rotation.reshape(-1, 9)]
     )
-    level = share_of(LEVEL, adjustment.false_alarm)
+    level = adjustment.levels.question
     pairs = sorted(cKDTree(place).query_pairs(SAME_PLACE))
     of_image = rows_of(seen.image, len(network.images))
     copies: dict[str, tuple[str, float]] = {}
