@@ -197,10 +197,8 @@ def _report_moved_points(before: SolvedSurvey, after: SolvedSurvey) -> SolvedSur
 
 def _gain_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return the gain of ln likelihood."""
-    if not after.adjustment.converged or after.adjustment.undetermined:
-        return -float("inf")
     freed = POSE * len(_further_poses(before, after)) + _free_of_mounts(after) - _free_of_mounts(before)
-    return _log_likelihood(after, freed) - _log_likelihood(before)
+    return _gain_of_parameters(before, after, freed)
 
 
 def _further_poses(before: SolvedSurvey, after: SolvedSurvey) -> list[tuple[int, int]]:
@@ -222,18 +220,27 @@ def _free_of_mounts(solved: SolvedSurvey) -> int:
 
 def _gain_of_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> float:
     """Return the gain of ln likelihood, if c differs by more than focusing changes it."""
-    a = zoomed.adjustment
-    focal = [c for _, c, _ in _c_per_photograph(zoomed)]
-    if not a.converged or a.undetermined or not any(max(c) > MAX_FOCUS_CHANGE * min(c) for c in focal):
+    if not any(max(c) > MAX_FOCUS_CHANGE * min(c) for _, c, _ in _c_per_photograph(zoomed)):
         return -float("inf")
-    return _log_likelihood(zoomed, _freed_by_varying_c(before, zoomed)[0][0]) - _log_likelihood(before)
+    return _gain_of_parameters(before, zoomed, _freed_of_cameras(before, zoomed))
 
 
 def _freed_by_varying_c(before: SolvedSurvey, zoomed: SolvedSurvey) -> list[tuple[int, int]]:
     """Return the further parameters, and the number of image points of a photograph."""
     a = zoomed.adjustment
-    freed = a.unknown_counts[1] - before.adjustment.unknown_counts[1]
-    return [(freed, len(a.rejected) // len(a.network.images))]
+    return [(_freed_of_cameras(before, zoomed), len(a.rejected) // len(a.network.images))]
+
+
+def _freed_of_cameras(before: SolvedSurvey, after: SolvedSurvey) -> int:
+    """Return the number of further interior parameters that are adjusted."""
+    return after.adjustment.unknown_counts[1] - before.adjustment.unknown_counts[1]
+
+
+def _gain_of_parameters(before: SolvedSurvey, after: SolvedSurvey, freed: int) -> float:
+    """Return the gain of ln likelihood by further parameters, if the network determines them."""
+    if not after.adjustment.converged or after.adjustment.undetermined:
+        return -float("inf")
+    return _log_likelihood(after, freed) - _log_likelihood(before)
 
 
 def _log_likelihood(solved: SolvedSurvey, freed: int = 0) -> float:
