@@ -27,6 +27,9 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from sfm.network import Estimate, Network
 
+# Units that tables have by mistake: the factor that corrects values and standard deviations.
+UNITS_OF_LENGTHS = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048}
+UNITS_OF_ANGLES = {"gon": 0.9, "radians": float(np.degrees(1.0))}
 NO_PARAMETERS = np.zeros(0)
 SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of a group below which a parameter is open
 POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # types of unknowns
@@ -280,13 +283,13 @@ class TableKind(Kind):
     def mistakes(self) -> Mapping[str, Self]:
         """Return the observations in other units; some kinds add further mistakes."""
         turned = np.array([name in self.angles for name in self.components])
-        units = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048} if not turned.all() else {}
         found: dict[str, Self] = {}
-        for name, factor in (units | ({"gon": 0.9} if turned.any() else {})).items():
-            by = np.where(turned == (name == "gon"), factor, 1.0)
-            values = self.values * np.resize(by, self.values.shape)
-            sigma = self.sigma * np.resize(by, self.sigma.shape)
-            found[name] = self.with_values(values).with_sigma(sigma)
+        for units, scaled in ((UNITS_OF_LENGTHS, ~turned), (UNITS_OF_ANGLES, turned)):
+            for name, factor in (units if scaled.any() else {}).items():
+                by = np.where(scaled, factor, 1.0)
+                values = self.values * np.resize(by, self.values.shape)
+                sigma = self.sigma * np.resize(by, self.sigma.shape)
+                found[name] = self.with_values(values).with_sigma(sigma)
         return found
 
     @classmethod

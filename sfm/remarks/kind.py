@@ -81,6 +81,7 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "feet": "lengths are in feet",
     "gon": "angles are in gon",
     "mirrored": "coordinates are those of a mirrored system",
+    "radians": "angles are in radians",
     "thousandfold": "lengths are divided by 1000, as from mm to m",
     "thousandth": "lengths are multiplied by 1000, as from m to mm",
     # mistakes in tables of mounts

@@ -414,7 +414,13 @@ def test_left_handed_differences_have_two_readings_unless_heights_decide(
 
 @pytest.mark.parametrize(
     ("mistake", "lengths", "angles"),
-    [("thousandfold", 1e-3, 1.0), ("thousandth", 1e3, 1.0), ("feet", 0.3048, 1.0), ("gon", 1.0, 0.9)],
+    [
+        ("thousandfold", 1e-3, 1.0),
+        ("thousandth", 1e3, 1.0),
+        ("feet", 0.3048, 1.0),
+        ("gon", 1.0, 0.9),
+        ("radians", 1.0, 180 / np.pi),
+    ],
 )
 def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, angles: float) -> None:
     (right,) = network_of("units", ("relative orientation",))[0].observations
@@ -423,6 +429,21 @@ def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, a
     factors = np.array([lengths] * 3 + [angles] * 3)
     np.testing.assert_allclose(found.values, factors * right.values)
     np.testing.assert_allclose(found.sigma, factors * right.sigma)
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_angles_in_radians_are_named_and_degrees_are_not(wrong: bool, tmp_path: Path) -> None:
+    """As a script writes them into a column of degrees, with their standard deviations."""
+    network, truth = network_of("radians", ("horizontal direction", "height difference", "distance"))
+    directions, heights, tape = network.observations
+    assert isinstance(directions, TableKind)
+    if wrong:
+        directions = directions.with_values(np.radians(directions.values))
+        directions = directions.with_sigma(np.radians(directions.sigma))
+    given = {"horizontal direction": [directions], "height difference": [heights], "distance": [tape]}
+    remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
+    said = [(one.kind, one.names("mistake")) for one in remarks if one.kind.endswith("_wrong")]
+    assert said == ([("kind_wrong", ("radians",))] if wrong else [])
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.2])
