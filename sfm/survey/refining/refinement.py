@@ -21,6 +21,7 @@ from sfm.camera import Camera
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.distortion.models import Role
+from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
