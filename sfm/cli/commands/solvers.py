@@ -10,7 +10,6 @@ import typer
 
 from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.display import counted
-from sfm.distributions import FALSE_ALARM
 from sfm.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
@@ -409,7 +408,7 @@ def refine(
                 min_correlation,
                 tuple(name.strip() for name in fix.split(",") if name.strip()),
                 masks,
-                FALSE_ALARM if given is None else given.adjust.false_alarm,
+                *(() if given is None else (given.adjust.false_alarm,)),
             ),
             targets=targets,
             progress=progress,
