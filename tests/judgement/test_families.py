@@ -106,6 +106,15 @@ def test_the_remark_on_a_camera(a: Adjustment) -> None:
     assert drift.number("change") == pytest.approx(2 * 0.5)  # from the first photograph to the last
 
 
+def test_a_deformation_that_grows_is_told_from_one_of_some_photographs(a: Adjustment) -> None:
+    factors = {"split": (0, 0, 0, 0, 1, 1), "linear": (-1, -0.6, -0.2, 0.2, 0.6, 1)}
+    for pattern, factor in factors.items():
+        one = alternative("strain", pattern, factor)
+        said = remark(a, one, [1e-3] * 5)
+        assert bool(said.names("photographs")) == (pattern == "split")
+        assert ("steadily" in said.text) == (pattern == "linear")
+
+
 def test_the_remark_on_a_camera_of_each_photograph(a: Adjustment) -> None:
     """From the mean of the photographs: 6, 3, 0, 0, 0, -3 px of c at the edge, and x0 of one."""
     c = [6.0, 3.0, 0.0, 0.0, 0.0, -3.0]

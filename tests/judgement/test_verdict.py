@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.quality.statistics import (
     global_test,
     robust_test,
@@ -28,7 +29,7 @@ from sfm.judgement.bundle_statistics import statistics_of
 from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, remark
+from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.remarks.verdict import Verdict
 from sfm.report.phrases import describe_test
 from sfm.report.survey_report import text_report
@@ -172,6 +173,17 @@ def test_the_key_of_a_survey_is_the_level_of_its_adjustment() -> None:
         assert a.false_alarm == level
         coordinates = 2 * len(network.image_points)
         assert coordinates * a.test_alpha == pytest.approx(level, rel=0.1)
+
+
+@pytest.mark.parametrize("c_moved", [4.0, 0.0])
+def test_another_solution_states_how_far_its_c_is_unless_c_is_held(c_moved: float) -> None:
+    network, truth = make_network(seed_of("another solution"), images=6, points=30)
+    result = run_survey(survey_of(network, truth))
+    flat = OtherSolution("camera", 12.0, "mm", False, 3.0, c_moved, 1.0, truth, True)
+    verdict = judge_survey(replace(result, other_solutions=(flat,))).verdict
+    (said,) = of_kind(verdict.remarks, "other_solution")
+    assert said.number("c") == 12.0
+    assert ("c by 4" in said.text) == bool(c_moved)
 
 
 def test_a_result_that_is_read_has_its_verdict(made: tuple[Network, Estimate], tmp_path: Path) -> None:
