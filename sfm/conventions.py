@@ -151,10 +151,10 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 def skew(vector: FloatArray) -> FloatArray:
     """Return [vector]x, the matrix of the cross product with the vector on the left, shape (..., 3, 3)."""
     w = np.asarray(vector, dtype=float)
-    zero = np.zeros(w.shape[:-1])
-    x, y, z = w[..., 0], w[..., 1], w[..., 2]
-    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return np.stack(rows, axis=-1).reshape(*w.shape[:-1], 3, 3)
+    W = np.zeros((*w.shape[:-1], 3, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    W[..., 1, 2], W[..., 2, 0], W[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
+    return W
 
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
@@ -56,7 +57,7 @@ class RigidFrames(Group):
         A = np.concatenate([np.broadcast_to(R, (len(arm), 3, 3)), -R @ skew(arm)], axis=2).reshape(-1, 6)
         alone = R @ (self.hidden_sigma[:, :, None] ** 2 * R.T)
         cofactor = A @ Q @ A.T + block_diag(*alone)
-        _, about = self._axes()
+        _, about = self._axes
         turned = (np.abs(A[:, 3:] @ about.T) > ON_LINE * np.abs(arm).max()).any(axis=1)
         cofactor[turned, turned] = np.inf
         J = (A @ by_motion).reshape(len(A), -1, 3)
@@ -108,9 +109,10 @@ class RigidFrames(Group):
         """
         shift = np.tile(-np.eye(3), (len(local), 1, 1))
         found = skew(local - self.value.mean(axis=0))
-        turn, about = (found @ axes.T @ axes for axes in self._axes())
+        turn, about = (found @ axes.T @ axes for axes in self._axes)
         return np.concatenate([shift, turn], axis=2), about
 
+    @cached_property
     def _axes(self) -> tuple[FloatArray, FloatArray]:
         """Return the axes of rotations that change the given coordinates, (3 or 2, 3), and any other axis."""
         given = skew(self.value - self.value.mean(axis=0)).reshape(-1, 3)
