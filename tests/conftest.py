@@ -6,6 +6,7 @@ import atexit
 import os
 import shutil
 import tempfile
+from collections import defaultdict
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -23,6 +24,23 @@ os.environ.setdefault("MPLCONFIGDIR", matplotlib.get_cachedir())  # its list of 
 CACHES = tempfile.mkdtemp(prefix="kolinear-tests-")
 os.environ["XDG_CACHE_HOME"] = CACHES  # never that of the user
 atexit.register(shutil.rmtree, CACHES, ignore_errors=True)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+    """Leave to the study what `sweep` does not list, by its place among the cases of a test.
+
+    A case that is asked for by its name is run.
+    """
+    cases = defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("sweep"):
+            cases[item.parent, item.originalname].append(item)
+    for sweep in cases.values():
+        listed = sweep[0].get_closest_marker("sweep").args
+        for place, item in enumerate(sweep):
+            if len(sweep) > 1 and place not in listed:
+                item.add_marker("slow")
 
 
 @pytest.fixture(autouse=True)

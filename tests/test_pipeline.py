@@ -104,6 +104,7 @@ def test_camcal_control_distances(camcal: SurveyResult) -> None:
             assert scale * np.linalg.norm(X[a] - X[b]) == pytest.approx(truth, abs=0.5e-3)
 
 
+@pytest.mark.slow
 def test_camcal_needs_no_control_to_start(
     camcal: SurveyResult, shared_data: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:
@@ -149,12 +150,10 @@ def test_panel_agrees_with_the_reference_points(panel: SurveyResult, shared_data
     assert panel.comparison.agree
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sigma0", "redundancy", "c"),
-    [
-        pytest.param("fixed", 0.16148, 3725, 7.45700, marks=pytest.mark.slow),
-        ("free", 0.142614, 3720, 7.456893),
-    ],
+    [("fixed", 0.16148, 3725, 7.45700), ("free", 0.142614, 3720, 7.456893)],
 )
 def test_camcal_reference_points(
     name: str, sigma0: float, redundancy: int, c: float, shared_data: Path, tmp_path: Path

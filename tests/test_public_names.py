@@ -404,6 +404,7 @@ def test_files_of_another_project_are_noticed(tmp_path: Path, file: str) -> None
 READ = "import sfm; print(sfm.read_result(sys.argv[1]).points.xyz.shape[0])"
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("regular", [True, False])
 def test_a_folder_called_adapters_beside_a_script_is_not_taken_for_ours(
     tmp_path: Path, result_folder: Path, result: SurveyResult, regular: bool

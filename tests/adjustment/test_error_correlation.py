@@ -74,6 +74,7 @@ def unequal(scene: tuple[Network, Estimate]) -> tuple[Network, Estimate]:
     return replace(network, image_points=replace(seen, covariance=covariance)), truth
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("name", ["scene", "unequal"])
 def test_covariance_may_correlate_is_what_repetition_shows(request: pytest.FixtureRequest, name: str) -> None:
     """Of centres, points and c; the covariance of independent errors states centres far too precise.
@@ -134,7 +135,7 @@ def test_every_covariance_has_the_common_errors(unequal: tuple[Network, Estimate
 
 def test_common_errors_take_little_memory() -> None:
     """Neither all image points by all unknowns nor all by all of a photograph: these took 7 kB each."""
-    network, truth = make_network(seed_of("memory"), images=20, points=600, planar=True, noise_px=0.3)
+    network, truth = make_network(seed_of("memory"), images=12, points=500, planar=True, noise_px=0.3)
     a = adjust(network, truth, reject="none", redundancy_numbers=False)
     tracemalloc.start()
     a = with_error_correlation(a, ErrorCorrelation(alone=0.8, common=0.2, length_px=200.0))
@@ -154,6 +155,7 @@ def sigma_of_centres(adjustment: Adjustment) -> float:
     return float(np.sqrt(np.einsum("mii->mi", adjustment.covariance.exterior)[:, :3].mean()))
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize(
     ("name", "share", "length_px"),
     [("scene", 0.3, 400.0), ("scene", 0.3, 100.0), ("scene", 0.1, 400.0), ("unequal", 0.3, 400.0)],

@@ -85,6 +85,7 @@ def test_blocks_take_fronts_and_networks_of_many_rays_the_product_of_full_rows()
     assert isinstance(small, DenseSolver) and small.pairs is None
 
 
+@pytest.mark.sweep(1, 2, 4, 7)
 @pytest.mark.parametrize("bars", [False, True])
 @pytest.mark.parametrize("kind", ["free", "minimal"])
 @pytest.mark.parametrize("pattern", ["fronts", "pairs"])

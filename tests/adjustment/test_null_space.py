@@ -95,6 +95,7 @@ def test_two_networks_without_a_common_point_are_each_in_a_datum_of_their_own(
     assert (moved / np.sqrt(np.trace(full.covariance.points, axis1=1, axis2=2))).max() < 1e-5
 
 
+@pytest.mark.sweep(0, 3, 5, 6)
 @pytest.mark.parametrize("kind", ["free", "minimal"])
 @pytest.mark.parametrize(("left", "open_directions"), [(1, 4), (2, 2)])
 @pytest.mark.parametrize("free", [(), ("c", "x0", "y0", "K1")])

@@ -175,6 +175,7 @@ def noisy(
     return network, Estimate((camera,), position, rotation, points)
 
 
+@pytest.mark.sweep(0, 1)
 @pytest.mark.parametrize("case", ["nadir", "pair", "panorama"])
 def test_what_drifts_until_the_adjustment_ends_unconverged_is_named(case: str) -> None:
     """The noise makes the normal equations regular by chance: 7 of 7, and nothing undetermined."""

@@ -165,6 +165,7 @@ def scatter_over_predicted(reject: str, part: float, copies: int) -> tuple[dict[
     return ratio, float(np.mean(inflated))
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("reject", ["huber", "tukey"])
 @pytest.mark.parametrize("part", [0.0, 0.05])
 def test_standard_deviations_of_m_estimators_are_those_of_their_errors(reject: str, part: float) -> None:

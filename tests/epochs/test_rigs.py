@@ -64,13 +64,13 @@ def test_a_camera_that_was_moved_on_its_rig_is_named_beside_the_points(tmp_path:
 
 
 def test_mounts_that_stayed_pass_as_often_as_the_level_says() -> None:
-    """T times 6 of 40 pairs is chi-square: mean 6, standard deviation of the mean 0.55."""
+    """T times 6 of 16 pairs is chi-square: mean 6, standard deviation of the mean 0.87."""
     T = []
-    for k in range(40):
+    for k in range(16):
         first, second = epoch(f"first {k}").result, epoch(f"second {k}").result
         (one,) = mount_changes(first, second, alpha=0.05, redundancy=None)
         T.append(6 * one.statistic)
-    assert np.mean(T) == pytest.approx(6.0, abs=4 * 0.55)
+    assert np.mean(T) == pytest.approx(6.0, abs=4 * 0.87)
 
 
 def test_without_a_scale_rotations_alone_are_tested() -> None:

@@ -145,6 +145,7 @@ def pair_far_from_others(name: str) -> Figure:
     return moved(figure(X, list(range(6)), name), 5, 9 * SIGMA * np.eye(3)[0])
 
 
+@pytest.mark.sweep(1, 2)
 @pytest.mark.parametrize(("factor", "axis"), [(0.99, 0), (1.01, 1), (1.5, 2), (0.99, 2)])
 def test_stretched_points_are_named(factor: float, axis: int) -> None:
     for n in (6, 12):
@@ -201,6 +202,7 @@ def test_exchanged_names_are_identified() -> None:
     assert found is not None and found.judgement.fits and found.renamed == (1, 3)
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("count", [3, 8])
 def test_coordinates_of_the_next_row_are_reassigned(count: int) -> None:
     for k in range(2):
@@ -368,6 +370,7 @@ def test_twenty_bars_five_times_worse_than_stated_are_imprecise() -> None:
     assert found.factor == pytest.approx(5, rel=0.4) and not found.doubtful
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize(("wrong", "told"), [(2, True), (3, False), (4, False), (5, True)])
 def test_a_part_of_seven_points_is_right_where_it_is_clearly_the_larger(wrong: int, told: bool) -> None:
     """Some were shifted together; chi-square of three against four differs by less than the margin."""

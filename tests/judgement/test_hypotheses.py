@@ -150,6 +150,7 @@ CLEAR = {
 }  # fmt: skip
 
 
+@pytest.mark.sweep(0, 1, 2, 4, 6, 8, 9)
 @pytest.mark.parametrize("kind", list(CLEAR))
 def test_a_planted_fault_is_named_first(kind: str) -> None:
     for number in range(CLEAR[kind], CLEAR[kind] + 4):
@@ -166,6 +167,7 @@ def test_what_photographs_do_not_determine_is_not_left_to_their_other_freedoms()
     assert causes_of("stabiliser", 16011) == ("camera_varies",)
 
 
+@pytest.mark.sweep(0, 3, 6, 8, 10, 12, 14, 18)
 @pytest.mark.parametrize("kind", [kind for kind in EVERY if kind not in FAULTS])
 def test_no_cause_is_named_where_none_is_one(kind: str) -> None:
     assert "held_parameter" not in causes_of(kind, 3)
@@ -456,6 +458,7 @@ def plate_seen_by_few(
     return adjust(replace(seen, camera=network.camera), start, datum=Datum("control"))
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("sigma", [0.0, 5e-5])
 @pytest.mark.parametrize("photographs", [3, 5])
 def test_a_zoom_among_photographs_of_a_plate_is_named(photographs: int, sigma: float) -> None:
@@ -504,6 +507,7 @@ def plate_as_printed(seed: int, bend: float, scatter: float, *, stated: float = 
     return adjust(seen, replace(truth, points=nominal), datum=Datum("control"))
 
 
+@pytest.mark.sweep(1, 2)
 @pytest.mark.parametrize(("bend", "scatter"), [(0.01, 0.0), (0.0, 0.002), (-0.004, 0.001)])
 def test_a_plate_that_is_not_as_given_is_named_and_its_remedy_works(bend: float, scatter: float) -> None:
     """Before, a camera that varies was named, or another shape in some photographs."""

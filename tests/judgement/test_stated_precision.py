@@ -31,6 +31,7 @@ def stated(name: str, factor: float, *, points: int = 12, gross: float = 0.0) ->
     return replace(network, image_points=replace(seen, xy=xy, covariance=covariance)), truth
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize(("factor", "severity"), [(10.0, ("error",)), (2.0, ("warning", "error"))])
 @pytest.mark.parametrize("seed", range(2))
 def test_points_stated_too_precise_are_named(factor: float, severity: tuple[str, ...], seed: int) -> None:

@@ -116,6 +116,7 @@ def mistaken(targets, tolerance, *, missing=0.2):
 
 
 # (noise of a coordinate, tolerance) in px; the grid's spacing is about 70 px in the photographs.
+@pytest.mark.sweep(0, 3, 8)
 @pytest.mark.parametrize(
     ("noise", "tolerance"), [(0.1, 0.6), (0.1, 5.0), (1.0, 5.0), (3.0, 12.0), (5.0, 18.0)]
 )

@@ -48,6 +48,7 @@ def misfit(result, truth):
     )
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("planar", [False, True], ids=["spatial", "planar"])
 @pytest.mark.parametrize("model", ["brown", "opencv"])
 def test_calibrated_cameras(model, planar):
@@ -67,6 +68,7 @@ def test_calibrated_cameras(model, planar):
     assert result.rms_px < 0.3
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("planar", [False, True], ids=["spatial", "planar"])
 @pytest.mark.parametrize("c", [-0.05, 0.05])
 def test_unknown_lens(c, planar):

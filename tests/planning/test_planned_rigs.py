@@ -320,12 +320,12 @@ def test_true_errors_are_those_predicted_in_the_mean(tmp_path: Path) -> None:
     )
     write_page(found, tmp_path / "plan")
     read, squares = read_plan(tmp_path / "plan"), []
-    for seed in range(10):
+    for seed in range(5):
         (tmp_path / str(seed)).mkdir()
         survey = write_simulation(read, tmp_path / str(seed), codes=None, seed=seed)
         result = sfm.run_survey(survey, compare_with="none")
         squares.append(compare_with_plan(read, None, result, seed=seed).error_ratio_squared)
-    low, high = chi2_ppf(0.001, 10) / 10, chi2_ppf(0.999, 10) / 10  # of the bar alone
+    low, high = chi2_ppf(0.001, 5) / 5, chi2_ppf(0.999, 5) / 5  # of the bar alone
     assert low < np.mean(squares) < high
 
 

@@ -54,6 +54,7 @@ def assert_as_printed(found, sheet, numbers, *, radius_mm):
         assert axes == pytest.approx(radius_mm * PX_PER_MM, abs=1.0)
 
 
+@pytest.mark.sweep(0, 4, 5)
 @pytest.mark.parametrize("family", ["ring12", "ring14", "ring20"])
 @pytest.mark.parametrize("dark", [True, False])
 def test_the_printed_page_is_read_back(tmp_path, family, dark):
@@ -65,6 +66,7 @@ def test_the_printed_page_is_read_back(tmp_path, family, dark):
     assert_as_printed(found, sheet, numbers, radius_mm=4.0)
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("dark", [True, False])
 @pytest.mark.parametrize("family", ["cctag3", "cctag4"])
 def test_printed_concentric_tags_are_read_back(tmp_path, family, dark):

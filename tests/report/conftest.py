@@ -1,4 +1,4 @@
-"""Reports of these tests have their plots, and their browser is started once for the tests of a file."""
+"""The browser is started once for the tests of a file."""
 
 from __future__ import annotations
 
@@ -15,8 +15,3 @@ def browser() -> Iterator[Any]:
     """A running browser; the test is skipped where there is none."""
     with chromium() as running:
         yield running
-
-
-@pytest.fixture(autouse=True)
-def plots_too(plots: None) -> None:
-    """Draw the plots of every test here."""

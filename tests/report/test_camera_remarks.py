@@ -93,6 +93,7 @@ def test_focal_lengths_of_both_directions_show_the_shape_of_the_pixels() -> None
     assert not of_kind(verdict_of(a).remarks, "pixels_distorted")
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize(
     ("kind", "size"), [("exchanged", (1500, 2000)), ("halved", (1000, 750)), ("doubled", (2000, 1500))]
 )

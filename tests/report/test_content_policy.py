@@ -28,6 +28,8 @@ from tests.places import ROOT
 from tests.surveys import write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
+pytestmark = pytest.mark.usefixtures("plots")
+
 EVIL = "<script>alert(1)</script><style>*{}</style><img src=https://example.org/x onerror=alert(1)>"
 NOTHING = ["'none'"]
 

@@ -40,6 +40,8 @@ from tests.places import ROOT
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
+pytestmark = pytest.mark.usefixtures("plots")
+
 SCRIPT = ROOT / "tests" / "compare_results.py"
 COMPUTED = (
     *((checks, name) for name in ("variance_components",)),

@@ -48,6 +48,8 @@ from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of
 
+pytestmark = pytest.mark.usefixtures("plots")
+
 PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
 
 

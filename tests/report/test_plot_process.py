@@ -28,6 +28,8 @@ from tests.findings import findings_of
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
 
+pytestmark = pytest.mark.usefixtures("plots")
+
 
 class Unsendable(str):
     """A text that is too much for the memory when it is copied."""
@@ -164,6 +166,7 @@ def _runs(pid: int) -> bool:
         return False
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("given", [None, "/nowhere:"])
 def test_nothing_of_the_current_folder_is_imported(
     given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, process: PlotProcess

@@ -66,6 +66,8 @@ from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of
 from tests.written import WRITTEN
 
+pytestmark = pytest.mark.usefixtures("plots")
+
 EVIL = "<script>alert('x')</script>&\"é€"
 
 

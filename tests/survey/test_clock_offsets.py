@@ -76,6 +76,7 @@ def rig_pictures(moments: int) -> tuple[tuple[AnyArray, ...], ...]:
     )
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("late", [True, False])
 def test_clocks_one_interval_off_in_exif_data_are_tried_at_both_offsets(late: bool, tmp_path: Path) -> None:
     """The right camera misses the first photograph: as they are, its times agree at all its moments."""

@@ -52,6 +52,7 @@ def remarks_on(plate: PlateFamily, targets: Sequence[Targets]) -> tuple[Remark, 
     )
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize(
     ("further", "sides"),
     [(0, ()), (1, ("last 2 columns",)), (2, ("last 4 columns",)), (5, ("first 2 rows",))],

@@ -68,6 +68,7 @@ def run_with(
     return run_survey(replace(read_survey(path), exterior=exterior)), truth.position
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize("off", [100.0, 50_000.0, 3e6])
 def test_one_photograph_far_off_is_left_out(tmp_path: Path, off: float) -> None:
     def change(places: FloatArray) -> FloatArray:

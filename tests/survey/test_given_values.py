@@ -48,6 +48,7 @@ SAME = 1e-6  # standard deviations
 SIX = [pytest.param(f"six {k}", marks=() if k == 7 else pytest.mark.slow) for k in range(20)]
 
 
+@pytest.mark.sweep(0, 4, 8, 11)
 @pytest.mark.parametrize("reject", ["tau", "tukey", "huber"])
 @pytest.mark.parametrize("name", ["six", "eight", "nine", *SIX])
 def test_a_photograph_with_five_good_points_and_a_wild_one_is_kept(reject: str, name: str) -> None:
@@ -128,6 +129,7 @@ def _restart(survey: Survey, folder: Path, *, cameras: bool = True) -> tuple[Sur
     return first, largest
 
 
+@pytest.mark.sweep(0, 2, 5, 6)
 @pytest.mark.parametrize("what", ["cameras", "no cameras", "bars", "check", "two", "control", "minimal"])
 def test_a_restart_from_the_own_result_reproduces_it(what: str, tmp_path: Path) -> None:
     rng = seed_of("restart")

@@ -64,6 +64,16 @@ OF_STUDY = {  # each beside a quick one of the same kind
     "control turned by a row",
     "four of ten control",
     "twenty points too precise, bars",
+    "one of two bars 10 %",
+    "one of two bars 300 for 400",
+    "one of two bars / 10",
+    "one of two bars 24 sigma",
+    "one of two bars, inches",
+    "one of three bars x 1000",
+    "one of three bars, wrong end",
+    "control, one of two bars 1 %",
+    "control 50 sigma",
+    "centres turned, control",
 }
 
 

@@ -102,6 +102,7 @@ def test_unreadable_files_are_named_once_with_their_reason(
         run_survey(read_survey(folder / "survey.toml"), store=store)
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize(
     ("replaced", "found"),
     [

@@ -96,6 +96,7 @@ def test_a_photograph_of_another_state_is_left_out(share: float, left_out: bool)
     assert result.adjustment.sigma0_px == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("number", [215, 219])
 def test_a_photograph_with_the_names_of_other_points_is_left_out(number: int) -> None:
     """A per-photograph camera left residuals of 200 px, and was believed; c was -106 %."""

@@ -98,6 +98,7 @@ def zoomed(picture: np.ndarray, factor: float) -> np.ndarray:
     return cv2.warpAffine(picture, A, (w, h), flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     ("count", "stations", "kinds"),
     [

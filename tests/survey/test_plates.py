@@ -125,7 +125,7 @@ def test_a_plate_that_slipped_far_is_named(tmp_path: Path, slip_mm: float, kind:
         assert {int(name) for name in found.names("points")} == set(range(80, 128))
 
 
-RUNS = 4
+RUNS = 2
 
 
 def test_a_plate_better_than_stated_costs_no_image_points(tmp_path: Path) -> None:

@@ -100,6 +100,7 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     assert turned_away is not None and turned_away.rms_px > 5 * epipolar_px
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize("seen", [1, 3, 4])
 def test_a_photograph_that_only_its_rig_poses_is_named(seen: int, tmp_path: Path) -> None:
     """Four image points determine a pose and check it."""
@@ -235,6 +236,7 @@ def test_wrong_mounts_are_refused(row: str, said: str, tmp_path: Path) -> None:
         run_survey(read_survey(path))
 
 
+@pytest.mark.sweep(1, 2, 5, 6, 9)
 @pytest.mark.parametrize("sigma", [0.0, 1e-3])
 @pytest.mark.parametrize(
     ("mistake", "kind", "direction"),
@@ -372,6 +374,7 @@ def of_rigs(result: SurveyResult) -> tuple[Remark, ...]:
     return of_kind(result.remarks, "rig_contradicted")
 
 
+@pytest.mark.sweep(1, 3)
 @pytest.mark.parametrize(
     ("cameras", "turn", "which"),
     [
@@ -396,6 +399,7 @@ def test_photographs_of_a_bumped_camera_are_free_of_the_rig_and_named(
     assert result.verdict.level == "fair"
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("moments", [[2, 5], [1, 2, 3, 4, 5, 6, 7, 0]])
 def test_photographs_of_other_moments_are_named(moments: list[int], tmp_path: Path) -> None:
     """Two photographs with exchanged names, and a camera whose first photograph is missing."""

@@ -191,6 +191,7 @@ def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
         assert one.reason.number("points") >= 30 and len(one.reason.names("photographs")) == 4
 
 
+@pytest.mark.sweep(1, 2, 3)
 @pytest.mark.parametrize(
     ("mirrored", "control", "severity"),
     [(9, 0, "error"), (8, 0, "error"), (3, 0, "warning"), (8, 8, "warning")],
@@ -234,6 +235,7 @@ def test_one_mirrored_photograph_is_named(control: int) -> None:
     assert one.reason.number("turned") < 0.5 and one.reason.number("before") > 5
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("datum", ["control", "free"])
 def test_control_names_photographs_that_are_all_mirrored(datum: str) -> None:
     """Of a camera that is adjusted: K2 is known to 1 % at the corner, the image points to 0.1 %."""

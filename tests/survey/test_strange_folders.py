@@ -567,6 +567,7 @@ def test_a_result_folder_of_a_stranger_is_left_alone(
     assert (out / "plots" / "holiday.png").read_text() == OWN
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize("name", ["index.html", "batch.csv", "batch.json", "manifest.json"])
 def test_pages_of_a_batch_that_a_person_has_changed_are_kept(name: str, tmp_path: Path) -> None:
     survey, out = observed(tmp_path), tmp_path / "out"

@@ -176,6 +176,7 @@ def test_every_photograph_has_its_own_c_where_texture_shows_that_it_differs() ->
     assert error < 0.005 and not of_kind(found.remarks, "other_camera", "camera_varies")
 
 
+@pytest.mark.sweep(0, 1, 3)
 @pytest.mark.parametrize(
     ("change", "textured", "settings"),
     [(0.0, True, {}), (0.04, False, {}), (0.04, True, {"free": ("c",)}), (0.04, True, {"free": ()})],

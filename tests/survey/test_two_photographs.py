@@ -226,6 +226,7 @@ def test_a_strip_of_which_most_is_in_two_photographs_is_covered_by_points_of_two
         assert 0.7 < np.sqrt(np.mean(over[some] ** 2)) < 1.3
 
 
+@pytest.mark.slow
 def test_two_photographs_from_a_folder_do_not_calibrate_their_camera(tmp_path: Path) -> None:
     """The draft assumes c, which scales the depth, and no residual shows it."""
     scene = Scene(corner_of_walls(seed_of("walls")), *around(seed_of("stations"), 8))

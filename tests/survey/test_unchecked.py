@@ -174,6 +174,7 @@ def test_fixed_control_is_weighted_as_it_scatters(decimals: int | None, kinds: t
     assert np.abs(result.estimate.points[index] - truth.points[index]).max() < 5e-5
 
 
+@pytest.mark.sweep(0, 2)
 @pytest.mark.parametrize(("points", "error"), [(4, 0.0), (8, 0.0), (8, 3e-4), (16, 1e-3)])
 def test_the_decimals_of_fixed_control_do_not_change_the_result(points: int, error: float) -> None:
     """The same control in mm and, converted, in 0.01 mm: points were left out, or no longer weighted."""

@@ -89,6 +89,7 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
     assert found.level == "bad" and found.kinds[0] == "other_solution"
 
 
+@pytest.mark.sweep(1, 2)
 @pytest.mark.parametrize(
     "number",
     [

@@ -97,6 +97,7 @@ SIGMA = 1e-3  # m, of control
 FREE = ("c", "x0", "y0", "K1")
 
 
+@pytest.mark.sweep(0, 3, 5, 6, 12, 15)
 @pytest.mark.parametrize("reject", ["tau", "none"])
 @pytest.mark.parametrize("control", ["weighted", "rounded"])
 @pytest.mark.parametrize("noise_px", [0.0, 1e-6, 3e-4, 1e-2])

@@ -37,6 +37,7 @@ def _factor(said: Remark) -> float:
     return said.number("times") if "times" in said.numbers else 1 + said.number("off") / 100
 
 
+@pytest.mark.sweep(0, 3, 5, 6)
 @pytest.mark.parametrize("reject", ["tau", "none"])
 @pytest.mark.parametrize("factor", [0.1, 1.02, 10.0, 1000.0])
 def test_of_two_bars_neither_is_believed(factor: float, reject: str) -> None:
@@ -89,6 +90,7 @@ def test_control_too_large_for_the_bars_of_many_networks_is_bad() -> None:
     assert bad == 16
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("factor", [0.5, 2.5, 10.15, 1000.0])
 def test_of_three_bars_the_wrong_one_is_left_out(factor: float) -> None:
     network, truth = _scene("three bars")
@@ -201,6 +203,7 @@ def _table(truth: Estimate, rows: int, factor: float) -> ObservationTable:
     )
 
 
+@pytest.mark.sweep(0, 3, 5, 6)
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("factor", "unit"), [(3.2808, 3.28), (1.01, None), (1000.0, 1000.0), (1.0, None)])
 def test_a_table_of_one_scale_does_not_outvote_two_bars(factor: float, unit: float | None, seed: int) -> None:

@@ -105,6 +105,7 @@ def test_dots_of_five_pixels_are_at_the_bound(diameter: float, blur: float, nois
 CASES = [(-1, 0.0, 1.05), (1, 0.0, 1.05), (-1, 0.2, 1.1), (1, 0.2, 1.6)]
 
 
+@pytest.mark.sweep(1, 2)
 @pytest.mark.parametrize(("sign", "shading", "limit"), CASES)
 def test_few_targets_are_at_the_bound(sign: int, shading: float, limit: float) -> None:
     image, truth, bound = photograph((10, 8), 90, sign, shading, 1)

@@ -118,6 +118,7 @@ def labels(outline: str, rim: float, ratio: float, turn_deg: float) -> tuple[Any
     return exposed(ink, np.random.default_rng(5)), places @ A.T + middle
 
 
+@pytest.mark.sweep(0, 5, 10)
 @pytest.mark.parametrize("rim", [0.5, 0.9])
 @pytest.mark.parametrize(("ratio", "turn_deg"), [(1.0, 0), (0.5, 25)])
 @pytest.mark.parametrize("outline", ["round", "square", "oblong"])
@@ -178,6 +179,7 @@ def keys() -> AnyArray:
     return exposed(ink, np.random.default_rng(6))
 
 
+@pytest.mark.sweep(0, 3, 6, 9)
 @pytest.mark.parametrize("rows_apart", [1.0, 0.866])
 @pytest.mark.parametrize(("radius", "pitch"), [(5, 2.4), (5, 3.0), (5, 3.6), (8, 2.8), (8, 3.3)])
 def test_holes_are_refused_without_a_search(
@@ -194,6 +196,7 @@ def test_keys_are_refused_without_a_search(monkeypatch: pytest.MonkeyPatch) -> N
     assert searched < found / 4
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("pitch", [3.0, 3.5])
 @pytest.mark.parametrize("square", [False, True])
 def test_large_keys_at_the_radii_of_a_ring_are_refused_without_a_search(

@@ -122,6 +122,7 @@ def test_a_mirrored_family_reads_the_mirrored_ring(name: str) -> None:
         assert read(picture[:, ::-1], mirrored, affine, 20, 200) == family.number[k]
 
 
+@pytest.mark.sweep(0, 2, 4)
 @pytest.mark.parametrize("name", ["ring12", "ring14", "ring20"])
 @pytest.mark.parametrize(("dark", "bright"), [(20.0, 200.0), (210.0, 40.0)])
 def test_rings_are_read_at_any_rotation_and_tilt(name: str, dark: float, bright: float) -> None:

@@ -54,6 +54,7 @@ def drawn(name: str, count: int, radius: float, **options: float) -> list[Tag]:
     return [draw_tag(family, int(n), radius, rng=rng, **settings) for n in numbers]
 
 
+@pytest.mark.sweep(1, 2, 5)
 @pytest.mark.parametrize(
     ("name", "radius", "options"),
     [

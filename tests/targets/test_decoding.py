@@ -184,6 +184,7 @@ def study(name: str, count: int, seed: int, least_recall: float) -> None:
     assert recall >= least_recall
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("name", ["ring12", "ring14", pytest.param("ring20", marks=pytest.mark.slow)])
 def test_few_rings_are_decoded(name: str) -> None:
     study(name, 128, 1, 0.98)  # 95 are legible: one may be missed

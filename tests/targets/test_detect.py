@@ -168,6 +168,7 @@ def nearest(found: FloatArray, reference: FloatArray) -> tuple[AnyArray, FloatAr
     return distance.argmin(axis=1), distance.min(axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "camcal").exists(), reason="../shared/data is absent")
 def test_camcal_reference_points_are_measured() -> None:
     reference: dict[int, list[tuple[float, ...]]] = {}
@@ -196,6 +197,7 @@ def test_camcal_reference_points_are_measured() -> None:
     assert d.std(axis=0).max() < 0.17  # the marks of the reference have about 0.14 px themselves
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "retro-panel").exists(), reason="../shared/data is absent")
 def test_retro_panel_codes_are_read() -> None:
     text = (DATA / "retro-panel" / "reference-image-points.csv").read_text().splitlines()[1:]

@@ -170,6 +170,7 @@ def test_what_is_unlike_the_others() -> None:
             assert _stands_out(values, values[sound])[0] == unlike
 
 
+@pytest.mark.sweep(2, 3)
 @pytest.mark.parametrize(
     ("name", "size"),
     [

@@ -51,6 +51,7 @@ def test_shifted_rows_are_placed_in_twelve_ways_none_of_them_mirrored() -> None:
         assert all(int(step.sum()) % 2 == 0 for step in (down, across))  # from dot to dot
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("rings", [False, True])
 def test_dots_are_named_by_their_marks_however_the_plate_is_seen(rings: bool) -> None:
     """Half of the plate beyond the border, a tenth of the dots not found, others that are none."""
@@ -82,6 +83,7 @@ LAYOUTS = {
 }
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_three_marks_are_enough_wherever_they_are(layout: str) -> None:
     """Whole plates, and with a column of dots beyond the plate."""

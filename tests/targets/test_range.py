@@ -57,6 +57,7 @@ def mixed_photograph(sixteen_bit: bool, seed: int) -> tuple[AnyArray, list[tuple
     return np.rint(image).clip(0, 255).astype(np.uint8), truth
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize("sixteen_bit", [False, True])
 def test_all_sizes_and_tilts_of_both_polarities_in_one_photograph(sixteen_bit: bool) -> None:
     image, truth = mixed_photograph(sixteen_bit, 3)

@@ -74,6 +74,7 @@ def count_read(targets: Targets, centre: FloatArray, codes: IntArray) -> int:
     return len(read)
 
 
+@pytest.mark.sweep(0, 2, 4)
 @pytest.mark.parametrize(
     ("name", "radii", "bright", "tilt_deg"),
     [

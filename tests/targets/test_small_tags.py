@@ -59,6 +59,7 @@ def photographed(name: str, seed: int, longest: float = 23.0) -> tuple[AnyArray,
     return np.rint(picture).clip(0, 255).astype(np.uint8), number, corners
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     "name", ["apriltag36h11", "aruco4x4_50", pytest.param("aruco5x5_250", marks=pytest.mark.slow)]
 )
@@ -81,6 +82,7 @@ def test_as_many_as_opencv_are_found_and_measured_better(name: str) -> None:
     assert 0.8 < ratio < 1.2  # no tag has less than its pixels say, some have more by chance
 
 
+@pytest.mark.slow
 def test_a_wrong_id_is_not_confirmed() -> None:
     name = "aruco4x4_50"
     picture, number, corners = photographed(name, 3)
@@ -179,6 +181,7 @@ LIGHTS = {
 }  # fmt: skip
 
 
+@pytest.mark.sweep(0, 1)
 @pytest.mark.parametrize(
     ("name", "side"),
     [
@@ -250,6 +253,7 @@ def test_a_dark_plate_with_a_coded_ring_is_no_tag(side: int) -> None:
     assert len(tags.xy) == 0 and len(tags.quads) == 0 and len(tags.rejected_xy) == 4
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("seed", [100, 211, *(pytest.param(k, marks=pytest.mark.slow) for k in (103, 229))])
 def test_letters_are_no_small_tags(seed: int) -> None:
     """Uneven light explains letters of 5 x 8 px (211, 229) as a tag whose modules are hardly resolved."""

@@ -104,6 +104,7 @@ def photographed(
     return picture, project(camera, position, rotation, corners)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     ("half", "inverted"), [(30.0, False), (45.0, True), pytest.param(60.0, False, marks=SLOW)]
 )
@@ -136,6 +137,7 @@ def sharpened(picture: AnyArray, amount: float, mask_px: float) -> AnyArray:
     return np.clip(np.rint(picture + amount * (picture - wide)), 0, 255).astype(np.uint8)
 
 
+@pytest.mark.sweep(1, 4)
 @pytest.mark.parametrize(
     ("half", "blur_px", "mask_px", "touched"),
     [
@@ -351,6 +353,7 @@ def test_sizes_that_do_not_go_with_the_codes_are_refused(tmp_path: Path) -> None
             read_survey(path)
 
 
+@pytest.mark.sweep(0)
 @pytest.mark.parametrize(("name", "dark"), [("apriltag25h9", True), ("aruco6x6_250", False)])
 def test_a_photographed_sheet_gives_its_ids(name: str, dark: bool) -> None:
     sheet = lay_out_sheet(name, np.arange(12), diameter_mm=40.0, dark=dark)
@@ -380,6 +383,7 @@ def test_a_photographed_sheet_gives_its_ids(name: str, dark: bool) -> None:
     assert np.abs(error).max() < 0.1
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     "name",
     [

@@ -13,7 +13,7 @@ from sfm.conventions import AnyArray
 from sfm.photographs.exif import Metadata
 from sfm.survey.drafting import target_trial
 from sfm.survey.drafting.camera_groups import group_photographs
-from sfm.survey.drafting.target_trial import LOOK_PX, MIN_PIXEL_RATIO, try_targets
+from sfm.survey.drafting.target_trial import MIN_PIXEL_RATIO, try_targets
 from sfm.targets.codes import plate_search
 from sfm.targets.codes.plate_search import Part, part_of_checkerboard
 from tests.synthetic import seed_of
@@ -96,7 +96,13 @@ def test_resampled_photographs_are_reported() -> None:
     assert found.remarks == ()
 
 
-SIDE = int(np.sqrt(MIN_PIXEL_RATIO) * LOOK_PX) + 200
+LOOK_PX = 450  # half of what is usual, for the time
+SIDE = int(np.sqrt(MIN_PIXEL_RATIO) * LOOK_PX) + 100
+
+
+@pytest.fixture
+def small_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(target_trial, "LOOK_PX", LOOK_PX)
 
 
 def texture(seed: str) -> AnyArray:
@@ -114,6 +120,7 @@ def with_dots(photograph: AnyArray, *, diameter: int, spacing: int) -> AnyArray:
     return shown
 
 
+@pytest.mark.usefixtures("small_look")
 def test_texture_is_not_measured_for_targets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for i, photograph in enumerate((texture("look 0"), np.full((SIDE, SIDE), 128, np.uint8))):
         cv2.imwrite(str(tmp_path / f"{i}.png"), photograph)
@@ -131,14 +138,16 @@ def test_texture_is_not_measured_for_targets(tmp_path: Path, monkeypatch: pytest
     assert trial.codes == "none" and trial.plate is None and len(trial.photographs) == 2
 
 
-@pytest.mark.parametrize(("diameter", "spacing"), [(10, 60), (60, 200)])
+@pytest.mark.usefixtures("small_look")
+@pytest.mark.parametrize(("diameter", "spacing"), [(10, 60), (40, 140)])
 def test_small_and_large_targets_are_seen(diameter: int, spacing: int) -> None:
-    """Of 10 px, which are lost at low resolution, and of 60 px, few of which are in the middle."""
+    """Of 10 px, which are lost at low resolution, and of 40 px, few of which are in the middle."""
     photograph = with_dots(texture("look"), diameter=diameter, spacing=spacing)
     assert target_trial._look(photograph).shows_targets
 
 
-@pytest.mark.parametrize("side", [*(pytest.param(side, marks=pytest.mark.slow) for side in (24, 48)), 200])
+@pytest.mark.usefixtures("small_look")
+@pytest.mark.parametrize("side", [*(pytest.param(side, marks=pytest.mark.slow) for side in (24, 48)), 100])
 def test_tags_are_seen(side: int) -> None:
     photograph = texture("look at tags")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)

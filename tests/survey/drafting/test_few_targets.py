@@ -67,6 +67,7 @@ def ring(
     )
 
 
+@pytest.mark.sweep(0, 3)
 @pytest.mark.parametrize(
     ("dictionary", "numbers", "module_px"),
     [

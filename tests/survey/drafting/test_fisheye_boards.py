@@ -61,6 +61,7 @@ def folder_of(folder: Path, *, fisheye: bool) -> Path:
     return folder
 
 
+@pytest.mark.sweep(1, 2)
 @pytest.mark.parametrize(("rows", "columns"), [(9, 15), (6, 9), (12, 8)])
 def test_a_bent_board_has_its_whole_size(rows: int, columns: int) -> None:
     for angles in POSES[:4]:

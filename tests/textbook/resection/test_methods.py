@@ -109,6 +109,7 @@ def test_church_refusals():
         resect_church(TANGENTS, POINTS, 2 * POINTS[:3].mean(axis=0) - np.array(FIRST))
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize("planar", [False, True], ids=["spatial", "planar"])
 def test_rampal_finds_the_truth_from_six_points(planar):
     rng = seed_of(f"rampal {planar}")

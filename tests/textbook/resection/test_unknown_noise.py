@@ -60,6 +60,7 @@ def resected(
     return resect_unknown_noise(measured, points), position
 
 
+@pytest.mark.sweep(0, 4, 8)
 @pytest.mark.parametrize("noise", [1e-6, 1e-4, 3e-3])
 @pytest.mark.parametrize(("n", "wrong"), [(8, 0), (12, 3), (40, 20)])
 def test_whatever_the_noise_wrong_points_are_rejected_and_sigma_is_true(
