@@ -255,6 +255,7 @@ def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
     assert alone.design_effect(D) == 1.0
 
 
+@pytest.mark.slow
 def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Estimate]) -> None:
     """The gain of a set of points, each of which may move by itself, spreads as the design effect says."""
     network, truth = scene

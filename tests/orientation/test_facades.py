@@ -55,6 +55,7 @@ def test_the_stated_sigma_does_not_choose_the_solution():
     assert all(one == pytest.approx(found[0], rel=1e-2) for one in found)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     "seed", [0, 3, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 5, 9, 15, 38))]
 )

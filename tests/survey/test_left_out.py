@@ -162,6 +162,7 @@ def network_with_far_points(number: int, count: int, distance: float) -> tuple[N
     )
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(
     ("count", "distance"),
     [

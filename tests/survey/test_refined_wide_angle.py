@@ -131,7 +131,7 @@ def _of_cameras(out: Path, column: str) -> FloatArray:
     return np.array([float(row[column] or "nan") for row in rows_of(out / "sigma_cameras.csv")])
 
 
-@pytest.mark.sweep(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
     [pytest.param("opencv_fisheye", marks=pytest.mark.slow), "simple_division", "thin_prism_fisheye"],

@@ -191,7 +191,7 @@ def test_photographs_of_the_mirror_image_are_named(mirrored: int) -> None:
         assert one.reason.number("points") >= 30 and len(one.reason.names("photographs")) == 4
 
 
-@pytest.mark.sweep(1, 2, 3)
+@pytest.mark.sweep(1, 3)
 @pytest.mark.parametrize(
     ("mirrored", "control", "severity"),
     [(9, 0, "error"), (8, 0, "error"), (3, 0, "warning"), (8, 8, "warning")],

@@ -124,6 +124,10 @@ def test_python_gets_the_error_with_what_was_reached(tmp_path: Path) -> None:
     assert [one.stage for one in reached.seconds] == ["orientation", "matching"]
     again = pickle.loads(pickle.dumps(error))
     assert str(again) == str(error) and again.reached.reason == reached.reason
+
+
+@pytest.mark.slow
+def test_python_gets_the_photographs_that_could_not_be_oriented(tmp_path: Path) -> None:
     with pytest.raises(GeometryError) as caught_too:
         sfm.run_survey(survey_of(tmp_path / "t", "anywhere"))
     failed = getattr(caught_too.value, "reached").failed  # noqa: B009

@@ -65,7 +65,8 @@ def test_an_observed_c_beside_too_few_image_points_is_bad_and_no_failure() -> No
     assert result.adjustment.redundancy == 0 and findings_of(result).verdict.level == "bad"
 
 
-@pytest.mark.parametrize("number", [pytest.param(77, marks=pytest.mark.slow), 142])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [77, 142])
 def test_c_of_three_photographs_that_is_wrong_by_far_is_not_believed(number: int) -> None:
     """Held at its start value, nothing stated, the object was 6 and 11 sigma wrong, and good."""
     found = outcome_of(number, c_sigma=0.4)
@@ -89,7 +90,7 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
     assert found.level == "bad" and found.kinds[0] == "other_solution"
 
 
-@pytest.mark.sweep(1, 2)
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize(
     "number",
     [
