@@ -32,14 +32,14 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
 
     A case that is asked for by its name is run.
     """
-    cases = defaultdict(list)
+    cases = defaultdict[tuple[object, str, tuple[int, ...]], list[pytest.Function]](list)
     for item in items:
-        if item.get_closest_marker("sweep"):
-            cases[item.parent, item.originalname].append(item)
-    for sweep in cases.values():
-        listed = sweep[0].get_closest_marker("sweep").args
-        for place, item in enumerate(sweep):
-            if len(sweep) > 1 and place not in listed:
+        sweep = item.get_closest_marker("sweep")
+        if sweep is not None:
+            cases[item.parent, item.originalname, sweep.args].append(item)
+    for (_, _, listed), of_test in cases.items():
+        for place, item in enumerate(of_test):
+            if len(of_test) > 1 and place not in listed:
                 item.add_marker("slow")
 
 
