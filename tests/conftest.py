@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from collections import defaultdict
 from contextlib import nullcontext
+from math import prod
 from pathlib import Path
 
 # Before numpy is loaded: the tests run in a process for each core, and threads of BLAS beyond the first spin.
@@ -37,7 +38,10 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         sweep = item.get_closest_marker("sweep")
         if sweep is not None:
             cases[item.parent, item.originalname, sweep.args].append(item)
-    for (_, _, listed), of_test in cases.items():
+    for (_, name, listed), of_test in cases.items():
+        count = prod(len(list(one.args[1])) for one in of_test[0].iter_markers("parametrize"))
+        if max(listed) >= count > 1:
+            raise pytest.UsageError(f"{name}: sweep lists place {max(listed)} of {count} cases")
         for place, item in enumerate(of_test):
             if len(of_test) > 1 and place not in listed:
                 item.add_marker("slow")

@@ -104,7 +104,6 @@ def test_camcal_control_distances(camcal: SurveyResult) -> None:
             assert scale * np.linalg.norm(X[a] - X[b]) == pytest.approx(truth, abs=0.5e-3)
 
 
-@pytest.mark.slow
 def test_camcal_needs_no_control_to_start(
     camcal: SurveyResult, shared_data: Path, store: MeasuredStore, tmp_path: Path
 ) -> None:

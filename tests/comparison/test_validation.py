@@ -152,7 +152,6 @@ def test_a_worse_in_house_adjuster_fails_the_run() -> None:
     assert not Validation("colmap", 1, (trial, worse)).passed
 
 
-@pytest.mark.slow
 def test_processes_give_what_one_gives() -> None:
     one = validate(ColmapBackend(), networks=2, seed=4)
     two = validate(ColmapBackend(), networks=2, seed=4, jobs=2)

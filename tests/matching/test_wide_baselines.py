@@ -90,7 +90,6 @@ def test_key_points_that_agree_by_half_only_lead_nowhere() -> None:
     assert np.isnan(affinities_around(left, right, np.array([[50.0, 50.0]])).xy).all()
 
 
-@pytest.mark.slow
 def test_repeated_marks_whose_partner_is_out_of_reach_are_not_matched() -> None:
     """One mark every 130 px, turned by 20 degrees: the window without a given centre holds another one."""
     size, step, turn = 560, 130.0, np.radians(20.0)

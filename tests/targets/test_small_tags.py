@@ -82,7 +82,6 @@ def test_as_many_as_opencv_are_found_and_measured_better(name: str) -> None:
     assert 0.8 < ratio < 1.2  # no tag has less than its pixels say, some have more by chance
 
 
-@pytest.mark.slow
 def test_a_wrong_id_is_not_confirmed() -> None:
     name = "aruco4x4_50"
     picture, number, corners = photographed(name, 3)
