@@ -69,6 +69,7 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "no depth of field": "that all distances are sharp",
     # sources of image points
     "given": "the given image points",
+    "marks": "the named points",
     "targets": "the targets",
     "texture": "the natural texture",
     # what shows which of two parts is mirrored

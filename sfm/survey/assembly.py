@@ -130,6 +130,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         ("control points", survey.control and survey.control.names),
         ("photographs of [exterior]", survey.exterior and survey.exterior.names),
         ("scale bars", survey.scale_bars),
+        ("named points", dict.fromkeys(mark.name for mark in survey.marks)),
         ("image points", [name for given in tables_of(survey.observations) for name in given.point]),
     )
     stated = [f"{len(values)} {name}" for name, values in given if values]

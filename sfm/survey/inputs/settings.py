@@ -297,6 +297,16 @@ class ObservationSettings(Section):
     sigma_px: Length | None = None  # standard deviation of rows that state none; else that of [adjust]
 
 
+class PointSettings(Section):
+    """[[point]]: a natural point that a person names in a photograph, and that is measured in all others."""
+
+    name: Name  # of the point, in this and later surveys
+    image: Name  # photograph in which it is named; the first of a point has its template
+    x_px: Value  # place in the photograph, px
+    y_px: Value
+    sigma_px: Length = 1.0  # standard deviation of pointing, px
+
+
 class ObservationTableSettings(Section):
     """[[survey_observations]]: a table of observations beside photographs, such as tape, level or GNSS."""
 

@@ -16,6 +16,7 @@ from sfm.network import Source
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets")
 GIVEN = Source("given", is_exact=True)
+MARKS = Source("marks")
 TEXTURE = Source("texture", names_last=False, fewest=MIN_TIE_POINTS, has_common_errors=True)
 
 
@@ -45,6 +46,13 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
         lambda given: counted(sum(map(len, tables_of(given))), "image point"),
         is_stated=lambda given: bool(tables_of(given)),
         is_alone=lambda given: not isinstance(given, tuple),  # one table, in place of photographs
+    ),
+    Declared(
+        MARKS,
+        "marks",
+        lambda marks: counted(len({mark.name for mark in marks}), "named point"),
+        "named points",
+        is_stated=bool,
     ),
     Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
 )

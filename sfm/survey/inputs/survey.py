@@ -54,6 +54,7 @@ from sfm.survey.inputs.settings import (
     ExteriorSettings,
     Head,
     PlateSettings,
+    PointSettings,
     RigSettings,
     Section,
     TargetSettings,
@@ -124,6 +125,7 @@ class Survey:
     equipment: tuple[PlacedEquipment, ...] = ()  # equipment of the scale bars and tables, for the report
     # measured image points: one table in place of photographs, or tables beside them
     observations: Observations | tuple[Observations, ...] | None = None
+    marks: tuple[PointSettings, ...] = ()  # natural points that a person names in photographs
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
@@ -164,6 +166,7 @@ class Survey:
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
             "rigs": tuple(_section(RigSettings, one, f"{where}: rig") for one in self.rigs),
             "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
+            "marks": tuple(_section(PointSettings, one, f"{where}: point") for one in self.marks),
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
             "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
         }
@@ -317,6 +320,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
             *equipment.bars,
         ),
         observations=_given_image_points(file),
+        marks=file.marks,
         diameters=read(read_diameters, file.targets.diameters),
         masks=None if file.head.masks is None else file.beside(file.head.masks),
         start_orientations=read(read_exterior, file.approximate.images),

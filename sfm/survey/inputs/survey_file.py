@@ -31,6 +31,7 @@ from sfm.survey.inputs.settings import (
     ObservationSettings,
     ObservationTableSettings,
     PlateSettings,
+    PointSettings,
     RigSettings,
     ScaleBarSettings,
     Section,
@@ -64,6 +65,7 @@ class SurveyFile(Section):
     more_image_points: Annotated[  # beside them
         tuple[ObservationSettings, ...], Field(strict=False, max_length=MAX_TABLES, alias=BESIDE)
     ] = ()
+    marks: Annotated[tuple[PointSettings, ...], Field(strict=False, alias="point")] = ()
     observation_tables: Annotated[
         tuple[ObservationTableSettings, ...],
         Field(strict=False, max_length=MAX_TABLES, alias="survey_observations"),

@@ -11,7 +11,7 @@ matched only in photographs whose pixels there are still free.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,7 +51,7 @@ class CoveringPoints:
 
 
 @dataclass(frozen=True)
-class _Squares:
+class Squares:
     """Textured squares of one reference photograph."""
 
     image: int  # the photograph
@@ -62,13 +62,13 @@ class _Squares:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def select(self, rows: BoolArray) -> _Squares:
+    def select(self, rows: BoolArray) -> Squares:
         """Return the selected squares."""
-        return _Squares(self.image, self.xy[rows], self.normal[rows], self.points[rows])
+        return Squares(self.image, self.xy[rows], self.normal[rows], self.points[rows])
 
 
 @dataclass(frozen=True)
-class _Rays:
+class SquareRays:
     """The squares of one reference photograph, measured in all photographs that see them."""
 
     image_points: ImagePoints
@@ -125,14 +125,14 @@ def find_covering_points(
         xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
-        squares = _Squares(i, xy, normal, points).select(known)
+        squares = Squares(i, xy, normal, points).select(known)
         visible, free = _visible(estimate, camera, squares, hidden, covered, margin, side_px)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
         if not of.any():
             return
-        measured = _match_squares(
+        measured = match_squares(
             *(grey, estimate, camera, squares.select(of), free[:, of], windows, threads), both_ways=not more
         )
         new, used = _points_that_meet(measured.image_points, estimate, camera, rays)
@@ -151,10 +151,25 @@ def find_covering_points(
     return _concatenate_points(found)
 
 
+def seen_squares(
+    estimate: Estimate, camera: IntArray, squares: Squares, margin_px: int
+) -> Iterator[tuple[int, IntArray, FloatArray]]:
+    """Yield each oriented photograph that sees squares from their front, which these are, and where, px."""
+    for j in np.flatnonzero(estimate.oriented).tolist():
+        at = project_points(estimate, camera, np.full(len(squares), j), squares.points)
+        size = np.array(estimate.cameras[camera[j]].size_px)
+        ray = estimate.position[j] - squares.points
+        cosine = np.sum(ray * squares.normal, axis=1) / np.linalg.norm(ray, axis=1)
+        with np.errstate(invalid="ignore"):
+            inside = ((at >= margin_px) & (at <= size - 1 - margin_px)).all(axis=1)
+        rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
+        yield j, rows, at[rows]
+
+
 def _visible(
     estimate: Estimate,
     camera: IntArray,
-    squares: _Squares,
+    squares: Squares,
     hidden: CoveredPixels | None,
     covered: CoveredPixels,
     margin: int,
@@ -166,33 +181,27 @@ def _visible(
     """
     visible = np.zeros((len(covered.shapes), len(squares)), dtype=bool)
     free = visible.copy()
-    for j in np.flatnonzero(estimate.oriented).tolist():
-        at = project_points(estimate, camera, np.full(len(squares.xy), j), squares.points)
-        size = np.array(covered.shapes[j][::-1])
-        ray = estimate.position[j] - squares.points
-        cosine = np.sum(ray * squares.normal, axis=1) / np.linalg.norm(ray, axis=1)
-        with np.errstate(invalid="ignore"):
-            inside = ((at >= margin) & (at <= size - 1 - margin)).all(axis=1)
-        rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
+    for j, rows, at in seen_squares(estimate, camera, squares, margin):
         if hidden is not None:
-            rows = rows[hidden.is_free(j, at[rows], side_px)]
+            shown = hidden.is_free(j, at, side_px)
+            rows, at = rows[shown], at[shown]
         visible[j, rows] = True
-        free[j, rows] = covered.is_free(j, at[rows], side_px)
+        free[j, rows] = covered.is_free(j, at, side_px)
     visible[squares.image] = free[squares.image] = True
     return visible, free
 
 
-def _match_squares(
+def match_squares(
     photographs: GreyPhotographs,
     estimate: Estimate,
     camera: IntArray,
-    squares: _Squares,
+    squares: Squares,
     visible: BoolArray,
     windows: Windows,
     threads: int,
     *,
     both_ways: bool,
-) -> _Rays:
+) -> SquareRays:
     """Measure the squares of a photograph in the others, those with the most similar direction first.
 
     Half of the noise of a match is that of the template, and is assigned to the reference, as in
@@ -262,7 +271,7 @@ def _match_squares(
     parts[0].covariance[some] = in_reference[some] / number[some, None, None]
     seen = ImagePoints.joined(parts)
     some = some[seen.point]
-    return _Rays(seen.select(some), np.concatenate(scales)[some])
+    return SquareRays(seen.select(some), np.concatenate(scales)[some])
 
 
 def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows) -> BoolArray:

@@ -47,22 +47,37 @@ DRAWN_PX = 8.0  # radius of the circles around given image points in the report
 def measure_given(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: object) -> Measurements:
     """Return the network of the image points that a survey gives.
 
-    Photographs and points are numbered in the order in which the tables first name them. The control is
-    part of the network in every datum. The adjustment uses it only if the datum is `control`.
-
     Args:
         survey: a survey with given image points.
-        files: its photographs; none if the image points stand in their place. A table may name a photograph
-            without its folder, and photographs that are not here.
+        files: its photographs; none if the image points stand in their place.
 
     Raises:
-        SurveyFileError: there are no observations, image points are outside their photographs, or the start
-            values of a camera are incomplete.
+        SurveyFileError: as in `read_tables`, or there are no observations.
         PhotographError: photographs of different sizes have the same camera.
     """
     tables: tuple[Observations, ...] = tables_of(survey.observations)
     if not tables:
         raise SurveyFileError(f"{survey.source}: [observations] with a file of image points is needed")
+    return read_tables(survey, tables, files)
+
+
+def read_tables(survey: Survey, tables: tuple[Observations, ...], files: PhotographList) -> Measurements:
+    """Return the network of tables of image points.
+
+    Photographs and points are numbered in the order in which the tables first name them. The control is
+    part of the network in every datum. The adjustment uses it only if the datum is `control`.
+
+    Args:
+        survey: gives cameras, and masks.
+        tables: the image points.
+        files: photographs; none if the image points stand in their place. A table may name a photograph
+            without its folder, and photographs that are not here.
+
+    Raises:
+        SurveyFileError: image points are outside their photographs, or the start values of a camera are
+            incomplete.
+        PhotographError: photographs of different sizes have the same camera.
+    """
     readable, metadata = readable_photographs(files)
     cameras = start_cameras(
         survey.cameras,

@@ -79,10 +79,10 @@ def complete_sources(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
     survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     sources = [source for _, source in sources_of(survey)]
     if len(sources) == 1:
-        completed = [sources[0].complete(survey, measured, start, jobs=jobs)]
+        completed = [sources[0].complete(oriented, measured, start, jobs=jobs)]
     else:
         completed = [
-            source.complete(survey, part, _orientation_of(start, measured, k), jobs=jobs)
+            source.complete(oriented, part, _orientation_of(start, measured, k), jobs=jobs)
             for k, (source, part) in enumerate(zip(sources, measured.parts, strict=True))
         ]
     return _joined_correspondences(survey, measured, start, completed)

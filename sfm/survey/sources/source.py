@@ -18,6 +18,7 @@ from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.orientation import Oriented
 
 
 @dataclass(frozen=True)
@@ -61,17 +62,17 @@ class Measure(Protocol):
 
 
 class Complete(Protocol):
-    """Returns all image points once the photographs are oriented.
+    """Returns all image points of a source once the photographs are oriented.
 
     Args:
-        survey: settings of the survey.
-        measured: what the first measurement returned.
+        oriented: the survey with the image points of all its sources.
+        measured: what the first measurement of this source returned.
         start: orientation of these photographs and points.
         jobs: number of photographs processed in parallel.
     """
 
     def __call__(  # noqa: D102
-        self, survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+        self, oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
     ) -> Correspondences: ...
 
 
@@ -96,7 +97,7 @@ class SurveySource:
 
 
 def complete_as_measured(
-    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+    oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
 ) -> Correspondences:
     """Return the image points as they were first measured."""
     return Correspondences(

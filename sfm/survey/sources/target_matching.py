@@ -31,6 +31,7 @@ from sfm.survey.diagnosis.contradicting_codes import (
 from sfm.survey.diagnosis.photograph_cameras import find_photograph_cameras
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.orientation import Oriented
 from sfm.survey.sources.source import Correspondences
 from sfm.survey.target_network import build_network, match_uncoded, min_rays
 
@@ -41,12 +42,12 @@ TOLERANCE_FACTOR = 6.0  # of the robust spread of the residuals
 
 
 def match_targets_of(
-    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+    oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
 ) -> Correspondences:
     """Return the network of all targets, the uncoded ones too.
 
     Args:
-        survey: settings of the survey.
+        oriented: the survey with the image points of all its sources.
         measured: the coded targets, and all others without a name.
         start: orientation of the photographs, with its final tolerance.
         jobs: not used, the targets are measured already.
@@ -54,7 +55,7 @@ def match_targets_of(
     Raises:
         GeometryError: fewer than two photographs keep enough points.
     """
-    photographs, naming = measured.photographs, measured.naming
+    survey, photographs, naming = oriented.survey, measured.photographs, measured.naming
     assert photographs is not None
     matched, left_out, contested = _without_other_objects(survey, photographs, naming, start)
     naming, network, estimate = matched.naming, matched.network, matched.estimate

@@ -12,14 +12,17 @@ from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.surface_points import cover_photographs
 from sfm.survey.measuring.tie_points import natural_points_of, needed_rays, tie_photographs
+from sfm.survey.orientation import Oriented
 from sfm.survey.sources.source import Correspondences, SurveySource, complete_as_measured
 
 
-def _cover(survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1) -> Correspondences:
+def _cover(
+    oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
+) -> Correspondences:
     """Return the windows that cover the photographs, or the tie points if these have more rays."""
-    surface = cover_photographs(survey, measured, start, jobs=jobs)
+    surface = cover_photographs(oriented.survey, measured, start, jobs=jobs)
     if surface is None:
-        return complete_as_measured(survey, measured, start)
+        return complete_as_measured(oriented, measured, start)
     return Correspondences(
         surface.network,
         surface.estimate,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +26,7 @@ from sfm.survey.inputs.settings import (
     SMALLEST,
     CameraSettings,
     ExteriorSettings,
+    PointSettings,
     RigSettings,
     TargetSettings,
 )
@@ -99,12 +102,30 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
                 f"{where}: scale_bar {bar.start} - {bar.end}: length {bar.length:g} is more than a million "
                 f"times its sigma {bar.sigma:g}; are both in {survey.unit}?"
             )
+    _refuse_contradicting_points(survey.marks, where)
     _refuse_contradicting_sizes(survey.targets, where, survey.unit)
     if is_table(survey.targets.codes) and not Path(survey.codes).is_file():
         raise SurveyFileError(
             f"{where}: targets.codes = '{survey.targets.codes}' is neither one of "
             f"{', '.join((*FAMILIES, *PLATES))} nor a table file in {survey.folder}"
         )
+
+
+def _refuse_contradicting_points(points: Sequence[PointSettings], where: str) -> None:
+    """Raise SurveyFileError if a point is named twice in a photograph, or two points at one place."""
+    for first, second in combinations(points, 2):
+        if first.image != second.image:
+            continue
+        if first.name == second.name:
+            raise SurveyFileError(
+                f"{where}: point '{first.name}' is named twice in {first.image}, needed once"
+            )
+        distance = math.hypot(first.x_px - second.x_px, first.y_px - second.y_px)
+        if distance <= max(first.sigma_px, second.sigma_px):
+            raise SurveyFileError(
+                f"{where}: points '{first.name}' and '{second.name}' are {distance:.3g} px apart in "
+                f"{first.image}, which is no more than sigma_px; needed one name for one place"
+            )
 
 
 def _refuse_contradicting_exterior(survey: Survey | SurveyFile) -> None:
