@@ -55,7 +55,7 @@ class Squares:
     """Textured squares of one reference photograph."""
 
     image: int  # the photograph
-    xy: FloatArray  # middles, whole pixels, (k, 2)
+    xy: FloatArray  # middles, px, (k, 2)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
     points: FloatArray  # object points, (k, 3)
 

@@ -156,7 +156,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
 
 def _with_full_names(table: Observations, files: PhotographList) -> Observations:
     """Return the image points of a table with the names that the files of their photographs have."""
-    full = _full_names(files)
+    full = full_names(files)
     return replace(table, image=tuple(full.get(name, name) for name in table.image))
 
 
@@ -204,7 +204,7 @@ def _merge_tables(
     )
 
 
-def _full_names(files: PhotographList) -> dict[str, str]:
+def full_names(files: PhotographList) -> dict[str, str]:
     """Return the name of each photograph whose name without folders is that of no other, by that name."""
     count = Counter(PurePosixPath(name).name for name in files.names)
     known = set(files.names)

@@ -14,29 +14,34 @@ photographs, and they stay where nothing is matched.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.camera import tangents_from_pixel
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import SurveyFileError
+from sfm.matching.conjugate import match_points
 from sfm.matching.lsm.coverage import Windows
 from sfm.matching.lsm.depth_search import search_depth
 from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, planes_at
-from sfm.matching.radiometry import GreyPhotographs
+from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.orientation.incremental.sequence import Orientation
+from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, Orientation
+from sfm.orientation.resection.ransac import resect_robust
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.remarks.remark import remark
 from sfm.survey.inputs.given import Observations
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, Measurements, PhotographList
+from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import GIVEN, MARKS
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
+from sfm.survey.inputs.survey_file import path_inside
 from sfm.survey.measuring.covering_points import (
     BORDER_PX,
     FIRST_PHOTOGRAPHS,
@@ -48,39 +53,55 @@ from sfm.survey.measuring.covering_points import (
 )
 from sfm.survey.measuring.tie_points import drawn_windows
 from sfm.survey.orientation import Oriented
-from sfm.survey.sources.given import read_tables
+from sfm.survey.sources.given import full_names, read_tables
 from sfm.survey.sources.source import Correspondences, SurveySource
+
+EARLIER = "earlier"  # name of a photograph of an earlier epoch, which takes no part in the network
+MOST_RESECTED = 100  # points of a photograph that orient it
+MIN_MARKED = 2  # photographs in which a point without a match is marked by hand
+NONE = np.zeros(0, dtype=np.int64)
 
 
 def measure_marks(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: object) -> Measurements:
-    """Return the network of the places that a person names.
+    """Return the network of the places that a person names in the photographs of a survey.
 
     Args:
         survey: a survey with named points.
         files: its photographs.
 
     Raises:
-        SurveyFileError: a named point is in no photograph of the survey, or outside its photograph.
+        SurveyFileError: the photograph of a named point does not exist, or shows less than its place.
         PhotographError: photographs of different sizes have the same camera.
     """
-    marks = survey.marks
-    sigma = np.array([[mark.sigma_px] * 2 for mark in marks])
+    known = _names_of(files)
+    here = [mark for mark in survey.marks if mark.image in known]
+    for mark in survey.marks:
+        if mark.image not in known and not _path_of(survey, mark).is_file():
+            raise SurveyFileError(
+                f"{survey.source}: point '{mark.name}' is named in '{mark.image}', which is neither a "
+                "photograph of the survey nor a file of an earlier epoch"
+            )
+    if not here:
+        nothing = ImagePoints(NONE, NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+        return Measurements(Network((), NONE, (), nothing), (), (), NONE)
     table = Observations.from_arrays(
-        [mark.image for mark in marks],
-        [mark.name for mark in marks],
-        [[mark.x_px, mark.y_px] for mark in marks],
-        sigma,
+        [mark.image for mark in here],
+        [mark.name for mark in here],
+        [[mark.x_px, mark.y_px] for mark in here],
+        [[mark.sigma_px, mark.sigma_px] for mark in here],
     )
     table = replace(table, table=replace(table.table, path=Path(f"{survey.source}: [[point]]")))
-    measured = read_tables(survey, (table,), files)
-    known = set(files.names)
-    for image in measured.network.images:
-        if image not in known:
-            name = next(mark.name for mark in marks if mark.image == image)
-            raise SurveyFileError(
-                f"{survey.source}: point '{name}' is named in '{image}', which is no photograph of the survey"
-            )
-    return measured
+    return read_tables(survey, (table,), files)
+
+
+def _names_of(files: PhotographList | None) -> frozenset[str]:
+    """Return the names of photographs, with folders and without."""
+    return frozenset() if files is None else frozenset({*files.names, *full_names(files)})
+
+
+def _path_of(survey: Survey, mark: PointSettings) -> Path:
+    """Return the file of the photograph of a mark, which may be of an earlier epoch."""
+    return path_inside(survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside)
 
 
 def match_marks(
@@ -90,35 +111,37 @@ def match_marks(
 
     Args:
         oriented: the survey with the image points of all its sources, which give the surface.
-        measured: the places that the person names.
-        start: orientation of their photographs, and points that several of them show.
+        measured: the places that the person names in photographs of the survey.
+        start: orientation of these photographs, and points that several of them show.
         jobs: number of photographs processed in parallel.
 
     Raises:
-        SurveyFileError: a named point has the name of a target.
+        SurveyFileError: a named point has the name of a target, or its place is outside a photograph of an
+            earlier epoch.
+        PhotographError: a photograph of an earlier epoch cannot be read.
     """
-    survey, whole, points = oriented.survey, oriented.measured.network, measured.network.points
+    survey, whole, part = oriented.survey, oriented.measured.network, measured.network
+    points = tuple(dict.fromkeys(mark.name for mark in survey.marks))
     _refuse_names_of_others(survey, whole, points)
     scene = _scene_of(oriented)
-    by_hand = measured.network.image_points
+    known = np.full((len(points), 3), np.nan)
     index = {name: i for i, name in enumerate(whole.images)}
-    image = np.array([index[name] for name in measured.network.images], dtype=np.int64)
-    by_hand = replace(by_hand, image=image[by_hand.image], source=None)
-    of_point, first = np.unique(by_hand.point, return_index=True)
+    image = np.array([index[name] for name in part.images], dtype=np.int64)
+    point = np.array([points.index(name) for name in part.points], dtype=np.int64)
+    known[point] = start.estimate.points
+    seen = part.image_points
+    by_hand = replace(seen, image=image[seen.image], point=point[seen.point], source=None)
     windows = Windows(survey.texture.window_px)
-    parts = [by_hand.select(slice(0))]
-    for i, rows in enumerate(rows_of(by_hand.image[first], len(whole.images))):
-        if len(rows) and scene.estimate.oriented[i]:
-            point = of_point[rows]
-            places = by_hand.xy[first[rows]]
-            rays = _match_templates(scene, i, places, start.estimate.points[point], windows, jobs)
-            parts.append(replace(rays, point=point[rays.point]))
-    matched = ImagePoints.joined(parts)
-    lost = np.setdiff1d(of_point, matched.point)
+    parts = [
+        *_match_templates_here(scene, by_hand, known, windows, jobs),
+        *_match_templates_of_others(survey, scene, points, known, windows, jobs),
+    ]
+    matched = ImagePoints.joined([by_hand.select(NONE), *parts])
+    lost = np.setdiff1d(np.arange(len(points)), matched.point).tolist()
     noise = survey.adjust.sigma_px**2 * np.eye(2)
     matched = replace(matched, covariance=matched.covariance + noise)
-    key, known = (seen.image * len(points) + seen.point for seen in (by_hand, matched))
-    everything = ImagePoints.joined([matched, by_hand.select(~np.isin(key, known))])
+    by_hand_key, key = (one.image * len(points) + one.point for one in (by_hand, matched))
+    everything = ImagePoints.joined([matched, by_hand.select(~np.isin(by_hand_key, key))])
     everything = everything.select(np.argsort(everything.point, kind="stable"))
     network = network_of(survey, whole.images, whole.camera, points, everything)
     found = intersect_image_points(
@@ -128,16 +151,15 @@ def match_marks(
         n_points=len(points),
         tolerance_px=float(start.tolerance_px.max()),
     )
-    unmatched = (remark("marks_unmatched", points=[points[j] for j in lost]),) if len(lost) else ()
     paths = [scene.paths.get(name, Path()) for name in network.images]
     drawn = drawn_windows(network, paths, windows.side_px)
     return Correspondences(
         network,
         replace(scene.estimate, points=found.points),
-        measured.min_rays,
+        np.full(len(points), MIN_MARKED),
         point_failures=start.point_failures,
         given=start.kind == "given",
-        remarks=unmatched,
+        remarks=(remark("marks_unmatched", points=[points[j] for j in lost]),) if lost else (),
         overlays=tuple(overlay for overlay in drawn if overlay.image in scene.paths),
     )
 
@@ -150,8 +172,10 @@ class _Scene:
     estimate: Estimate
     seen: ImagePoints
     paths: Mapping[str, Path]
+    names: frozenset[str]  # of these photographs, with folders and without
     grey: GreyPhotographs
     masks: Masks
+    earlier: int = -1  # photograph of an earlier epoch, of which the points may have moved
 
     def visible(self, j: int, xy: FloatArray) -> BoolArray:
         """Return which positions in a photograph are not masked, (k,)."""
@@ -168,8 +192,9 @@ def _scene_of(oriented: Oriented) -> _Scene:
     return _Scene(
         network,
         replace(start.estimate, position=position),
-        network.image_points.select(fits),
+        replace(network.image_points.select(fits), source=None, stated=None),
         paths,
+        _names_of(files),
         GreyPhotographs(lambda i: read_photograph(paths[network.images[i]])),
         Masks(oriented.survey.masks),
     )
@@ -186,8 +211,96 @@ def _refuse_names_of_others(survey: Survey, network: Network, points: Sequence[s
             )
 
 
+def _match_templates_here(
+    scene: _Scene, by_hand: ImagePoints, known: FloatArray, windows: Windows, jobs: int
+) -> Iterator[ImagePoints]:
+    """Yield the rays of points whose first mark is in a photograph of the survey."""
+    of_point, first = np.unique(by_hand.point, return_index=True)
+    for i, rows in enumerate(rows_of(by_hand.image[first], len(scene.network.images))):
+        if len(rows) and scene.estimate.oriented[i]:
+            point = of_point[rows]
+            rays = _match_templates(scene, i, by_hand.xy[first[rows]], known[point], windows, jobs)
+            yield replace(rays, point=point[rays.point])
+
+
+def _match_templates_of_others(
+    survey: Survey, scene: _Scene, points: Sequence[str], known: FloatArray, windows: Windows, jobs: int
+) -> Iterator[ImagePoints]:
+    """Yield the rays of points whose first mark is in a photograph of an earlier epoch.
+
+    This photograph is oriented on points that have not moved, and gives nothing but the templates.
+    """
+    first = {mark.name: mark for mark in reversed(survey.marks)}
+    earlier = [mark for mark in first.values() if mark.image not in scene.names]
+    for path in dict.fromkeys(_path_of(survey, mark) for mark in earlier):
+        marks = [mark for mark in earlier if _path_of(survey, mark) == path]
+        photograph = grey_of(read_photograph(path))
+        height, width = photograph.shape
+        for mark in marks:
+            if not (0 <= mark.x_px < width and 0 <= mark.y_px < height):
+                raise SurveyFileError(
+                    f"{survey.source}: point '{mark.name}' is at {mark.x_px:g}, {mark.y_px:g} px, outside "
+                    f"{mark.image} of {width} x {height} px"
+                )
+        with_earlier = _with_earlier(scene, photograph)
+        if with_earlier is not None:
+            xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
+            point = np.array([points.index(mark.name) for mark in marks])
+            rays = _match_templates(with_earlier, len(scene.network.images), xy, known[point], windows, jobs)
+            yield replace(rays, point=point[rays.point])
+
+
+def _with_earlier(scene: _Scene, photograph: AnyArray) -> _Scene | None:
+    """Return the photographs and one of an earlier epoch, oriented on its points; None if it cannot be.
+
+    It is assumed to be of the first camera with photographs of its size.
+    """
+    network, estimate, seen = scene.network, scene.estimate, scene.seen
+    of_size = [a for a, lens in enumerate(estimate.cameras) if lens.size_px == photograph.shape[::-1]]
+    if not of_size:
+        return None
+    lens, m = estimate.cameras[of_size[0]], len(network.images)
+    most = np.argsort(-np.bincount(seen.image, minlength=m), kind="stable")[:FIRST_PHOTOGRAPHS]
+    parts = [seen.select(NONE)]
+    for i in most.tolist():
+        shown = seen.select(seen.image == i)
+        if len(shown):
+            shown = shown.select(np.arange(0, len(shown), -(-len(shown) // MOST_RESECTED)))
+            found = match_points(scene.grey[i].pixels, photograph, shown.xy)
+            there = replace(shown, image=np.full(len(shown), m), xy=found.right)
+            parts.append(there.select(found.good))
+    matched = ImagePoints.joined(parts)
+    resected = resect_robust(
+        tangents_from_pixel(lens, matched.xy),
+        estimate.points[matched.point],
+        tolerance=FINAL_TOLERANCE_PX / lens.c_px,
+        field=lens.size_px[0] * lens.size_px[1] / lens.c_px**2,
+    )
+    if not resected.found:
+        return None
+    return replace(
+        scene,
+        network=replace(
+            network, images=(*network.images, EARLIER), camera=np.append(network.camera, of_size[0])
+        ),
+        estimate=replace(
+            estimate,
+            position=np.concatenate([estimate.position, resected.position[None]]),
+            rotation=np.concatenate([estimate.rotation, resected.rotation[None]]),
+        ),
+        seen=ImagePoints.joined([seen, matched.select(resected.inliers)]),
+        grey=GreyPhotographs(lambda j: photograph if j == m else scene.grey[j].pixels),
+        earlier=m,
+    )
+
+
 def _match_templates(
-    scene: _Scene, i: int, xy: FloatArray, known: FloatArray, windows: Windows, jobs: int
+    scene: _Scene,
+    i: int,
+    xy: FloatArray,
+    known: FloatArray,
+    windows: Windows,
+    jobs: int,
 ) -> ImagePoints:
     """Return the rays of points with a template in photograph i, in all photographs that show them.
 
@@ -220,7 +333,7 @@ def _match_templates(
             rays = _rays_that_meet(scene, squares, windows, jobs)
             parts.append(replace(rays, point=rows[rays.point]))
             lost = np.setdiff1d(lost, parts[-1].point)
-    return ImagePoints.joined(parts)
+    return ImagePoints.joined([scene.seen.select(NONE), *parts])
 
 
 def _search_along_rays(
@@ -263,7 +376,7 @@ def _rays_that_meet(scene: _Scene, squares: Squares, windows: Windows, jobs: int
     for j, rows, at in seen_squares(estimate, camera, squares, windows.side_px // 2 + BORDER_PX):
         shown[j, rows[scene.visible(j, at)]] = True
     shown[i] = True
-    count = shown.sum(axis=0)
+    count = shown.sum(axis=0) - (i == scene.earlier)
     parts = []
     for needed, these in ((MIN_RAYS, count >= MIN_RAYS), (2, count == 2)):
         numbers = np.flatnonzero(these)
@@ -279,13 +392,15 @@ def _rays_that_meet(scene: _Scene, squares: Squares, windows: Windows, jobs: int
             jobs,
             both_ways=needed == 2,
         ).image_points
+        rays = rays.select(rays.image != scene.earlier)
         met = intersect_image_points(rays, camera, estimate, n_points=len(numbers), tolerance_px=TOLERANCE_PX)
         used = rays.select(met.used)
         enough = np.bincount(used.point, minlength=len(numbers)) >= needed
-        enough &= np.bincount(used.point[used.image == i], minlength=len(numbers)) > 0
+        if i != scene.earlier:  # the ray of the template is the point
+            enough &= np.bincount(used.point[used.image == i], minlength=len(numbers)) > 0
         used = used.select(enough[used.point])
         parts.append(replace(used, point=numbers[used.point]))
-    return ImagePoints.joined(parts)
+    return ImagePoints.joined([scene.seen.select(NONE), *parts])
 
 
 SOURCE = SurveySource(measure_marks, match_marks)
