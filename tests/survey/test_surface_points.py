@@ -24,7 +24,7 @@ from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring import covering_points, surface_points, tie_points
-from sfm.survey.measuring.covering_points import CoveringPoints, _Squares, _visible
+from sfm.survey.measuring.covering_points import CoveringPoints, Squares, _visible
 from sfm.survey.measuring.surface_points import Surface, cover_photographs
 from sfm.survey.measuring.tie_points import natural_points_of
 from tests.matching.test_tie_points import _scene as small_scene
@@ -249,7 +249,7 @@ def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_b
     across /= np.linalg.norm(across)
     # normals that look at the second photograph, hardly look at it, and look away
     normal = np.stack([to_second, across + 0.2 * to_second, -to_second])
-    places = _Squares(0, np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
+    places = Squares(0, np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
     covered_pixels = CoveredPixels([(360, 480)] * 3)
     assert _visible(truth, camera, places, None, covered_pixels, 11, 15)[1][1].tolist() == [
         True,

@@ -373,11 +373,13 @@ def _example_lines(trial: TargetTrial) -> list[str]:
         first, second = "corner 1", "corner 2"
         ends, known = "points with names", "coordinates of such points"
         named = [
-            "# Points of texture have no names. Image points of points with names, measured by hand in two",
-            "# photographs or more, in a table image,point,x_px,y_px beside this file:",
-            "# [[observations]]",
-            '# file = "image_points.csv"',
-            "# sigma_px = 0.5",
+            "# Points of texture have other names in every run. A point that you name in one photograph keeps",
+            "# its name and is found in the others (repeat the section for each point):",
+            "# [[point]]",
+            f"# name = {_quoted(first)}",
+            f"# image = {_quoted(next(iter(trial.photographs), 'photograph.jpg'))}",
+            "# x_px = 1200.5",
+            "# y_px = 800.5",
             "#",
         ]
     return [

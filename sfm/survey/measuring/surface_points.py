@@ -81,7 +81,7 @@ def cover_photographs(
     Returns:
         The network. None if the windows give fewer rays than the tie points, for example if the surface is
         nowhere plane over them, or if no tie point fits the orientation. Points are named t00001, t00002 ...
-        in the order in which they are found. Control and scale bars of the survey refer to these names.
+        in the order in which they are found, which may differ in the next run.
     """
     network, estimate, files = measured.network, start.estimate, measured.files
     settings = survey.texture

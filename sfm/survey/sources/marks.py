@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -312,7 +313,7 @@ def _match_templates(
         i: photograph of the templates.
         xy: middles of the templates, px, (k, 2).
         known: approximate object points, NaN where unknown, (k, 3).
-        windows: size of the windows.
+        windows: size of the windows; larger ones are tried where these are not matched.
         jobs: number of photographs processed in parallel.
     """
     estimate, camera = scene.estimate, scene.network.camera
@@ -320,20 +321,24 @@ def _match_templates(
     on_surface, normal = planes_at(estimate, camera, i, xy, neighbours)
     normal = np.where(np.isfinite(normal), normal, estimate.rotation[i][:, 2])
 
-    def along_rays(rows: IntArray) -> FloatArray:
+    def along_rays(rows: IntArray, windows: Windows) -> FloatArray:
         return _search_along_rays(scene, i, xy[rows], normal[rows], neighbours, windows.side_px)
 
-    parts: list[ImagePoints] = []
+    parts = [scene.seen.select(NONE)]
     lost = np.arange(len(xy))
-    for approximate in (lambda rows: known[rows], lambda rows: on_surface[rows], along_rays):
-        points = approximate(lost)
+    for side_px, approximate in product(
+        (windows.side_px, 2 * windows.side_px - 1),  # larger ones show more texture
+        (lambda rows, _: known[rows], lambda rows, _: on_surface[rows], along_rays),
+    ):
+        tried = replace(windows, side_px=side_px)
+        points = approximate(lost, tried)
         rows = lost[np.isfinite(points).all(axis=1)]
         if len(rows):
             squares = Squares(i, xy[rows], normal[rows], points[np.isin(lost, rows)])
-            rays = _rays_that_meet(scene, squares, windows, jobs)
+            rays = _rays_that_meet(scene, squares, tried, jobs)
             parts.append(replace(rays, point=rows[rays.point]))
             lost = np.setdiff1d(lost, parts[-1].point)
-    return ImagePoints.joined([scene.seen.select(NONE), *parts])
+    return ImagePoints.joined(parts)
 
 
 def _search_along_rays(

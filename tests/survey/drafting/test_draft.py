@@ -210,7 +210,7 @@ def test_a_changed_focal_length_and_hostile_names_make_a_file_that_reads(tmp_pat
     assert [len(one.images or ()) for one in described.cameras] == [4, 2]
     assert [one.c_mm for one in described.cameras] == [50.0, 85.0]
     assert described.tie_points is not None, "there is no target"
-    assert "two targets" not in draft.text and "# [[observations]]" in draft.text
+    assert "two targets" not in draft.text and "# [[point]]" in draft.text
 
 
 @pytest.mark.parametrize(
