@@ -373,8 +373,8 @@ def _example_lines(trial: TargetTrial) -> list[str]:
         first, second = "corner 1", "corner 2"
         ends, known = "points with names", "coordinates of such points"
         named = [
-            "# Points of texture have other names in every run. A point that you name in one photograph keeps",
-            "# its name and is found in the others (repeat the section for each point):",
+            "# Points of texture have other names in every run. A point that you name in one photograph",
+            "# keeps its name and is found in the others (repeat the section for each point):",
             "# [[point]]",
             f"# name = {_quoted(first)}",
             f"# image = {_quoted(next(iter(trial.photographs), 'photograph.jpg'))}",

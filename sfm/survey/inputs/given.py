@@ -77,14 +77,14 @@ class KnownPoints:
 
         Args:
             names: n unique names of the points.
-            xyz: coordinates, object unit, (n, 3).
+            xyz: coordinates, object unit, NaN where unknown, (n, 3).
             sigma: standard deviations, 0 = fixed, object unit, (n, 3) or broadcastable to it.
 
         Raises:
             SurveyFileError: as in `read_control`.
         """
         columns = columns_of("control", (*AXES, *SIGMAS_OF_AXES), len(names), (xyz, 3), (sigma, 3))
-        return _known_points(array_table("control", {"id": names}, columns))
+        return _known_points(array_table("control", {"id": names}, columns, blank=AXES))
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,10 @@ class Observations:
 
     image: tuple[str, ...]  # photograph of each row, (k,)
     point: tuple[str, ...]  # point of each row, (k,)
-    xy: FloatArray  # px in the pixel frame or mm in the image frame, (k, 2)
+    # px in the pixel frame, mm in the image frame, or x and y (down) from the middle in longer sides, (k, 2)
+    xy: FloatArray
     sigma: FloatArray | None  # standard deviations in the same unit, NaN if not given, (k, 2); or None
-    unit: str  # px | mm
+    unit: str  # px | mm | of the longer side
     table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
     sigma_px: float | None = None  # of rows without standard deviations; None: that of the survey

@@ -262,7 +262,9 @@ class RigSettings(Section):
 class ControlSettings(Section):
     """[control]: known object points."""
 
-    file: Name  # id,X,Y,Z[,sX,sY,sZ]
+    file: Name  # id,X,Y,Z[,sX,sY,sZ], or gcp_list.txt or ground_control_points.json with image points
+    sigma: TwoLengths | None = None  # of X and Y, and of Z, where the file states none; else they are fixed
+    check: Names = ()  # points that are not adjusted but check the result
 
 
 class ExteriorSettings(Section):

@@ -39,13 +39,13 @@ from sfm.survey.inputs.given import (
     ScaleBar,
     StartCameras,
     StartOrientations,
-    read_control,
     read_diameters,
     read_exterior,
     read_image_points,
     read_points,
     read_start_cameras,
 )
+from sfm.survey.inputs.ground_control import GroundControl, read_ground_control
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -53,6 +53,7 @@ from sfm.survey.inputs.settings import (
     DatumSettings,
     ExteriorSettings,
     Head,
+    ObservationSettings,
     PlateSettings,
     PointSettings,
     RigSettings,
@@ -283,6 +284,9 @@ def survey_of_file(file: SurveyFile) -> Survey:
         return None if name is None else reader(file.beside(name))
 
     equipment = _given_by_equipment(file)
+    control = (
+        read_ground_control(file.beside(file.control.file), file.control, file.unit) if file.control else None
+    )
     return Survey(
         name=file.name,
         unit=file.unit,
@@ -293,7 +297,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         datum=file.datum,
         adjust=file.adjust,
         compare=file.compare,
-        control=read(read_control, file.control.file if file.control else None),
+        control=None if control is None else control.points,
         exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
         exif_sigma_m=file.exif_sigma_m,
         rigs=file.rigs,
@@ -319,7 +323,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
             *(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
             *equipment.bars,
         ),
-        observations=_given_image_points(file),
+        observations=_given_image_points(file, control),
         marks=file.marks,
         diameters=read(read_diameters, file.targets.diameters),
         masks=None if file.head.masks is None else file.beside(file.head.masks),
@@ -332,16 +336,30 @@ def survey_of_file(file: SurveyFile) -> Survey:
     )
 
 
-def _given_image_points(file: SurveyFile) -> Observations | tuple[Observations, ...] | None:
+def _given_image_points(
+    file: SurveyFile, control: GroundControl | None
+) -> Observations | tuple[Observations, ...] | None:
     """Return the image points that a survey file gives, in place of photographs or beside them.
 
     Raises:
-        SurveyFileError: a table is unreadable.
+        SurveyFileError: a table is unreadable, or control with image points contradicts other settings.
     """
+    if control is not None and control.is_geographic and file.exif_sigma_m is not None:
+        raise SurveyFileError(
+            f"{file.source}: control by latitude and longitude and exterior.exif_sigma_m have different "
+            "origins, needed one of them"
+        )
     tables = tuple(
         replace(read_image_points(file.beside(one.file)), sigma_px=one.sigma_px)
         for one in tables_of(file.observations)
     )
+    if control is not None and control.image_points is not None:
+        if isinstance(file.observations, ObservationSettings):
+            raise SurveyFileError(
+                f"{file.source}: [observations] stands in place of photographs, and the control has image "
+                "points beside them; write [[observations]]"
+            )
+        return (*tables, control.image_points)
     return tables if isinstance(file.observations, tuple) else next(iter(tables), None)
 
 

@@ -245,6 +245,9 @@ def _in_pixels(
     between = np.zeros(len(xy)) if given.covariance is None else given.covariance.copy()
     xy_px = xy.copy()
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
+    if given.unit == "of the longer side":
+        size = np.array([one.size_px for one in cameras], dtype=float)[camera]
+        xy_px = xy * size.max(axis=1, keepdims=True) + (size - 1) / 2
     if given.unit == "mm":
         for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
             xy_px[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)

@@ -1,0 +1,125 @@
+"""Ground control with its image points, as other programs write it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sfm.camera import project
+from sfm.errors import SurveyFileError
+from sfm.photographs.exif import LocalSystem
+from sfm.pipeline import run_survey
+from sfm.survey.inputs.survey import read_survey
+from tests.surveys import camera, code_centres, stations, write_photograph_survey
+from tests.synthetic import seed_of
+
+ORIGIN = np.array([391_000.0, 5_820_000.0, 30.0])  # UTM, m
+PLACES = {
+    "north": (-150.0, 60.0, 0.0),
+    "south": (140.0, -60.0, 0.0),
+    "east": (150.0, 60.0, 0.0),
+    "west": (-140.0, -70.0, 0.0),
+    "top": (0.0, 0.0, 60.0),
+    "flat": (0.0, 85.0, 0.0),
+    "checked": (0.0, -85.0, 0.0),
+}  # mm
+
+
+def lines_of(names: tuple[str, ...] = tuple(PLACES)) -> list[str]:
+    """Return the lines of image points, with a noise of 0.2 px; the height of one point is unknown."""
+    position, rotation = stations(6)
+    noise = seed_of("ground control")
+    lines = []
+    for name in names:
+        X, Y, Z = (ORIGIN + np.array(PLACES[name]) / 1000).tolist()
+        for i in range(6):
+            exact = project(camera(), position[i], rotation[i], np.array([PLACES[name]]))[0]
+            x, y = (exact + 0.2 * noise.standard_normal(2)).tolist()
+            height = "NaN" if name == "flat" else Z
+            lines.append(f"{X:.6f} {Y:.6f} {height} {x} {y} photo_{i + 1}.png {name}")
+    return lines
+
+
+def survey_with(folder: Path, file: str, text: str, more: str = "") -> Path:
+    """Write a survey of photographs with control from a file; return the survey file."""
+    path = write_photograph_survey(folder, folder.name)
+    for photograph in folder.glob("*.png"):
+        photograph.rename(photograph.with_name(photograph.name.replace(" ", "_")))
+    (folder / file).write_text(text, "utf-8")
+    control = f'[control]\nfile = "{file}"\nsigma = [1e-4, 1e-4]\n{more}'
+    path.write_text(path.read_text("utf-8").replace('unit = "mm"', 'unit = "m"') + control, "utf-8")
+    return path
+
+
+def test_a_list_of_ground_control_places_the_survey(tmp_path: Path) -> None:
+    text = "\n".join(["WGS84 UTM 33N", "# by hand", *lines_of()])
+    path = survey_with(
+        tmp_path / "list", "gcp_list.txt", text, 'check = ["checked"]\n[datum]\nkind = "control"\n'
+    )
+    survey = read_survey(path)
+    assert survey.control is not None and np.isnan(survey.control.xyz[5, 2])
+    assert survey.control.sigma[5].tolist() == [1e-4, 1e-4, np.inf]
+    result = run_survey(survey)
+    a = result.adjustment
+    assert [source.name for source in a.network.sources] == ["targets", "given"]
+    assert result.verdict.level != "bad"
+    for code, xyz in code_centres().items():
+        j = a.network.points.index(str(code))
+        assert np.abs(a.estimate.points[j] - ORIGIN - xyz / 1000).max() < 5e-4
+    (check,) = result.check_points
+    assert check.point == "checked" and "checked" in a.network.points
+    given = [a.network.points[j] for j in a.network.control.point.tolist()]
+    assert "checked" not in given and "top" in given
+
+
+def test_ground_control_by_latitude_and_longitude_is_local(tmp_path: Path) -> None:
+    """A point without altitude, and one without a position, which has only a name."""
+    position, rotation = stations(6)
+    points = []
+    for k, (name, xyz) in enumerate(PLACES.items()):
+        seen = [project(camera(), position[i], rotation[i], np.array([xyz]))[0] for i in range(6)]
+        where = {"latitude": 52.5 + 1e-6 * k, "longitude": 13.4 + 1e-6 * k * k, "altitude": 30.0}
+        if name == "flat":
+            del where["altitude"]
+        observations = [
+            {"shot_id": f"photo_{i + 1}.png", "projection": ((xy - [319.5, 239.5]) / 640).tolist()}
+            for i, xy in enumerate(seen)
+        ]
+        points.append({"id": name, "observations": observations, "more": 1})
+        if name != "top":
+            points[-1]["position"] = where
+    path = survey_with(tmp_path / "json", "ground_control_points.json", json.dumps({"points": points}))
+    survey = read_survey(path)
+    assert survey.control is not None and survey.control.names == tuple(n for n in PLACES if n != "top")
+    system = LocalSystem(52.5, 13.4)
+    east, north, _ = system.coordinates([52.500006], [13.400036], [30.0])[0]
+    difference = survey.control.xyz[5] - survey.control.xyz[0]
+    assert difference[:2] == pytest.approx([east, north], abs=1e-6)
+    assert np.isnan(survey.control.xyz[4, 2])
+    network = run_survey(survey).network
+    rows = network.image_points.point == network.points.index("top")
+    image = network.images.index("photo_1.png")
+    exact = project(camera(), position[0], rotation[0], np.array([PLACES["top"]]))[0]
+    assert network.image_points.xy[rows & (network.image_points.image == image)][0] == pytest.approx(exact)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("EPSG:2056\n", "line 1: projection 'EPSG:2056'"),
+        ("WGS84\n1 2 3 4 5\n", "line 2: 5 fields"),
+        ("WGS84\n1 2 three 4 5 a.png\n", "line 2: found 'three', expected a number"),
+        ("WGS84\n1 NaN 3 4 5 a.png\n", "line 2: found NaN"),
+        ("WGS84\n1 2 3 4 5 a.png p\n1 2 4 4 5 b.png p\n", "line 3: point 'p' has other coordinates"),
+        ("WGS84\n", "no point of the file has coordinates"),
+        ("WGS84 UTM 33N\n1 2 3 4 5 a.png p\n", "no point 'q', which control.check names"),
+    ],
+)
+def test_wrong_ground_control_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = survey_with(tmp_path / "wrong", "gcp_list.txt", text, 'check = ["q"]\n')
+    with pytest.raises(SurveyFileError, match=message) as refused:
+        read_survey(path)
+    assert "\n" not in str(refused.value)
