@@ -98,7 +98,7 @@ POINTS = (
         "{points:named point} {points:was|were} found in too few other photographs: {points}.",
         "the window around the place has no texture, is at an edge of the object or hidden in the others; or "
         "its photograph is not oriented",
-        "Name a place with texture on one surface, or name the point in another photograph too.",
+        "Mark a place with texture on one surface, or mark the point in another photograph too.",
     ),
     Kind(
         "codes_at_several_places",
