@@ -23,10 +23,10 @@ from sfm.adjustment.quality.statistics import (
 )
 from sfm.adjustment.result import Adjustment
 from sfm.distributions import FALSE_ALARM
-from sfm.errors import GeometryError, KolinearError, SurveyFileError
+from sfm.errors import GeometryError, SurveyFileError
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import statistics_of
-from sfm.judgement.verdict import judge_survey
+from sfm.judgement.verdict import judge_adjustment, judge_survey
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind, remark
@@ -85,15 +85,16 @@ def test_gross_errors_are_said_where_nothing_acts_on_them(
     assert ("gross_errors_kept" in kinds) == kept
 
 
-def test_a_rank_defect_is_bad(made: tuple[Network, Estimate]) -> None:
-    network, truth = made
-    single = np.isin(network.image_points.image, (0, 1))  # two photographs do not determine six parameters
-    part = replace(network, image_points=network.image_points.select(single))
-    try:
-        adjustment = sfm.adjust(part, truth)
-    except KolinearError:
-        return
-    assert verdict_of(adjustment).level == "bad"
+@pytest.mark.parametrize(("undetermined", "more"), [(("c of camera 1",), 0), ((), 1), ((), 0)])
+def test_a_rank_defect_is_bad(
+    made: tuple[Network, Estimate], undetermined: tuple[str, ...], more: int
+) -> None:
+    a = sfm.adjust(*made)
+    without = replace(a, undetermined=undetermined, defect=a.expected_defect + more)
+    verdict = verdict_of(judge_adjustment(without))
+    assert (
+        ("rank_defect" in kinds_of(verdict.remarks)) == (verdict.level == "bad") == bool(undetermined or more)
+    )
 
 
 @pytest.mark.parametrize(("unreadable", "level"), [(1, "fair"), (9, "fair"), (0, "good")])
