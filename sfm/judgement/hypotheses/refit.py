@@ -73,7 +73,7 @@ class Refit:
     beta: FloatArray  # parameters of the alternative, (q,)
     gain: float  # gain of ln likelihood; rejected image points are assumed uniform over their photograph
     shift: float  # largest change of a coordinate, in standard deviations stated without the alternative
-    rms: float  # root mean square of these changes
+    rms: float  # root mean square of these changes; NaN of cameras
     before: tuple[FloatArray, ...] = ()  # parameters of the earlier alternatives
     finished: bool = True  # whether the rounds ended before the largest number of adjustments
 
@@ -204,7 +204,7 @@ def shifts_of(
         beta: parameters of the alternative, (q,).
     """
     if plain.datum == "control":
-        return _shifts_of_cameras(plain, before, other)
+        return _shift_of_cameras(plain, before, other), float("nan")
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
@@ -220,15 +220,15 @@ def shifts_of(
     return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
 
 
-def _shifts_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> tuple[float, float]:
-    """Return the largest and the RMS change of determined interior parameters, in standard deviations."""
-    change = [np.zeros(0)]
+def _shift_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> float:
+    """Return the largest change of determined interior parameters, in standard deviations."""
+    largest = 0.0
     for k, (one, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
         sigma = plain.interior_sigma(k)
         known = np.isfinite(sigma) & (sigma > 0)
-        change.append((changed.parameters - one.parameters)[known] / sigma[known])
-    every = np.concatenate(change)
-    return float(np.abs(every).max(initial=0.0)), float(np.sqrt((every**2).mean())) if len(every) else 0.0
+        change = np.abs((changed.parameters - one.parameters)[known] / sigma[known])
+        largest = max(largest, float(change.max(initial=0.0)))
+    return largest
 
 
 def spread_of_photographs(found: Refit, one: Alternative, others: Sequence[Alternative]) -> float:
