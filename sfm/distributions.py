@@ -58,7 +58,7 @@ def level_of_single(family: float, tests: int) -> float:
 
     Source: Sidak (1967), J. Am. Stat. Assoc. 62.
     """
-    return float(1 - (1 - family) ** (1 / max(tests, 1)))
+    return float(-np.expm1(np.log1p(-family) / max(tests, 1)))
 
 
 def chi2_sf(x: Any, r: Any) -> Any:

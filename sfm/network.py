@@ -59,6 +59,7 @@ class Source:
     fewest: int = 4  # image points of a photograph: three determine it, the fourth checks
     is_exact: bool = False  # whether they were handed over as they are
     has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
+    points: str = "uncoded"  # what its points are that have no code
 
 
 @dataclass(frozen=True)
@@ -176,11 +177,6 @@ class Network:
     def has_common_errors(self) -> bool:
         """Whether the errors of neighbouring image points of a source have a common part."""
         return any(source.has_common_errors for source in self.sources)
-
-    @property
-    def handed_over(self) -> BoolArray:
-        """Which image points were handed over with their standard deviations, (k,)."""
-        return np.array([source.is_exact for source in self.sources])[self.source]
 
     @property
     def automatic_points(self) -> frozenset[str]:

@@ -332,14 +332,13 @@ class SurveyResult:
 
     @property
     def point_counts(self) -> str:
-        """Numbers of coded and other points, and of those whose numbers are new in every run, in words."""
-        coded = int((self.code >= 0).sum())
-        named = int(self.adjustment.network.named.sum())
-        counts = {"coded": coded, "uncoded": named - coded, "of natural texture": len(self.code) - named}
-        if named == len(self.code):
-            del counts["of natural texture"]
-        elif not named:
-            del counts["coded"], counts["uncoded"]
+        """Numbers of coded points, and of the others by the first of their sources, in words."""
+        network, coded = self.adjustment.network, np.asarray(self.code) >= 0
+        first = np.full(len(coded), len(network.sources))
+        np.minimum.at(first, network.image_points.point, network.source)
+        counts = {"coded": int(coded.sum())} if coded.any() else {}
+        for k, source in enumerate(network.sources):
+            counts[source.points] = int((first[~coded] == k).sum())
         return ", ".join(f"{count} {what}" for what, count in counts.items())
 
     @property

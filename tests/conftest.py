@@ -31,7 +31,7 @@ atexit.register(shutil.rmtree, CACHES, ignore_errors=True)
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Leave to the study what `sweep` does not list, by its place among the cases of a test.
 
-    A case that is asked for by its name is run.
+    Cases that are asked for by their names are run.
     """
     cases = defaultdict[tuple[object, str, tuple[int, ...]], list[pytest.Function]](list)
     for item in items:
@@ -42,8 +42,8 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         count = prod(len(list(one.args[1])) for one in of_test[0].iter_markers("parametrize"))
         if max(listed) >= count > 1:
             raise pytest.UsageError(f"{name}: sweep lists place {max(listed)} of {count} cases")
-        for place, item in enumerate(of_test):
-            if len(of_test) > 1 and place not in listed:
+        for place, item in enumerate(of_test if len(of_test) >= count else ()):
+            if place not in listed:
                 item.add_marker("slow")
 
 

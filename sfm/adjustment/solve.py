@@ -51,7 +51,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
-from sfm.distributions import FALSE_ALARM, level_of_single, normal_sf
+from sfm.distributions import FALSE_ALARM, Levels, level_of_single, normal_sf
 from sfm.errors import GeometryError
 from sfm.kernels.threads import own_threads
 from sfm.network import Estimate, Network
@@ -162,7 +162,7 @@ def adjust(
             replace(
                 result,
                 image_sigma_factor=factor,
-                test_alpha=_level_of(reject, alpha, result.test_alpha),
+                test_alpha=_level_of(reject, alpha, Levels(false_alarm).question),
                 false_alarm=false_alarm,
             )
         )

@@ -84,7 +84,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
         *consistency_remarks(consistency, int(a.rejected.sum()), automatic=a.network.automatic_points),
-        *stated_precision_remarks(a, a.network.handed_over),  # the others are weighted, not stated
+        *(() if result.photographs else stated_precision_remarks(a)),  # only given image points state theirs
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
         *given_remarks(result, given_of(a, result.length_unit), statistics, check_coordinates(result)),

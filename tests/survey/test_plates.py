@@ -63,7 +63,6 @@ def test_the_plate_that_is_control_is_not_left_out(tmp_path: Path) -> None:
     assert found.names("others") == ("plate 2", "plate 3")
 
 
-@pytest.mark.sweep(0)
 @pytest.mark.parametrize(("count", "more"), [(2, ("calibrated_from_few",)), (3, ())])
 def test_no_camera_is_calibrated_from_the_front(tmp_path: Path, count: int, more: tuple[str, ...]) -> None:
     """Before, c was held 1 mm wrong and the survey worked."""

@@ -182,19 +182,6 @@ def test_what_two_sources_measure_is_used_once() -> None:
     assert wrong.contradicting == ((3, 3),) and len(wrong.image_points) == n - 1
 
 
-@pytest.mark.parametrize(("sigma_px", "named"), [(0.2, False), (0.02, True)])
-def test_a_table_stated_too_precise_beside_another_is_named(
-    tmp_path: Path, sigma_px: float, named: bool
-) -> None:
-    names, more = list(CORNERS), ""
-    for file, of, sigma in (("a.csv", names[::2], 0.2), ("b.csv", names[1::2], sigma_px)):
-        write_given(tmp_path / file, {name: CORNERS[name] for name in of})
-        more += f'[[observations]]\nfile = "{file}"\nsigma_px = {sigma}\n'
-    verdict = run_survey(read_survey(write(tmp_path, more))).verdict
-    said = [one for one in verdict.remarks if one.kind == "image_sigmas"]
-    assert [set(one.names("points")) <= set(names[1::2]) for one in said] == [True] * named
-
-
 def test_no_module_asks_which_source_a_survey_has() -> None:
     asking = [
         f"{path.relative_to(ROOT)}:{number}"

@@ -251,15 +251,15 @@ def test_places_are_visible_where_photographs_look_at_their_plane_inside_their_b
     normal = np.stack([to_second, across + 0.2 * to_second, -to_second])
     places = Squares(0, np.zeros((3, 2)), normal / np.linalg.norm(normal, axis=1, keepdims=True), X)
     covered_pixels = CoveredPixels([(360, 480)] * 3)
-    assert _visible(truth, camera, places, None, covered_pixels, 11, 15)[1][1].tolist() == [
+    assert _visible(truth, camera, places, covered_pixels, 11, 15)[1][1].tolist() == [
         True,
         False,
         False,
     ]
-    assert not _visible(truth, camera, places, None, covered_pixels, 181, 15)[0][1].any()  # of 360 rows
+    assert not _visible(truth, camera, places, covered_pixels, 181, 15)[0][1].any()  # of 360 rows
     covered_pixels.cover(np.array([1]), np.array([[240.0, 180.0]]), np.array([1000.0]))
-    seen, free = _visible(truth, camera, places, None, covered_pixels, 11, 15)
+    seen, free = _visible(truth, camera, places, covered_pixels, 11, 15)
     assert free[0].all() and not free[1].any() and seen[1].any()
     # what a mask hides is not seen, and does not count as another photograph that shows the surface
-    seen, free = _visible(truth, camera, places, covered_pixels, covered_pixels, 11, 15)
+    seen, free = _visible(truth, camera, places, CoveredPixels([(360, 480)] * 3), 11, 15, 15, covered_pixels)
     assert free[0].all() and not free[1].any() and not seen[1].any()

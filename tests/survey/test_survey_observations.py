@@ -398,7 +398,6 @@ def test_a_mistake_in_a_whole_table_is_named(
     assert {one.severity for one in said if one.kind == "kind_wrong"} == {"warning"}  # it does no harm
 
 
-@pytest.mark.sweep(0)
 @pytest.mark.parametrize(("level", "readings"), [(False, ("exchanged", "mirrored")), (True, ("mirrored",))])
 def test_left_handed_differences_have_two_readings_unless_heights_decide(
     level: bool, readings: tuple[str, ...], tmp_path: Path

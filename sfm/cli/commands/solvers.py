@@ -384,6 +384,7 @@ def refine(
         from sfm.report.pages import page_of, texts_of
         from sfm.report.refinement import Numbers, describe_key_points
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.survey.inputs.settings import AdjustSettings
         from sfm.survey.inputs.survey import read_survey
         from sfm.survey.refining.oriented_windows import measure_model_targets
         from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
@@ -406,9 +407,9 @@ def refine(
             RefineSettings(
                 window,
                 min_correlation,
-                tuple(name.strip() for name in fix.split(",") if name.strip()),
-                masks,
-                *(() if given is None else (given.adjust.false_alarm,)),
+                fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
+                masks_dir=masks,
+                false_alarm=(AdjustSettings() if given is None else given.adjust).false_alarm,
             ),
             targets=targets,
             progress=progress,

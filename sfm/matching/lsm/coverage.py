@@ -61,12 +61,6 @@ class CoveredPixels:
             if pixels is not None:
                 bits[:] = np.packbits(pixels, axis=1)
 
-    def copy(self) -> CoveredPixels:
-        """Return another record that begins with the same pixels."""
-        other = CoveredPixels(self.shapes)
-        other._bits = [bits.copy() for bits in self._bits]
-        return other
-
     def pixels(self, image: int) -> AnyArray:
         """Return a photograph with 1 where it is covered, uint8, (H, W)."""
         return np.unpackbits(self._bits[image], axis=1, count=self.shapes[image][1])

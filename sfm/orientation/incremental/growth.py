@@ -345,6 +345,7 @@ class Growth:
                         "photograph_contradicting",
                         confirmed=int(found.confirmed[i]),
                         against=int(found.against[i]),
+                        points=int(found.known[i]),
                     )
             self.dropped[worst] = True
             self.release(worst)

@@ -77,12 +77,13 @@ POINTS = (
     ),
     Kind(
         "sources_contradict",
-        Unless(("x",), "error", "warning"),
+        Unless(("offset",), "error", "warning"),
         "{sources:@} contradict one another: {common:image point} that both have {common:is|are} {distance} "
-        "apart (median)[[, {x:+} in x and {y:+} in y alike]]; the first were left out there.",
+        "apart (median)[[, all by about {offset}: {x:+} in x, {y:+} in y]]; the first were left out there.",
         "other names of points or photographs; if alike, another origin of pixels: the corner of the first "
         "pixel is half a pixel from its centre",
-        "Correct the table of image points, or leave it out; the others in it are used.",
+        "Correct the table of image points, or leave it out; the others in it are used, and may be off as "
+        "well.",
     ),
     Kind(
         "photographs_without_file",

@@ -163,7 +163,8 @@ ROWS = (
         "{dots:does|do} not fit it]]: {photographs}.",
         "it is cut off, its marks or tags are hidden, blurred or too small, or rows and columns are not "
         "those of the plate: they count crossings of a board, and two corners for each tag of an AprilGrid",
-        "Show more of it, larger; check rows, columns, marks and polarity, or tag_size, dictionary and "
+        "Show more of it, larger (all of a plate of dots, with its rim); "
+        "check rows, columns, marks and polarity, or tag_size, dictionary and "
         "first_tag, or run kolinear init on the folder.",
         explains=("photograph_with_few_points",),
     ),
@@ -242,7 +243,7 @@ ROWS = (
     Kind(
         "photograph_contradicting",
         "warning",
-        "Its image points contradict the network[[: {against}]][[ of {points}]][[, {confirmed:condition} "
+        "Its image points contradict the network[[: {against} of {points}]][[, and {confirmed:condition} "
         "{confirmed:confirms|confirm} it]].",
         "another object or another state of it, a mirrored picture, wrong codes, or matches of a repeated "
         "pattern",

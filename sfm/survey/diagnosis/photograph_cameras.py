@@ -217,7 +217,8 @@ def _photograph_camera(
         ObjectPoints(np.arange(n), points, np.zeros((n, 3, 3))),
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
-    shared = _adjust_alone(alone, _scaled_resection(camera, xy, points, np.ones(1)), points, nothing)
+    begin = _scaled_resection(camera, xy, points, np.ones(1))
+    shared = _adjust_alone(alone, begin, points, nothing, false_alarm)
 
     def freed_parameters(_: _Fit) -> Iterator[BoolArray]:
         for roles in FREED_ROLES:
@@ -228,7 +229,7 @@ def _photograph_camera(
             yield freed
 
     def adjust_freed(freed: BoolArray) -> _Fit:
-        return _Fit(_adjust_alone(alone, start, points, freed), freed)
+        return _Fit(_adjust_alone(alone, start, points, freed, false_alarm), freed)
 
     def gain(before: _Fit, after: _Fit) -> float:
         found = after.adjustment
@@ -271,7 +272,11 @@ class _Fit:
 
 
 def _adjust_alone(
-    alone: Network, start: tuple[Camera, FloatArray, FloatArray] | None, points: FloatArray, free: BoolArray
+    alone: Network,
+    start: tuple[Camera, FloatArray, FloatArray] | None,
+    points: FloatArray,
+    free: BoolArray,
+    false_alarm: float,
 ) -> Adjustment | None:
     """Adjust one photograph on known points, with some parameters free; None if there is no solution."""
     if start is None or 2 * len(points) <= 6 + free.sum():
@@ -279,7 +284,7 @@ def _adjust_alone(
     camera, position, rotation = start
     begin = Estimate((replace(camera, free=free, shared=()),), position[None], rotation[None], points)
     try:
-        found = adjust(alone, begin, datum=Datum("control"), reject="tau")
+        found = adjust(alone, begin, datum=Datum("control"), false_alarm=false_alarm)
     except (GeometryError, np.linalg.LinAlgError):
         return None
     return found if found.converged and found.redundancy > 0 else None

@@ -15,9 +15,15 @@ from sfm.network import Source
 # Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets")
-GIVEN = Source("given", is_exact=True)
-MARKS = Source("marks")
-TEXTURE = Source("texture", names_last=False, fewest=MIN_TIE_POINTS, has_common_errors=True)
+GIVEN = Source("given", is_exact=True, points="given")
+MARKS = Source("marks", points="named")
+TEXTURE = Source(
+    "texture",
+    names_last=False,
+    fewest=MIN_TIE_POINTS,
+    has_common_errors=True,
+    points="of natural texture",
+)
 
 
 @dataclass(frozen=True)

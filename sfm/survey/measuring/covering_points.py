@@ -116,17 +116,20 @@ def find_covering_points(
     tie_rows = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
     shapes = [estimate.cameras[lens].size_px[::-1] for lens in camera]
-    covered = CoveredPixels(shapes) if hidden is None else hidden.copy()
+    covered = CoveredPixels(shapes)
     grey = GreyPhotographs(photographs.__getitem__)
     found = [_no_points()]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
-        xy = textured_squares(grey[i].pixels, side_px, covered.free_middles(i, side_px), border_px=margin)
+        free_middles = covered.free_middles(i, side_px)
+        if hidden is not None:
+            free_middles &= hidden.free_middles(i, windows.side_px)
+        xy = textured_squares(grey[i].pixels, side_px, free_middles, border_px=margin)
         points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         known = np.asarray(np.isfinite(points).all(axis=1))
         squares = Squares(i, xy, normal, points).select(known)
-        visible, free = _visible(estimate, camera, squares, hidden, covered, margin, side_px)
+        visible, free = _visible(estimate, camera, squares, covered, margin, side_px, windows.side_px, hidden)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
@@ -170,10 +173,11 @@ def _visible(
     estimate: Estimate,
     camera: IntArray,
     squares: Squares,
-    hidden: CoveredPixels | None,
     covered: CoveredPixels,
     margin: int,
     side_px: int,
+    window_px: int = 0,
+    hidden: CoveredPixels | None = None,
 ) -> tuple[BoolArray, BoolArray]:
     """Return which photographs see the squares, and which of these have their pixels free, (m, k) each.
 
@@ -183,7 +187,7 @@ def _visible(
     free = visible.copy()
     for j, rows, at in seen_squares(estimate, camera, squares, margin):
         if hidden is not None:
-            shown = hidden.is_free(j, at, side_px)
+            shown = hidden.is_free(j, at, window_px)
             rows, at = rows[shown], at[shown]
         visible[j, rows] = True
         free[j, rows] = covered.is_free(j, at, side_px)

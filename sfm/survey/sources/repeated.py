@@ -142,7 +142,7 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
             together = _squares(offset[None], np.median(C, axis=0)[None])[0]
             if together > max(1.0, np.pi / 2 * chi2_isf(LEVEL, 2) / len(of_a)):
                 x, y = (Quantity(float(one), "px") for one in offset)
-                remarks.append(said(x=x, y=y))
+                remarks.append(said(offset=Quantity(float(np.linalg.norm(offset)), "px"), x=x, y=y))
         wrong = _squares(difference - offset, C) > chi2_isf(LEVEL / len(of_a), 2)
         keep[of_a[wrong]] = False
         contradicting += zip(seen.image[of_a[wrong]].tolist(), seen.point[of_a[wrong]].tolist(), strict=True)
