@@ -517,3 +517,17 @@ def test_photographs_that_differ_are_the_fewer_ones() -> None:
     one = made(Gain(20.0, 2, np.zeros(2)))
     for factor, few in (([0, 1, 0], [1]), ([1, 0, 1], [1]), ([-1, 0, 1], [2]), ([1, 0, 0, 1], [0, 3])):
         assert replace(one, factor=np.array(factor, dtype=float)).photographs.tolist() == few
+
+
+def test_what_photographs_contribute_to_cameras_is_in_standard_deviations() -> None:
+    """Residuals of chance contribute about one standard deviation in all, of each parameter."""
+    total = []
+    for seed in range(4):
+        network, truth = make_network(
+            seed_of(f"contributions {seed}"), images=12, points=60, free=("c", "x0", "y0"), noise_px=0.1
+        )
+        a = adjust(network, truth, datum=Datum("free"), reject="none")
+        _, of_interior = reduce_adjustment(a, columns_of(a)).contributions()
+        assert of_interior.sum(axis=1) == pytest.approx(0.0, abs=0.01)
+        total.append((of_interior**2).sum(axis=1))
+    assert 0.3 < np.mean(total) < 3

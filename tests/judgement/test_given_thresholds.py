@@ -23,6 +23,7 @@ from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.network import ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
+from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.findings import findings_of
 from tests.survey import mistyped
@@ -343,3 +344,16 @@ def test_four_points_that_are_not_in_a_plane_are_in_space() -> None:
     assert given_groups.are_in_space(corner)
     assert not given_groups.are_in_space(corner[:3])
     assert not given_groups.are_in_space(corner * [1, 1, 0.01])
+
+
+def test_centres_give_the_datum_where_the_control_is_not_used() -> None:
+    """Control that is mirrored gives none, but the observed projection centres beside it do."""
+    network, truth = make_network(seed_of("mirrored beside centres"), images=8, points=30)
+    mirrored = truth.points[:12] * [1.0, 1.0, -1.0]
+    control = KnownPoints.from_arrays(network.points[:12], mirrored, 1e-3)
+    centres = ObservedExterior.from_arrays(network.images, truth.position, 1e-3)
+    given = {"control": control, "exterior": centres, "datum": {"kind": "control"}}
+    result = run_survey(survey_of(network, truth, **given))
+    assert "given_mirrored" in kinds_of(remarks_on_given(result))
+    assert result.adjustment.datum == "control" and len(result.adjustment.network.exterior) == 8
+    assert np.abs(result.adjustment.estimate.position - truth.position).max() < 0.01
