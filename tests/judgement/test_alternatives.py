@@ -531,3 +531,22 @@ def test_what_photographs_contribute_to_cameras_is_in_standard_deviations() -> N
         assert of_interior.sum(axis=1) == pytest.approx(0.0, abs=0.01)
         total.append((of_interior**2).sum(axis=1))
     assert 0.3 < np.mean(total) < 3
+
+
+def test_a_photograph_with_more_noise_has_a_spread_by_itself() -> None:
+    """Its image points scatter three times as much: a change of its camera must stand out from that."""
+    rng = seed_of("noisy photograph")
+    network, truth = make_network(rng, images=12, points=60, free=("c",), noise_px=0.1)
+    seen = network.image_points
+    xy = seen.xy + np.where(seen.image == 3, 0.28, 0.0)[:, None] * rng.standard_normal(seen.xy.shape)
+    network = replace(network, image_points=replace(seen, xy=xy))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    every = columns_of(a)
+    found = [
+        one
+        for one in alternatives_of(a, reduce_adjustment(a, every), every)
+        if one.pattern == "single" and one.factor[3] > 0
+    ]
+    assert found
+    for one in found:
+        assert one.factor.sum() == 1 and 3 < one.spread.factor < 9
