@@ -338,7 +338,8 @@ class SurveyResult:
         np.minimum.at(first, network.image_points.point, network.source)
         counts = {"coded": int(coded.sum())} if coded.any() else {}
         for k, source in enumerate(network.sources):
-            counts[source.points] = int((first[~coded] == k).sum())
+            if (first[~coded] == k).any():
+                counts[source.points] = int((first[~coded] == k).sum())
         return ", ".join(f"{count} {what}" for what, count in counts.items())
 
     @property

@@ -120,6 +120,23 @@ def test_named_points_are_found_and_found_again_in_a_later_epoch(tmp_path: Path)
     assert 0.7 < np.sqrt(square.mean() / 3) < 1.4
 
 
+def test_a_point_of_an_earlier_epoch_that_is_marked_again_is_measured_once(tmp_path: Path) -> None:
+    """The mark shows where it is now; the template stays that of the first epoch."""
+    write(tmp_path / "first", marks())
+    position, rotation = stations(PHOTOGRAPHS)
+    name = next(name for name, X in POINTS.items() if X[2])
+    now = POINTS[name] + MOVED
+    again = "".join(
+        mark(name, i, project(camera(), position[i - 1], rotation[i - 1], now[None])[0] + [0.5, -0.4])
+        for i in (2, 3)
+    )
+    text = marks("../first/") + again
+    network = run_survey(read_survey(write(tmp_path / "later", text, MOVED), allow_outside=True)).network
+    seen = network.image_points
+    images = seen.image[seen.point == network.points.index(name)]
+    assert len(images) == len(set(images.tolist())) >= 3
+
+
 def test_a_place_that_nothing_matches_is_named(tmp_path: Path) -> None:
     beside = np.array([30.0, 30.0])  # where the photograph shows no plate
     result = run_survey(read_survey(write(tmp_path / "plain", mark("beside", 1, beside))))

@@ -29,8 +29,10 @@ from sfm.photographs.exif import SatellitePosition, local_coordinates
 from sfm.survey.inputs.given import KnownPoints, Observations, read_control
 from sfm.survey.inputs.settings import ControlSettings
 
-GEOGRAPHIC = re.compile(r"WGS84|EPSG:4326|\+proj=(longlat|latlong)\b.*", re.I)
-UTM = re.compile(r"WGS84 UTM \d{1,2}[NS]|EPSG:32[67]\d\d|\+proj=utm\b.*", re.I)
+ZONE = "(0?[1-9]|[1-5][0-9]|60)"
+OPTIONS = r"( \+(zone=\d+|south|datum=WGS84|ellps=(WGS84|GRS80)|units=m|no_defs|type=crs|towgs84=[0,]+))*"
+GEOGRAPHIC = re.compile(rf"WGS84|EPSG:4326|\+proj=(longlat|latlong){OPTIONS}", re.I)
+UTM = re.compile(rf"WGS84 UTM {ZONE}[NS]|EPSG:32[67](0[1-9]|[1-5][0-9]|60)|\+proj=utm{OPTIONS}", re.I)
 FIELDS = 6  # of a line, and a name if there is one
 NO_SIGMA = (math.nan, math.nan, math.nan)
 

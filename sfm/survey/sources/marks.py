@@ -133,8 +133,10 @@ def match_marks(
     seen = part.image_points
     by_hand = replace(seen, image=image[seen.image], point=point[seen.point], source=None)
     windows = Windows(survey.texture.window_px)
+    first = {mark.name: mark.image for mark in reversed(survey.marks)}  # the photograph of the template
+    templates_here = np.array([first[name] in scene.names for name in points])
     parts = [
-        *_match_templates_here(scene, by_hand, known, windows, jobs),
+        *_match_templates_here(scene, by_hand.select(templates_here[by_hand.point]), known, windows, jobs),
         *_match_templates_of_others(survey, scene, points, known, windows, jobs),
     ]
     matched = ImagePoints.joined([by_hand.select(NONE), *parts])
@@ -399,13 +401,22 @@ def _rays_that_meet(scene: _Scene, squares: Squares, windows: Windows, jobs: int
         ).image_points
         rays = rays.select(rays.image != scene.earlier)
         met = intersect_image_points(rays, camera, estimate, n_points=len(numbers), tolerance_px=TOLERANCE_PX)
-        used = rays.select(met.used)
+        used = rays.select(met.used & _under_no_mask(scene, rays))
         enough = np.bincount(used.point, minlength=len(numbers)) >= needed
         if i != scene.earlier:  # the ray of the template is the point
             enough &= np.bincount(used.point[used.image == i], minlength=len(numbers)) > 0
         used = used.select(enough[used.point])
         parts.append(replace(used, point=numbers[used.point]))
     return ImagePoints.joined([scene.seen.select(NONE), *parts])
+
+
+def _under_no_mask(scene: _Scene, rays: ImagePoints) -> BoolArray:
+    """Return which image points are not masked where they were matched, (k,)."""
+    visible = np.ones(len(rays), dtype=bool)
+    for j in np.unique(rays.image).tolist():
+        rows = np.flatnonzero(rays.image == j)
+        visible[rows] = scene.visible(j, rays.xy[rows])
+    return visible
 
 
 SOURCE = SurveySource(measure_marks, match_marks)
