@@ -241,8 +241,8 @@ def test_what_is_wrong_in_a_survey_made_in_python_is_one_line(wrong: dict[str, o
             "control, row 2: id '1' is on",
         ),
         (
-            lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.nan]]),
-            "row 1: column Z contains nan",
+            lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0, np.inf]]),
+            "row 1: column Z contains inf",
         ),
         (lambda: sfm.KnownPoints.from_arrays(["1"], [[0, 0]]), r"X, Y, Z have the shape \(1, 2\), expected"),
         (lambda: sfm.KnownPoints.from_arrays(["1"], np.zeros((1, 3)), -1), "column sX contains -1, needed 0"),

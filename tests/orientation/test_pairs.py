@@ -47,7 +47,9 @@ def test_names_of_another_object_contradict_a_pair() -> None:
     network, truth = pair("strange pair", single=40)
     with pytest.raises(GeometryError, match="0 of 2 photographs could be oriented") as error:
         orient(network, empty_estimate(network, truth.cameras))
-    assert error.match(r"image 1: \d\d of its image points contradict the network, 5 conditions confirm it")
+    assert error.match(
+        r"image 1: Its image points contradict the network: \d\d of \d\d, and 5 conditions confirm it"
+    )
     assert error.match("image 2: ")
 
 

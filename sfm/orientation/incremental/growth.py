@@ -345,7 +345,7 @@ class Growth:
                         "photograph_contradicting",
                         confirmed=int(found.confirmed[i]),
                         against=int(found.against[i]),
-                        points=int(found.known[i]),
+                        points=int(found.fitting[i] + found.against[i]),
                     )
             self.dropped[worst] = True
             self.release(worst)

@@ -161,11 +161,19 @@ ROWS = (
         "note",
         "The {plate:@} of {size} was not found in {photographs:photograph}[[, where {dots:dot} "
         "{dots:does|do} not fit it]]: {photographs}.",
-        "it is cut off, its marks or tags are hidden, blurred or too small, or rows and columns are not "
-        "those of the plate: they count crossings of a board, and two corners for each tag of an AprilGrid",
-        "Show more of it, larger (all of a plate of dots, with its rim); "
-        "check rows, columns, marks and polarity, or tag_size, dictionary and "
-        "first_tag, or run kolinear init on the folder.",
+        "it is cut off or hidden, its marks are hidden or blurred, or rows and columns are not those of the "
+        "plate; of a checkerboard they count crossings",
+        "Show all of it with its rim, larger; check rows, columns, marks and polarity, or run kolinear "
+        "init on the folder.",
+        explains=("photograph_with_few_points",),
+    ),
+    Kind(
+        "board_not_found",
+        "note",
+        "The {plate:@} of {size} was not found in {photographs:photograph}: {photographs}.",
+        "its tags are too small, blurred or hidden; rows and columns count crossings of a ChArUco board, "
+        "and two corners for each tag of an AprilGrid",
+        "Show more of it, larger; check rows, columns, tag_size, dictionary and first_tag.",
         explains=("photograph_with_few_points",),
     ),
     Kind(

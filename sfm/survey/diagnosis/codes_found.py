@@ -63,7 +63,8 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         missing = [name for name in dots if dots[name] < MIN_DOTS]
         size = f"{plate.rows} x {plate.columns}"
         if missing:
-            remarks.append(remark("plate_not_found", plate=plate.name, photographs=missing, size=size))
+            kind = "board_not_found" if plate.dictionary else "plate_not_found"
+            remarks.append(remark(kind, plate=plate.name, photographs=missing, size=size))
         if strange:
             many = round(statistics.median(dots[name] for name in strange))
             remarks.append(

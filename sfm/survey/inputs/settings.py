@@ -304,8 +304,8 @@ class PointSettings(Section):
 
     name: Name  # of the point, in this and later surveys
     image: Name  # photograph in which it is named; the first of a point has its template
-    x_px: Value  # place in the photograph, px
-    y_px: Value
+    x_px: Value  # column of the place in the photograph, px
+    y_px: Value  # row, px
     sigma_px: Length = 1.0  # standard deviation of pointing, px
 
 
