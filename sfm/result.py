@@ -338,8 +338,9 @@ class SurveyResult:
         np.minimum.at(first, network.image_points.point, network.source)
         counts = {"coded": int(coded.sum())} if coded.any() else {}
         for k, source in enumerate(network.sources):
-            if (first[~coded] == k).any():
-                counts[source.points] = int((first[~coded] == k).sum())
+            count = int((first[~coded] == k).sum())
+            if count:
+                counts[source.points] = counts.get(source.points, 0) + count
         return ", ".join(f"{count} {what}" for what, count in counts.items())
 
     @property

@@ -16,6 +16,7 @@ import numpy as np
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.kernels.sampling import AFTER, BEFORE
 from sfm.matching.correlation import (
+    START_CORRELATION,
     LsmFlag,
     NccFlag,
     NccMatches,
@@ -33,7 +34,6 @@ from sfm.matching.radiometry import equalise_histogram, grey_of
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
 MAX_BIAS_PX = 1.0  # of a match whose surface is curved
 NOT_PLANE = "surface not plane over the template"
-START_CORRELATION = 0.5  # smallest r at the start, before the warp makes the patches similar
 
 
 @dataclass(frozen=True)

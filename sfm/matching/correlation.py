@@ -39,6 +39,7 @@ class NccFlag(IntFlag):
 MATCHED, FLAT_TEXTURE, DIVERGED, OUTSIDE, TOO_FAR, LOW_CORRELATION = (int(f) for f in (0, 1, 2, 4, 8, 16))
 # Smallest coefficient r of a match, unless stated: one patch then explains half of the variance of the other.
 MIN_CORRELATION = 0.7
+START_CORRELATION = 0.5  # smallest r at the start, before the warp makes the patches similar
 PEAK_ZONE = 2  # a second peak is farther than this from the first in a row or column, px
 # Columns of the values read from a surface: x and y in it with their covariances, r, second r, gain, offset.
 OUTPUTS = 10

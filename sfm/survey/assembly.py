@@ -53,6 +53,7 @@ def assemble_result(
         if name not in is_in:
             reasons.setdefault(name, reason)
     failed = (*measured.failed, *(FailedImage(*one) for one in reasons.items()))
+    before = (*measured.left_out, *matched.left_out_image_points)
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)
     result = SurveyResult(
@@ -76,11 +77,11 @@ def assemble_result(
         ),
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
-        left_out=(*measured.left_out, *solution.left_out),
+        left_out=(*before, *solution.left_out),
         settings=settings_by_table(survey),
         given_tests=solution.given_tests,
         other_solutions=solution.others,
-        unused_image_points=solution.unused_image_points + sum(one.image_points for one in measured.left_out),
+        unused_image_points=solution.unused_image_points + sum(one.image_points for one in before),
         reject=survey.reject,
         weights=survey.adjust.weights,
         plates=_plates(survey, code),

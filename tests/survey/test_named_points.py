@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +26,7 @@ from tests.synthetic import seed_of
 
 PHOTOGRAPHS = 6
 NOISE = 2.0  # grey values
+LATTICE = (0.0, 105.0, 95.0)  # middle of the lattice of dots, mm
 MOVED = (0.3, -0.2, 0.25)  # of the upper plate between the epochs, mm
 TOP = [(0.0, y, 60.0) for y in (-38.0, -19.0, 0.0, 19.0, 38.0)]
 FLOOR = [(x, y, 0.0) for x in (-185.0, -135.0, 105.0, 135.0, 185.0) for y in (-57.0, 57.0)]
@@ -32,8 +34,11 @@ POINTS = {f"corner {k}": np.array(xyz) for k, xyz in enumerate([*TOP, *FLOOR])}
 
 
 @lru_cache
-def pictures(moved: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[AnyArray, ...]:
-    """Render photographs of plates with coded targets on texture, the upper one moved, without noise."""
+def pictures(moved: tuple[float, ...] = (0.0, 0.0, 0.0), *, dots: bool = False) -> tuple[AnyArray, ...]:
+    """Render photographs of plates with coded targets on texture, the upper one moved, without noise.
+
+    dots: a third plate, high above the floor, has a lattice of dots in place of texture.
+    """
     scene, targets = plates(), plates().targets
     centre = scene.faces.centre + np.array([[0.0, 0.0, 0.0], moved])
     faces = replace(scene.faces, centre=centre, texture=np.full(2, 0.2), grain=np.full(2, 2.0))
@@ -41,6 +46,23 @@ def pictures(moved: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[AnyArray, ...]
         rectangles(face, xy[None], np.full((1, 2), 17.0 if face else 24.0), np.zeros(1), np.full(1, 0.8))
         for face, xy in zip(targets.face.tolist(), targets.centre, strict=True)
     ]
+    if dots:
+        faces = replace(
+            faces,
+            centre=np.vstack([faces.centre, LATTICE]),
+            axes=np.concatenate([faces.axes, faces.axes[:1]]),
+            half=np.vstack([faces.half, [45.0, 45.0]]),
+            value=np.append(faces.value, 0.9),
+            texture=np.append(faces.texture, 0.0),
+            grain=np.append(faces.grain, 1.0),
+        )
+        places = lattice(range(-9, 10), range(-5, 6))
+        places = places[np.abs(places).max(axis=1) < 40]
+        paper.append(
+            rectangles(
+                2, places, np.full((len(places), 2), 2.0), np.zeros(len(places)), np.full(len(places), 0.15)
+            )
+        )
     scene = replace(scene, faces=faces, marks=join_marks([*paper, scene.marks]))
     found, _ = render_photographs(
         scene, camera(), *stations(PHOTOGRAPHS), optics=Optics(blur_px=0.7, exposure=0.9), seed=1
@@ -48,11 +70,18 @@ def pictures(moved: tuple[float, ...] = (0.0, 0.0, 0.0)) -> tuple[AnyArray, ...]
     return tuple(found)
 
 
-def write(folder: Path, marks: str, moved: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Path:
+def lattice(columns: Iterable[int], rows: Iterable[int]) -> FloatArray:
+    """Return places of a lattice of equal triangles of 8 mm, mm, (k, 2)."""
+    return np.array([(8.0 * (a + b / 2), 4.0 * b * np.sqrt(3)) for b in rows for a in columns])
+
+
+def write(
+    folder: Path, marks: str, moved: tuple[float, ...] = (0.0, 0.0, 0.0), *, dots: bool = False
+) -> Path:
     """Write photographs and their survey file with named points; return the file."""
     folder.mkdir()
     rng = seed_of(folder.name)
-    for number, picture in enumerate(pictures(moved), 1):
+    for number, picture in enumerate(pictures(moved, dots=dots), 1):
         noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
         cv2.imwrite(str(folder / f"photo {number}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
     path = folder / "survey.toml"
@@ -68,27 +97,35 @@ def mark(name: str, image: int, xy: FloatArray, before: str = "") -> str:
     )
 
 
-def marks(before: str = "") -> str:
-    """Return the named points, each in the nearest photograph that shows it."""
+def seen_in(number: int, xyz: FloatArray) -> FloatArray:
+    """Return where a photograph shows a place, px, (2,)."""
     position, rotation = stations(PHOTOGRAPHS)
-    text = ""
-    for name, xyz in POINTS.items():
-        seen = np.array(
-            [project(camera(), X0, R, xyz[None])[0] for X0, R in zip(position, rotation, strict=True)]
-        )
-        inside = ((seen > 20) & (seen < np.array(SIZE_PX) - 20)).all(axis=1)
-        i = int(np.argmin(np.where(inside, np.linalg.norm(position - xyz, axis=1), np.inf)))
-        text += mark(name, i + 1, seen[i], before)
-    return text
+    return project(camera(), position[number - 1], rotation[number - 1], np.array([xyz]))[0]
 
 
-def placed(result: SurveyResult) -> tuple[list[str], FloatArray, FloatArray]:
+def nearest(xyz: FloatArray) -> int:
+    """Return the number of the nearest photograph that shows a place."""
+    seen = np.array([seen_in(number, xyz) for number in range(1, PHOTOGRAPHS + 1)])
+    inside = ((seen > 20) & (seen < np.array(SIZE_PX) - 20)).all(axis=1)
+    away = np.linalg.norm(stations(PHOTOGRAPHS)[0] - xyz, axis=1)
+    return 1 + int(np.argmin(np.where(inside, away, np.inf)))
+
+
+def marks(points: Mapping[str, FloatArray] = POINTS, before: str = "") -> str:
+    """Return named points, each in the nearest photograph that shows it."""
+    numbers = {name: nearest(xyz) for name, xyz in points.items()}
+    return "".join(mark(name, i, seen_in(i, points[name]), before) for name, i in numbers.items())
+
+
+def placed(
+    result: SurveyResult, points: Mapping[str, FloatArray] = POINTS
+) -> tuple[list[str], FloatArray, FloatArray]:
     """Return the named points of a result in the frame of the truth, by the codes that did not move."""
     a, truth = result.adjustment, code_centres()
     names = list(a.network.points)
     fixed = [j for j, name in enumerate(names) if name.isdigit() and truth[int(name)][2] == 0]
     placing = fit_similarity(a.estimate.points[fixed], np.array([truth[int(names[j])] for j in fixed]))
-    rows = [names.index(name) for name in POINTS if name in names]
+    rows = [names.index(name) for name in points if name in names]
     R = placing.scale * placing.rotation
     covariance = np.einsum("ab,nbc,dc->nad", R, a.covariance.points[rows], R)
     return [names[j] for j in rows], placing.apply(a.estimate.points[rows]), covariance
@@ -109,7 +146,9 @@ def test_named_points_are_found_and_found_again_in_a_later_epoch(tmp_path: Path)
     rays = np.bincount(network.image_points.point, minlength=len(network.points))
     assert min(rays[network.points.index(name)] for name in names) >= 3
 
-    later = run_survey(read_survey(write(tmp_path / "later", marks("../first/"), MOVED), allow_outside=True))
+    later = run_survey(
+        read_survey(write(tmp_path / "later", marks(before="../first/"), MOVED), allow_outside=True)
+    )
     found, after, covariance_after = placed(later)
     assert found == names
     moved = np.array([MOVED if POINTS[name][2] else (0.0, 0.0, 0.0) for name in names])
@@ -123,14 +162,9 @@ def test_named_points_are_found_and_found_again_in_a_later_epoch(tmp_path: Path)
 def test_a_point_of_an_earlier_epoch_that_is_marked_again_is_measured_once(tmp_path: Path) -> None:
     """The mark shows where it is now; the template stays that of the first epoch."""
     write(tmp_path / "first", marks())
-    position, rotation = stations(PHOTOGRAPHS)
     name = next(name for name, X in POINTS.items() if X[2])
-    now = POINTS[name] + MOVED
-    again = "".join(
-        mark(name, i, project(camera(), position[i - 1], rotation[i - 1], now[None])[0] + [0.5, -0.4])
-        for i in (2, 3)
-    )
-    text = marks("../first/") + again
+    again = "".join(mark(name, i, seen_in(i, POINTS[name] + MOVED) + np.array((0.5, -0.4))) for i in (2, 3))
+    text = marks(before="../first/") + again
     network = run_survey(read_survey(write(tmp_path / "later", text, MOVED), allow_outside=True)).network
     seen = network.image_points
     images = seen.image[seen.point == network.points.index(name)]
@@ -142,6 +176,69 @@ def test_a_place_that_nothing_matches_is_named(tmp_path: Path) -> None:
     result = run_survey(read_survey(write(tmp_path / "plain", mark("beside", 1, beside))))
     (said,) = [one for one in result.verdict.remarks if one.kind == "marks_unmatched"]
     assert said.names("points") == ("beside",) and "beside" not in result.network.points
+
+
+def test_a_point_on_a_repeated_pattern_is_not_measured_at_another_place(tmp_path: Path) -> None:
+    """Several depths of its ray look alike; a second mark, far from exact, decides between them."""
+    points = {f"dot {k}": np.array([*xy, 0.0]) + LATTICE for k, xy in enumerate(lattice((-2, 0, 2), (-2, 1)))}
+    text = marks(points)
+    result = run_survey(read_survey(write(tmp_path / "once", text, dots=True)))
+    (said,) = [one for one in result.verdict.remarks if one.kind == "marks_unmatched"]
+    assert set(said.names("points")) == set(said.names("alike")) == set(points)
+    assert not set(points) & set(result.network.points)
+    for name, xyz in points.items():
+        second = 1 + nearest(xyz) % PHOTOGRAPHS
+        text += mark(name, second, seen_in(second, xyz) + np.array((0.8, -0.6)))
+    twice = run_survey(read_survey(write(tmp_path / "twice", text, dots=True)))
+    found, placed_at, _ = placed(twice, points)
+    assert set(found) == set(points) and twice.verdict.level != "bad"
+    assert max(np.abs(placed_at - np.array([points[name] for name in found])).max(axis=1)) < 0.1
+
+
+@pytest.mark.sweep(0, 3)
+@pytest.mark.parametrize("off", [(40.0, 25.0), (8.0, 5.0), (4.0, 0.0), (1.0, -0.5)])
+def test_a_mark_beside_its_point_is_named_and_left_out(tmp_path: Path, off: tuple[float, float]) -> None:
+    name, xyz = next(iter(POINTS.items()))
+    other = 1 + nearest(xyz) % PHOTOGRAPHS
+    text = marks() + mark(name, other, seen_in(other, xyz) + off)
+    result = run_survey(read_survey(write(tmp_path / "beside", text)))
+    contradicting = [one for one in result.verdict.remarks if one.kind == "image_points_contradicting"]
+    wrong = [f"{name} in photo {other}.png"] if np.hypot(*off) > 2 else []
+    assert [one.names("image_points") for one in contradicting] == [(one,) for one in wrong]
+    assert [one.point for one in result.left_out] == wrong
+    found, at, _ = placed(result)
+    assert found == list(POINTS)
+    assert np.abs(at - np.array(list(POINTS.values()))).max() < 0.06
+
+
+def test_where_most_marks_contradict_the_template_they_are_the_point(tmp_path: Path) -> None:
+    name, xyz = next(iter(POINTS.items()))
+    first = nearest(xyz)
+    others = [number for number in range(1, PHOTOGRAPHS + 1) if number != first][:4]
+    text = mark(name, first, seen_in(first, xyz) + np.array((14.0, 3.0)))
+    text += "".join(mark(name, i, seen_in(i, xyz) + np.array((0.3, -0.4))) for i in others)
+    result = run_survey(read_survey(write(tmp_path / "template", text)))
+    _, at, _ = placed(result, {name: xyz})
+    assert np.abs(at - xyz).max() < 2.0
+    assert any(one.kind == "marks_unmatched" for one in result.verdict.remarks)
+
+
+def test_a_table_that_contradicts_a_named_point_is_named(tmp_path: Path) -> None:
+    """Only once the point is matched in further photographs do they have common image points."""
+    name, xyz = next(iter(POINTS.items()))
+    others = [number for number in range(1, PHOTOGRAPHS + 1) if number != nearest(xyz)]
+    path = write(tmp_path / "table", '[[observations]]\nfile = "given.csv"\n' + marks())
+    rows = [
+        f"photo {i}.png,{name},{x!r},{y!r}"
+        for i in others
+        for x, y in [(seen_in(i, xyz) + (12.0 if i == others[0] else 0.05)).tolist()]
+    ]
+    (path.parent / "given.csv").write_text("\n".join(["image,point,x_px,y_px", *rows, ""]), "utf-8")
+    result = run_survey(read_survey(path))
+    (said,) = [one for one in result.verdict.remarks if one.kind == "image_points_contradicting"]
+    assert said.names("image_points") == (f"{name} in photo {others[0]}.png",)
+    _, at, _ = placed(result, {name: xyz})
+    assert np.abs(at - xyz).max() < 0.2
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,14 @@ class CoveredPixels:
         covered = (self._bits[image][row, col >> 3] >> (7 - (col & 7)).astype(np.uint8)) & 1
         return np.asarray(covered.mean(axis=(1, 2)) <= MAX_SHARED_FRACTION)
 
+    def free_positions(self, image: IntArray, xy: FloatArray) -> BoolArray:
+        """Return which positions, given by photograph (k,) and xy (px, (k, 2)), are on free pixels, (k,)."""
+        free = np.ones(len(xy), dtype=bool)
+        for i in np.unique(image).tolist():
+            rows = np.flatnonzero(image == i)
+            free[rows] = self.is_free(i, xy[rows], 0.0)
+        return free
+
 
 def points_apart(seen: ImagePoints, fits: BoolArray, side_px: float, *, n_points: int) -> BoolArray:
     """Choose points, those with the most rays first, whose windows share few of their pixels, (n,).

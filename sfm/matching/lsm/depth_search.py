@@ -2,7 +2,8 @@
 
 The epipolar line of a point is searched in all photographs at once: at each depth windows are projected on a
 plane there, and correlated. A wrong depth may be alike in one photograph by chance, or on a repeated pattern,
-but hardly in several with different bases.
+but hardly in several with different bases: where the pattern is as regular as the bases, there are several
+depths, which are all returned.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ import numpy as np
 
 from sfm.camera import ray_directions, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.matching.correlation import match_ncc_warped
+from sfm.matching.correlation import START_CORRELATION, match_ncc_warped
 from sfm.matching.lsm.coverage import plane_warps, project_points
 from sfm.network import Estimate
 
 REACH_PX = 2  # distance from the line and along it that a correlation covers
 VERTICES = 65  # of the line of which the length gives the number of depths
+MIN_ALIKE = 2  # photographs that show the surroundings alike at a further depth
+MOST = 8  # depths that are returned; two would do to see that a pattern is repeated
 
 
-def search_depth(
+def search_depths(
     template: AnyArray,
     others: Mapping[int, AnyArray],
     estimate: Estimate,
@@ -34,7 +37,9 @@ def search_depth(
     farthest: float,
     window_px: int,
 ) -> FloatArray:
-    """Return the object point on a ray whose surroundings other photographs show most alike.
+    """Return the object points on a ray whose surroundings other photographs show alike, the best first.
+
+    The first is the most alike, however little it is.
 
     Args:
         template: the photograph of the ray, (H, W).
@@ -49,7 +54,7 @@ def search_depth(
         window_px: odd side of the windows.
 
     Returns:
-        The object point, (3,).
+        Object points, (p, 3).
     """
     (ray,) = ray_directions(tangents_from_pixel(estimate.cameras[camera[i]], xy[None]), estimate.rotation[i])
 
@@ -64,7 +69,7 @@ def search_depth(
     lengths = [np.nansum(np.linalg.norm(np.diff(path(j, on_ray(VERTICES)), axis=0), axis=1)) for j in others]
     points = on_ray(2 + int(max(lengths, default=0.0) / (2 * REACH_PX)))
     k = len(points)
-    correlation = np.zeros(k)
+    correlation, alike = np.zeros(k), np.zeros(k, dtype=np.int64)
     for j, other in others.items():
         at = path(j, points)
         warp = plane_warps(
@@ -79,5 +84,14 @@ def search_depth(
             reach_px=np.full(k, REACH_PX),
             template_px=window_px,
         )
-        correlation += np.fmax(match.correlation, 0.0)  # 0 outside the photograph
-    return np.asarray(points[np.argmax(correlation)])
+        r = np.fmax(match.correlation, 0.0)  # 0 outside the photograph
+        correlation += r
+        alike += r >= START_CORRELATION
+    # the search around each depth covers the next as well
+    before, behind = (np.pad(correlation, 2)[shift : shift + k] for shift in (1, 3))
+    peaks = np.flatnonzero(
+        (correlation > before) & (correlation >= behind) & (alike >= min(MIN_ALIKE, len(others)))
+    )
+    order = peaks[np.argsort(-correlation[peaks], kind="stable")]
+    best = int(np.argmax(correlation))
+    return np.asarray(points[[best, *order[order != best][: MOST - 1]]])

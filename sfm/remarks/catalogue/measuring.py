@@ -72,8 +72,8 @@ POINTS = (
         "warning",
         "{image_points:image point} {image_points:was|were} measured at different positions and left "
         "out: {image_points}.",
-        "two points in one photograph share a name",
-        "Correct the names.",
+        "two points in one photograph share a name, or a place was marked wrongly",
+        "Correct the names, or the places that were marked.",
     ),
     Kind(
         "sources_contradict",
@@ -96,9 +96,10 @@ POINTS = (
     Kind(
         "marks_unmatched",
         "warning",
-        "{points:named point} {points:was|were} found in too few other photographs: {points}.",
-        "the window around the place has no texture, is at an edge of the object or hidden in the others; or "
-        "its photograph is not oriented",
+        "{points:named point} {points:was|were} found in too few other photographs: {points}[[; several "
+        "places look like {alike}]].",
+        "the window around the place has no texture, repeats a pattern, is at an edge of the object or "
+        "hidden in the others; or its photograph is not oriented",
         "Mark a place with texture on one surface, or mark the point in another photograph too.",
     ),
     Kind(

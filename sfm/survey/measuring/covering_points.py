@@ -73,6 +73,7 @@ class SquareRays:
 
     image_points: ImagePoints
     scale: FloatArray  # of the windows relative to the reference, (k,)
+    correlation: FloatArray  # r of each window and that of the reference, 1 for the latter, (k,)
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,7 @@ class _Matched:
     """Rays of one photograph."""
 
     seen: ImagePoints
+    correlation: FloatArray  # (k,)
     scale: FloatArray  # of the windows relative to the reference, (k,)
     in_reference: FloatArray  # half of the noise, assigned to the reference, px^2, (k, 2, 2)
 
@@ -220,7 +222,7 @@ def match_squares(
     first = visible & (rank <= FIRST_PHOTOGRAPHS)
     template = photographs[i]
     parts = [ImagePoints(np.full(k, i), np.arange(k), squares.xy, np.full((k, 2, 2), np.nan))]
-    scales = [np.ones(k)]
+    scales, correlations = [np.ones(k)], [np.ones(k)]
     in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
 
     def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
@@ -252,7 +254,8 @@ def match_squares(
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
         seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
-        return _Matched(seen, scale[fits][good], back @ half @ back.transpose(0, 2, 1))
+        r = match.correlation[good]
+        return _Matched(seen, r, scale[fits][good], back @ half @ back.transpose(0, 2, 1))
 
     def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
         others = np.flatnonzero(which.any(axis=1))
@@ -265,6 +268,7 @@ def match_squares(
                 number[one.seen.point] += 1
                 parts.append(one.seen)
                 scales.append(one.scale)
+                correlations.append(one.correlation)
 
     measure(first, squares.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
@@ -275,7 +279,7 @@ def match_squares(
     parts[0].covariance[some] = in_reference[some] / number[some, None, None]
     seen = ImagePoints.joined(parts)
     some = some[seen.point]
-    return SquareRays(seen.select(some), np.concatenate(scales)[some])
+    return SquareRays(seen.select(some), np.concatenate(scales)[some], np.concatenate(correlations)[some])
 
 
 def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows) -> BoolArray:

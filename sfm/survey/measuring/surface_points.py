@@ -20,7 +20,7 @@ from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, first_alike, project_points
 from sfm.matching.lsm.surface_planes import on_surface
-from sfm.network import Estimate, ImagePoints, Network, rows_of, without_given
+from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles
@@ -95,8 +95,7 @@ def cover_photographs(
     paths = [path_of[name] for name in network.images]
     photographs = PhotographFiles(paths)
     surface = seen.select(fits)
-    masks = Masks(survey.masks)
-    hidden = _hidden(masks, network, estimate)
+    hidden = masked_pixels(Masks(survey.masks), network, estimate)
     windows = _best_windows(photographs, network, estimate, surface, settings, jobs, hidden)
     found = find_covering_points(
         photographs,
@@ -108,7 +107,7 @@ def cover_photographs(
         hidden=hidden,
         threads=jobs,
     )
-    found = without_far_points(_visible(masks, found, network, estimate), estimate)
+    found = without_far_points(_visible(hidden, found), estimate)
     if len(found.image_points) < fits.sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
@@ -200,7 +199,7 @@ def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     return np.asarray(fits & enough[seen.point])
 
 
-def _hidden(masks: Masks, network: Network, estimate: Estimate) -> CoveredPixels | None:
+def masked_pixels(masks: Masks, network: Network, estimate: Estimate) -> CoveredPixels | None:
     """Return the masked pixels of the photographs; None if there are no masks."""
     if masks.folder is None:
         return None
@@ -209,13 +208,12 @@ def _hidden(masks: Masks, network: Network, estimate: Estimate) -> CoveredPixels
     return CoveredPixels([size[::-1] for size in sizes], black)
 
 
-def _visible(masks: Masks, found: CoveringPoints, network: Network, estimate: Estimate) -> CoveringPoints:
+def _visible(hidden: CoveredPixels | None, found: CoveringPoints) -> CoveringPoints:
     """Return the covering points that two photographs show where these are not masked."""
     seen = found.image_points
-    kept = np.ones(len(seen), dtype=bool)
-    for i, rows in enumerate(rows_of(seen.image, len(network.images))):
-        size_px = estimate.cameras[network.camera[i]].size_px
-        kept[rows] = masks.visible(network.images[i], seen.xy[rows], size_px)
+    if hidden is None:
+        return found
+    kept = hidden.free_positions(seen.image, seen.xy)
     good = np.bincount(seen.point[kept], minlength=len(found.points)) >= 2
     return _some_points(found, good, kept)
 

@@ -151,8 +151,34 @@ def _running(part: Measurements | Correspondences) -> set[str]:
 class _Repeated:
     """Image points that several sources measured."""
 
-    remarks: tuple[Remark, ...]  # on sources and image points that contradict one another
-    left_out: tuple[LeftOutPoint, ...]
+    of_sources: tuple[Remark, ...]  # on sources that contradict one another
+    contradicting: tuple[str, ...]  # image points, left out
+
+    @property
+    def left_out(self) -> tuple[LeftOutPoint, ...]:
+        """The image points that contradict one another, each of two sources."""
+        return tuple(
+            LeftOutPoint(name, 2, remark("image_points_contradicting", image_points=name))
+            for name in self.contradicting
+        )
+
+    @property
+    def remarks(self) -> tuple[Remark, ...]:
+        """Remarks on sources and image points that contradict one another."""
+        names = self.contradicting
+        return (
+            *self.of_sources,
+            *((remark("image_points_contradicting", image_points=names),) if names else ()),
+        )
+
+    def after(self, measured: Measurements) -> _Repeated:
+        """Return what was not yet known before the photographs were oriented."""
+        known = {one.names("sources") for one in measured.remarks if one.kind == "sources_contradict"}
+        before = {point.point for point in measured.left_out}
+        return _Repeated(
+            tuple(one for one in self.of_sources if one.names("sources") not in known),
+            tuple(name for name in self.contradicting if name not in before),
+        )
 
 
 def _joined(
@@ -179,13 +205,8 @@ def _joined(
         )
     once = without_repeated(ImagePoints.joined(parts), sources)
     contradicting = tuple(f"{points[j]} in {images[i]}" for i, j in once.contradicting)
-    remarks = (remark("image_points_contradicting", image_points=contradicting),) if contradicting else ()
-    left_out = tuple(
-        LeftOutPoint(name, 2, remark("image_points_contradicting", image_points=name))
-        for name in contradicting
-    )
     network = network_of(survey, images, camera, points, once.image_points, bars=_all_bars(bars))
-    return replace(network, sources=sources), _Repeated((*once.remarks, *remarks), left_out)
+    return replace(network, sources=sources), _Repeated(once.remarks, contradicting)
 
 
 def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
@@ -265,7 +286,8 @@ def _joined_correspondences(
     completed = [
         replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
     ]
-    network, _ = _joined(survey, [matched.network for matched in completed], named)
+    network, repeated = _joined(survey, [matched.network for matched in completed], named)
+    repeated = repeated.after(measured)
     images = _indices(network.images, measured.network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
     elsewhere = {
@@ -295,11 +317,12 @@ def _joined_correspondences(
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
         tuple(name for matched in completed for name in matched.no_circles),
-        tuple(remark for matched in completed for remark in matched.remarks),
+        (*(said for matched in completed for said in matched.remarks), *repeated.remarks),
         start.point_failures,
         start.kind == "given",
         tuple(elsewhere.items()),
         tuple(dict.fromkeys(name for matched in completed for name in matched.suspected)),
+        (*(point for matched in completed for point in matched.left_out_image_points), *repeated.left_out),
         _joined_overlays(
             [
                 part.overlays if matched.overlays is None else matched.overlays

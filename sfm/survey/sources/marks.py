@@ -5,37 +5,41 @@ shows. Therefore its image point in the photograph of the template has no error 
 the same in every run, and in every epoch that uses this template. Least squares matching measures it in the
 others. A match has the noise of both windows: half of its covariance is that of its image point, and the
 other half, common to all, that of the image point of the template. The standard deviations are those of the
-point in the middle of the template. What the person means by the name may lie beside it by the error of
-pointing, about a pixel; a bar to this point has that error too.
+displacement of the point between epochs. Its coordinates have the noise of the template beside, about 0.02 px,
+which is the same in all epochs. What the person means by the name may lie beside it by the error of pointing,
+about a pixel; a bar to this point has that error too.
 
 Marks of a point in further photographs, with the sigma of pointing, show where it is: they may orient these
-photographs, and they stay where nothing is matched.
+photographs, they decide where a pattern looks alike at several places, and they stay where nothing is
+matched. Those beside the matched point are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from sfm.camera import tangents_from_pixel
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray
+from sfm.distributions import Levels, chi2_isf
 from sfm.errors import SurveyFileError
 from sfm.matching.conjugate import match_points
-from sfm.matching.lsm.coverage import Windows
-from sfm.matching.lsm.depth_search import search_depth
-from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, planes_at
+from sfm.matching.lsm.coverage import Windows, project_points
+from sfm.matching.lsm.surface_planes import squares_over_covariance
 from sfm.matching.radiometry import GreyPhotographs, grey_of
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.network import ImagePoints, Network
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.remarks.remark import remark
+from sfm.result import LeftOutPoint
 from sfm.survey.inputs.given import Observations
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, Measurements, PhotographList
 from sfm.survey.inputs.settings import PointSettings
@@ -43,15 +47,9 @@ from sfm.survey.inputs.sources import GIVEN, MARKS
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import path_inside
-from sfm.survey.measuring.covering_points import (
-    BORDER_PX,
-    FIRST_PHOTOGRAPHS,
-    MIN_RAYS,
-    TOLERANCE_PX,
-    Squares,
-    match_squares,
-    seen_squares,
-)
+from sfm.survey.measuring.covering_points import FIRST_PHOTOGRAPHS, TOLERANCE_PX
+from sfm.survey.measuring.surface_points import masked_pixels
+from sfm.survey.measuring.templates import NONE, TemplateRays, TemplateScene, match_templates
 from sfm.survey.measuring.tie_points import drawn_windows
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.given import full_names, read_tables
@@ -60,7 +58,6 @@ from sfm.survey.sources.source import Correspondences, SurveySource
 EARLIER = "earlier"  # name of a photograph of an earlier epoch, which takes no part in the network
 MOST_RESECTED = 100  # points of a photograph that orient it
 MIN_MARKED = 2  # photographs in which a point without a match is marked by hand
-NONE = np.zeros(0, dtype=np.int64)
 
 
 def measure_marks(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: object) -> Measurements:
@@ -125,82 +122,124 @@ def match_marks(
     points = tuple(dict.fromkeys(mark.name for mark in survey.marks))
     _refuse_names_of_others(survey, whole, points)
     scene = _scene_of(oriented)
-    known = np.full((len(points), 3), np.nan)
     index = {name: i for i, name in enumerate(whole.images)}
     image = np.array([index[name] for name in part.images], dtype=np.int64)
     point = np.array([points.index(name) for name in part.points], dtype=np.int64)
+    known = np.full((len(points), 3), np.nan)
     known[point] = start.estimate.points
     seen = part.image_points
     by_hand = replace(seen, image=image[seen.image], point=point[seen.point], source=None)
-    windows = Windows(survey.texture.window_px)
-    first = {mark.name: mark.image for mark in reversed(survey.marks)}  # the photograph of the template
-    templates_here = np.array([first[name] in scene.names for name in points])
-    parts = [
-        *_match_templates_here(scene, by_hand.select(templates_here[by_hand.point]), known, windows, jobs),
-        *_match_templates_of_others(survey, scene, points, known, windows, jobs),
-    ]
-    matched = ImagePoints.joined([by_hand.select(NONE), *parts])
-    lost = np.setdiff1d(np.arange(len(points)), matched.point).tolist()
-    noise = survey.adjust.sigma_px**2 * np.eye(2)
-    matched = replace(matched, covariance=matched.covariance + noise)
-    by_hand_key, key = (one.image * len(points) + one.point for one in (by_hand, matched))
-    everything = ImagePoints.joined([matched, by_hand.select(~np.isin(by_hand_key, key))])
+    found = _match_all(oriented, scene, points, known, jobs)
+    used = _without_contradictions(scene, found.image_points, by_hand, survey.adjust.levels)
+    lost = np.setdiff1d(np.arange(len(points)), used.matched.point)
+    matched = _with_pointing(survey, whole, points, used.matched)
+    key, by_hand_key = (rows.image * len(points) + rows.point for rows in (matched, used.by_hand))
+    everything = ImagePoints.joined([matched, used.by_hand.select(~np.isin(by_hand_key, key))])
     everything = everything.select(np.argsort(everything.point, kind="stable"))
     network = network_of(survey, whole.images, whole.camera, points, everything)
-    found = intersect_image_points(
+    placed = intersect_image_points(
         everything,
         network.camera,
         scene.estimate,
         n_points=len(points),
         tolerance_px=float(start.tolerance_px.max()),
     )
-    paths = [scene.paths.get(name, Path()) for name in network.images]
-    drawn = drawn_windows(network, paths, windows.side_px)
+    paths = _paths_of(oriented)
+    drawn = drawn_windows(
+        network, [paths.get(name, Path()) for name in network.images], survey.texture.window_px
+    )
+    contradicting = tuple(f"{points[j]} in {whole.images[i]}" for i, j in used.contradicting)
+    remarks = []
+    if len(lost):
+        alike = [points[j] for j in np.intersect1d(found.alike, lost)]
+        remarks.append(remark("marks_unmatched", points=[points[j] for j in lost], alike=alike))
+    if contradicting:
+        remarks.append(remark("image_points_contradicting", image_points=contradicting))
     return Correspondences(
         network,
-        replace(scene.estimate, points=found.points),
+        replace(scene.estimate, points=placed.points),
         np.full(len(points), MIN_MARKED),
         point_failures=start.point_failures,
         given=start.kind == "given",
-        remarks=(remark("marks_unmatched", points=[points[j] for j in lost]),) if lost else (),
-        overlays=tuple(overlay for overlay in drawn if overlay.image in scene.paths),
+        remarks=tuple(remarks),
+        overlays=tuple(overlay for overlay in drawn if overlay.image in paths),
+        left_out_image_points=tuple(
+            LeftOutPoint(name, 1, remark("image_points_contradicting", image_points=name))
+            for name in contradicting
+        ),
+    )
+
+
+def _paths_of(oriented: Oriented) -> dict[str, Path]:
+    """Return the files of the photographs, by their names."""
+    files = oriented.measured.files
+    return {} if files is None else dict(zip(files.names, files.paths, strict=True))
+
+
+def _scene_of(oriented: Oriented) -> TemplateScene:
+    """Return the oriented photographs that have files, and the image points that fit."""
+    network, start, paths = oriented.measured.network, oriented.orientation, _paths_of(oriented)
+    position = start.estimate.position.copy()
+    position[[name not in paths for name in network.images]] = np.nan
+    measured = np.array([source != MARKS for source in network.sources])[network.source]
+    fits = start.fits & start.estimate.determined[network.image_points.point] & measured
+    return TemplateScene(
+        network,
+        replace(start.estimate, position=position),
+        replace(network.image_points.select(fits), source=None, stated=None),
+        GreyPhotographs(lambda i: read_photograph(paths[network.images[i]])),
+        masked_pixels(Masks(oriented.survey.masks), network, start.estimate),
     )
 
 
 @dataclass(frozen=True)
-class _Scene:
-    """The oriented photographs that have files, and the image points that give the surface."""
+class _Used:
+    """Image points that agree."""
 
-    network: Network
-    estimate: Estimate
-    seen: ImagePoints
-    paths: Mapping[str, Path]
-    names: frozenset[str]  # of these photographs, with folders and without
-    grey: GreyPhotographs
-    masks: Masks
-    earlier: int = -1  # photograph of an earlier epoch, of which the points may have moved
-
-    def visible(self, j: int, xy: FloatArray) -> BoolArray:
-        """Return which positions in a photograph are not masked, (k,)."""
-        size_px = self.estimate.cameras[self.network.camera[j]].size_px
-        return self.masks.visible(self.network.images[j], xy, size_px)
+    matched: ImagePoints
+    by_hand: ImagePoints
+    contradicting: tuple[tuple[int, int], ...]  # (photograph, point) of marks that are left out
 
 
-def _scene_of(oriented: Oriented) -> _Scene:
-    network, start, files = oriented.measured.network, oriented.orientation, oriented.measured.files
-    paths = {} if files is None else dict(zip(files.names, files.paths, strict=True))
-    position = start.estimate.position.copy()
-    position[[name not in paths for name in network.images]] = np.nan
-    fits = start.fits & start.estimate.determined[network.image_points.point]
-    return _Scene(
-        network,
-        replace(start.estimate, position=position),
-        replace(network.image_points.select(fits), source=None, stated=None),
-        paths,
-        _names_of(files),
-        GreyPhotographs(lambda i: read_photograph(paths[network.images[i]])),
-        Masks(oriented.survey.masks),
+def _without_contradictions(
+    scene: TemplateScene, matched: ImagePoints, by_hand: ImagePoints, levels: Levels
+) -> _Used:
+    """Return the matched image points and the marks that are where the point is.
+
+    Where most further marks of a point contradict, its template is not where the person means it to be: what
+    was matched is left out. Otherwise the marks are left out.
+    """
+    n = 1 + int(max(by_hand.point.max(initial=-1), matched.point.max(initial=-1)))
+    placed = intersect_image_points(
+        matched, scene.network.camera, scene.estimate, n_points=n, tolerance_px=TOLERANCE_PX
     )
+    at = project_points(scene.estimate, scene.network.camera, by_hand.image, placed.points[by_hand.point])
+    off = squares_over_covariance(by_hand.xy - at, by_hand.covariance)  # NaN where nothing was matched
+    wrong = off > chi2_isf(levels.of_each(len(off)), 2)
+    tested = np.bincount(by_hand.point[np.isfinite(off)], minlength=n)
+    of_point = np.bincount(by_hand.point[wrong], minlength=n)
+    elsewhere = (of_point > 1) & (2 * of_point >= tested)
+    wrong &= ~elsewhere[by_hand.point]
+    contradicting = zip(by_hand.image[wrong].tolist(), by_hand.point[wrong].tolist(), strict=True)
+    kept = ~elsewhere[matched.point]
+    return _Used(matched.select(kept), by_hand.select(~wrong), tuple(contradicting))
+
+
+def _with_pointing(
+    survey: Survey, whole: Network, points: Sequence[str], matched: ImagePoints
+) -> ImagePoints:
+    """Return matched image points with the noise of image points, and that of pointing where it matters.
+
+    A table that has the point too means it by its name: the template is beside it by the error of pointing.
+    """
+    noise = np.full(len(points), survey.adjust.sigma_px**2)
+    given = np.array([source == GIVEN for source in whole.sources])[whole.source]
+    by_tables = {whole.points[j] for j in whole.image_points.point[given].tolist()}
+    pointing = {mark.name: mark.sigma_px for mark in reversed(survey.marks)}
+    for j, name in enumerate(points):
+        if name in by_tables:
+            noise[j] += pointing[name] ** 2
+    return replace(matched, covariance=matched.covariance + noise[matched.point][:, None, None] * np.eye(2))
 
 
 def _refuse_names_of_others(survey: Survey, network: Network, points: Sequence[str]) -> None:
@@ -214,46 +253,59 @@ def _refuse_names_of_others(survey: Survey, network: Network, points: Sequence[s
             )
 
 
-def _match_templates_here(
-    scene: _Scene, by_hand: ImagePoints, known: FloatArray, windows: Windows, jobs: int
-) -> Iterator[ImagePoints]:
-    """Yield the rays of points whose first mark is in a photograph of the survey."""
-    of_point, first = np.unique(by_hand.point, return_index=True)
-    for i, rows in enumerate(rows_of(by_hand.image[first], len(scene.network.images))):
-        if len(rows) and scene.estimate.oriented[i]:
-            point = of_point[rows]
-            rays = _match_templates(scene, i, by_hand.xy[first[rows]], known[point], windows, jobs)
-            yield replace(rays, point=point[rays.point])
+def _match_all(
+    oriented: Oriented, scene: TemplateScene, points: Sequence[str], known: FloatArray, jobs: int
+) -> TemplateRays:
+    """Return the rays of the named points, each with its first template.
 
-
-def _match_templates_of_others(
-    survey: Survey, scene: _Scene, points: Sequence[str], known: FloatArray, windows: Windows, jobs: int
-) -> Iterator[ImagePoints]:
-    """Yield the rays of points whose first mark is in a photograph of an earlier epoch.
-
-    This photograph is oriented on points that have not moved, and gives nothing but the templates.
+    It is in an oriented photograph of the survey, or in one of an earlier epoch, which is oriented on points
+    that have not moved, and gives nothing but templates.
     """
-    first = {mark.name: mark for mark in reversed(survey.marks)}
-    earlier = [mark for mark in first.values() if mark.image not in scene.names]
-    for path in dict.fromkeys(_path_of(survey, mark) for mark in earlier):
-        marks = [mark for mark in earlier if _path_of(survey, mark) == path]
-        photograph = grey_of(read_photograph(path))
-        height, width = photograph.shape
-        for mark in marks:
-            if not (0 <= mark.x_px < width and 0 <= mark.y_px < height):
-                raise SurveyFileError(
-                    f"{survey.source}: point '{mark.name}' is at {mark.x_px:g}, {mark.y_px:g} px, outside "
-                    f"{mark.image} of {width} x {height} px"
-                )
-        with_earlier = _with_earlier(scene, photograph)
-        if with_earlier is not None:
-            xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
-            point = np.array([points.index(mark.name) for mark in marks])
-            rays = _match_templates(with_earlier, len(scene.network.images), xy, known[point], windows, jobs)
-            yield replace(rays, point=point[rays.point])
+    survey, files = oriented.survey, oriented.measured.files or NO_PHOTOGRAPHS
+    windows = Windows(survey.texture.window_px)
+    scenes: dict[str, tuple[TemplateScene, int] | None] = {}
+    templates: defaultdict[str, list[PointSettings]] = defaultdict(list)
+    named: set[str] = set()
+    for mark in survey.marks:
+        if mark.name in named:
+            continue
+        if mark.image not in scenes:
+            scenes[mark.image] = _scene_with(survey, scene, mark, files)
+        if scenes[mark.image] is not None:
+            templates[mark.image].append(mark)
+            named.add(mark.name)
+    parts, alike = [scene.seen.select(NONE)], [NONE]
+    for name, marks in templates.items():
+        with_template, i = cast(tuple[TemplateScene, int], scenes[name])
+        xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
+        point = np.array([points.index(mark.name) for mark in marks])
+        found = match_templates(with_template, i, xy, known[point], windows, jobs)
+        parts.append(replace(found.image_points, point=point[found.image_points.point]))
+        alike.append(point[found.alike])
+    return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))
 
 
-def _with_earlier(scene: _Scene, photograph: AnyArray) -> _Scene | None:
+def _scene_with(
+    survey: Survey, scene: TemplateScene, mark: PointSettings, files: PhotographList
+) -> tuple[TemplateScene, int] | None:
+    """Return the scene with the photograph of a mark, and which it is; None if it is not oriented."""
+    if mark.image in _names_of(files):
+        name = full_names(files).get(mark.image, mark.image)
+        oriented = name in scene.network.images and scene.estimate.oriented[scene.network.images.index(name)]
+        return (scene, scene.network.images.index(name)) if oriented else None
+    photograph = grey_of(read_photograph(_path_of(survey, mark)))
+    height, width = photograph.shape
+    for other in survey.marks:
+        if other.image == mark.image and not (0 <= other.x_px < width and 0 <= other.y_px < height):
+            raise SurveyFileError(
+                f"{survey.source}: point '{other.name}' is at {other.x_px:g}, {other.y_px:g} px, outside "
+                f"{other.image} of {width} x {height} px"
+            )
+    with_earlier = _with_earlier(scene, photograph)
+    return None if with_earlier is None else (with_earlier, with_earlier.earlier)
+
+
+def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene | None:
     """Return the photographs and one of an earlier epoch, oriented on its points; None if it cannot be.
 
     It is assumed to be of the first camera with photographs of its size.
@@ -295,128 +347,6 @@ def _with_earlier(scene: _Scene, photograph: AnyArray) -> _Scene | None:
         grey=GreyPhotographs(lambda j: photograph if j == m else scene.grey[j].pixels),
         earlier=m,
     )
-
-
-def _match_templates(
-    scene: _Scene,
-    i: int,
-    xy: FloatArray,
-    known: FloatArray,
-    windows: Windows,
-    jobs: int,
-) -> ImagePoints:
-    """Return the rays of points with a template in photograph i, in all photographs that show them.
-
-    The object point is approximately known, or on the surface of its neighbours, or else it is searched for
-    along its ray.
-
-    Args:
-        scene: the oriented photographs.
-        i: photograph of the templates.
-        xy: middles of the templates, px, (k, 2).
-        known: approximate object points, NaN where unknown, (k, 3).
-        windows: size of the windows; larger ones are tried where these are not matched.
-        jobs: number of photographs processed in parallel.
-    """
-    estimate, camera = scene.estimate, scene.network.camera
-    neighbours = np.unique(scene.seen.point[scene.seen.image == i])
-    on_surface, normal = planes_at(estimate, camera, i, xy, neighbours)
-    normal = np.where(np.isfinite(normal), normal, estimate.rotation[i][:, 2])
-
-    def along_rays(rows: IntArray, windows: Windows) -> FloatArray:
-        return _search_along_rays(scene, i, xy[rows], normal[rows], neighbours, windows.side_px)
-
-    parts = [scene.seen.select(NONE)]
-    lost = np.arange(len(xy))
-    for side_px, approximate in product(
-        (windows.side_px, 2 * windows.side_px - 1),  # larger ones show more texture
-        (lambda rows, _: known[rows], lambda rows, _: on_surface[rows], along_rays),
-    ):
-        tried = replace(windows, side_px=side_px)
-        points = approximate(lost, tried)
-        rows = lost[np.isfinite(points).all(axis=1)]
-        if len(rows):
-            squares = Squares(i, xy[rows], normal[rows], points[np.isin(lost, rows)])
-            rays = _rays_that_meet(scene, squares, tried, jobs)
-            parts.append(replace(rays, point=rows[rays.point]))
-            lost = np.setdiff1d(lost, parts[-1].point)
-    return ImagePoints.joined(parts)
-
-
-def _search_along_rays(
-    scene: _Scene, i: int, xy: FloatArray, normal: FloatArray, neighbours: IntArray, window_px: int
-) -> FloatArray:
-    """Return object points where photographs of similar directions show the surroundings most alike."""
-    estimate, camera = scene.estimate, scene.network.camera
-    depth = -((estimate.points[neighbours] - estimate.position[i]) @ estimate.rotation[i])[:, 2]
-    depth = depth[depth > 0]
-    if not len(depth):
-        return np.full((len(xy), 3), np.nan)
-    direction = estimate.position - np.median(estimate.points[neighbours], axis=0)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    cosine = np.where(estimate.oriented, direction @ direction[i], -np.inf)
-    cosine[i] = -np.inf
-    nearest = [j for j in np.argsort(-cosine)[:FIRST_PHOTOGRAPHS].tolist() if np.isfinite(cosine[j])]
-    others = {j: scene.grey[j].pixels for j in nearest}
-    points = [
-        search_depth(
-            scene.grey[i].pixels,
-            others,
-            estimate,
-            camera,
-            i,
-            place,
-            normal=across,
-            nearest=NEAREST * float(depth.min()),
-            farthest=FARTHEST * float(depth.max()),
-            window_px=window_px,
-        )
-        for place, across in zip(xy, normal, strict=True)
-    ]
-    return np.reshape(points, (-1, 3))
-
-
-def _rays_that_meet(scene: _Scene, squares: Squares, windows: Windows, jobs: int) -> ImagePoints:
-    """Return the rays of squares that meet in a point: three, or two where only two photographs show it."""
-    estimate, camera, i = scene.estimate, scene.network.camera, squares.image
-    shown = np.zeros((len(scene.network.images), len(squares)), dtype=bool)
-    for j, rows, at in seen_squares(estimate, camera, squares, windows.side_px // 2 + BORDER_PX):
-        shown[j, rows[scene.visible(j, at)]] = True
-    shown[i] = True
-    count = shown.sum(axis=0) - (i == scene.earlier)
-    parts = []
-    for needed, these in ((MIN_RAYS, count >= MIN_RAYS), (2, count == 2)):
-        numbers = np.flatnonzero(these)
-        if not len(numbers):
-            continue
-        rays = match_squares(
-            scene.grey,
-            estimate,
-            camera,
-            squares.select(these),
-            shown[:, these],
-            windows,
-            jobs,
-            both_ways=needed == 2,
-        ).image_points
-        rays = rays.select(rays.image != scene.earlier)
-        met = intersect_image_points(rays, camera, estimate, n_points=len(numbers), tolerance_px=TOLERANCE_PX)
-        used = rays.select(met.used & _under_no_mask(scene, rays))
-        enough = np.bincount(used.point, minlength=len(numbers)) >= needed
-        if i != scene.earlier:  # the ray of the template is the point
-            enough &= np.bincount(used.point[used.image == i], minlength=len(numbers)) > 0
-        used = used.select(enough[used.point])
-        parts.append(replace(used, point=numbers[used.point]))
-    return ImagePoints.joined([scene.seen.select(NONE), *parts])
-
-
-def _under_no_mask(scene: _Scene, rays: ImagePoints) -> BoolArray:
-    """Return which image points are not masked where they were matched, (k,)."""
-    visible = np.ones(len(rays), dtype=bool)
-    for j in np.unique(rays.image).tolist():
-        rows = np.flatnonzero(rays.image == j)
-        visible[rows] = scene.visible(j, rays.xy[rows])
-    return visible
 
 
 SOURCE = SurveySource(measure_marks, match_marks)

@@ -11,7 +11,7 @@ from sfm.conventions import IntArray
 from sfm.network import Estimate, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import Remark
-from sfm.result import Eccentricity, PhotographTargets
+from sfm.result import Eccentricity, LeftOutPoint, PhotographTargets
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import Section
@@ -36,6 +36,7 @@ class Correspondences:
     given: bool = False  # whether the orientation started from approximate values of the survey
     left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
+    left_out_image_points: tuple[LeftOutPoint, ...] = ()  # that contradict others of their point
     overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
 
 
