@@ -59,6 +59,7 @@ class Source:
     fewest: int = 4  # image points of a photograph: three determine it, the fourth checks
     is_exact: bool = False  # whether they were handed over as they are
     has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
+    is_matched: bool = False  # whether its image points are windows that were matched with one another
     points: str = "uncoded"  # what its points are that have no code
 
 
@@ -182,6 +183,13 @@ class Network:
     def automatic_points(self) -> frozenset[str]:
         """Names of the points that may have other names in later runs."""
         return frozenset(name for name, named in zip(self.points, self.named, strict=True) if not named)
+
+    @property
+    def windows(self) -> frozenset[str]:
+        """Names of the points that are the middles of matched windows, in all their image points."""
+        matched = np.array([source.is_matched for source in self.sources])[self.source]
+        others = np.unique(self.image_points.point[~matched])
+        return frozenset(self.points) - {self.points[j] for j in others.tolist()}
 
     @cached_property
     def named(self) -> BoolArray:

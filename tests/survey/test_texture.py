@@ -16,7 +16,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.adjusting import solution
 from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
 from sfm.survey.adjusting.solution import SolvedSurvey
-from sfm.survey.inputs.sources import TEXTURE
+from sfm.survey.inputs.sources import MARKS, TEXTURE
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.survey.sources.source import Correspondences
 from tests.survey.texture_scenes import KINDS, NUMBERS, SHARE, WRONG, outcome_of, study, water, write_scene
@@ -100,6 +100,24 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
         of_texture, "points_moved"
     )
     assert not of_kind(of_texture, "two_places")  # nobody can measure a point without a name again
+
+
+@pytest.mark.parametrize(
+    ("group", "kind"), [((7, 17, 27), "windows_elsewhere"), ((7, 8, 17), "points_moved")]
+)
+def test_a_named_point_among_windows_is_one(
+    monkeypatch: pytest.MonkeyPatch, group: tuple[int, ...], kind: str
+) -> None:
+    """Named points that are seen elsewhere by themselves, or in the majority, moved."""
+    network, truth = make_network(seed_of("named"), images=8, points=POINTS, free=("c",))
+    source = np.isin(network.image_points.point, [7, 8]).astype(np.int64)
+    seen = replace(network.image_points, source=source)
+    network = replace(network, image_points=seen, sources=(TEXTURE, MARKS))
+    names = [network.points[j] for j in group]
+    moved = remark("points_moved", points=names, distance=0.1, shift=9.0, wrong=1.0, **{"from": "image 5"})
+    monkeypatch.setattr(solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved,)))
+    found = solve_survey(survey_of(network, truth), Correspondences(network, truth, np.full(POINTS, 2)))
+    assert [one.kind for one in found.remarks if one.kind in ("windows_elsewhere", "points_moved")] == [kind]
 
 
 @pytest.mark.parametrize(("left", "stays"), [(9, False), (30, True)])

@@ -89,14 +89,19 @@ def posed_by_rigs(adjustment: Adjustment, needed: IntArray) -> tuple[Remark, ...
 
 
 def windows_elsewhere(network: Network, remarks: Sequence[Remark]) -> tuple[Remark, ...]:
-    """Return the remarks; points of texture did not move, but are seen at other positions.
+    """Return the remarks; windows on texture did not move, but are matched at other positions.
 
-    A single one that is seen at two is left out: it has no name that a person could correct.
+    Named points may be among them, but are not most of them. A single window that is seen at two positions
+    is left out: it has no name that a person could correct.
     """
-    texture = network.automatic_points
+    texture, windows = network.automatic_points, network.windows
+
+    def are_windows(names: tuple[str, ...]) -> bool:
+        return windows.issuperset(names) and 2 * len(texture.intersection(names)) > len(names)
+
     return tuple(
         replace(said, kind="windows_elsewhere")
-        if said.kind == "points_moved" and texture.issuperset(said.names("points"))
+        if said.kind == "points_moved" and are_windows(said.names("points"))
         else said
         for said in remarks
         if said.kind != "two_places" or said.names("point")[0] not in texture

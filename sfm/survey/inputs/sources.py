@@ -16,12 +16,13 @@ from sfm.network import Source
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets")
 GIVEN = Source("given", is_exact=True, points="given")
-MARKS = Source("marks", points="named")
+MARKS = Source("marks", is_matched=True, points="named")
 TEXTURE = Source(
     "texture",
     names_last=False,
     fewest=MIN_TIE_POINTS,
     has_common_errors=True,
+    is_matched=True,
     points="of natural texture",
 )
 
