@@ -164,7 +164,7 @@ def test_a_point_of_an_earlier_epoch_that_is_marked_again_is_measured_once(tmp_p
     write(tmp_path / "first", marks())
     name = next(name for name, X in POINTS.items() if X[2])
     again = "".join(mark(name, i, seen_in(i, POINTS[name] + MOVED) + np.array((0.5, -0.4))) for i in (2, 3))
-    text = marks(before="../first/") + again
+    text = marks({name: POINTS[name]}, "../first/") + again
     network = run_survey(read_survey(write(tmp_path / "later", text, MOVED), allow_outside=True)).network
     seen = network.image_points
     images = seen.image[seen.point == network.points.index(name)]
