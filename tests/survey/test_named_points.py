@@ -211,6 +211,17 @@ def test_a_mark_beside_its_point_is_named_and_left_out(tmp_path: Path, off: tupl
     assert np.abs(at - np.array(list(POINTS.values()))).max() < 0.06
 
 
+def test_the_first_mark_in_an_oriented_photograph_is_the_template(tmp_path: Path) -> None:
+    name, xyz = next(iter(POINTS.items()))
+    text = mark(name, PHOTOGRAPHS + 1, np.array([200.0, 150.0])) + marks({name: xyz})
+    path = write(tmp_path / "unoriented", text)
+    nothing = seed_of("nothing").integers(0, 255, SIZE_PX[::-1], dtype=np.uint8)
+    cv2.imwrite(str(path.parent / f"photo {PHOTOGRAPHS + 1}.png"), nothing)
+    result = run_survey(read_survey(path))
+    _, at, _ = placed(result, {name: xyz})
+    assert np.abs(at - xyz).max() < 0.06
+
+
 def test_where_most_marks_contradict_the_template_they_are_the_point(tmp_path: Path) -> None:
     name, xyz = next(iter(POINTS.items()))
     first = nearest(xyz)
