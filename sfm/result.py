@@ -196,7 +196,7 @@ class SurveyResult:
     left_out: tuple[LeftOutPoint, ...] = ()  # measured points that are not in the result
     given_tests: tuple[GivenTest, ...] = ()  # tests of control and scale bars against the image points alone
     other_solutions: tuple[OtherSolution, ...] = ()  # further solutions that fit the image points
-    unused_image_points: int = 0  # their point or photograph is not in the result; in no other count
+    unused_image_points: int = 0  # their point, photograph or state is not in the result; in no other count
     plates: tuple[SeenPlate, ...] = ()  # plates whose points are known relative to one another
     check_points: tuple[CheckPoint, ...] = ()  # points with coordinates that took no part
     equipment: tuple[PlacedEquipment, ...] = ()  # calibrated equipment, once for each position
@@ -351,8 +351,8 @@ class SurveyResult:
         unused = self.unused_image_points
         if not unused:
             return words
-        points = f"of {counted(len(self.left_out), 'point')}" if self.left_out else "of photographs"
-        return f"{words}, {unused} not in the result ({points})"
+        of_points = f" (of {counted(len(self.left_out), 'point')})" if self.left_out else ""
+        return f"{words}, {unused} not in the result{of_points}"
 
     @property
     def has_scale(self) -> bool:

@@ -15,6 +15,7 @@ notion de collectif (bound on a ratio of likelihoods).
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -54,6 +55,7 @@ class Choice(Generic[Model, Solution]):
     # the solution that is taken, with its remarks, from the present one and the chosen one
     report: Callable[[Solution, Solution], Solution] = lambda _, chosen: chosen
     suffices: Callable[[Solution], bool] = lambda _: False  # whether no further model is tried
+    onward: bool = False  # whether a solution that is not taken suggests models too
     behind: int = 1  # alternatives behind each model: start values, and photographs that are asked the same
 
 
@@ -76,9 +78,10 @@ def choose(
         GeometryError: a model on which a test has decided has no solution.
     """
     for choice in choices:
-        models, best, most = list(choice.models(present)), None, 0.0
+        models, best, most = deque(choice.models(present)), None, 0.0
         search = float(np.log(max(len(models), 1) * choice.behind / Levels(false_alarm).family))
-        for model in models:
+        while models:
+            model = models.popleft()
             try:
                 solution = solve(model)
             except GeometryError:
@@ -91,6 +94,8 @@ def choose(
                 best, most = solution, evidence
                 if choice.suffices(solution):
                     break
+            elif choice.onward:
+                models.extend(choice.models(solution))
         if best is not None:
             present = choice.report(present, best)
     return present

@@ -3,6 +3,7 @@
 Their texts have fields in braces. Each field shows one part of the remark:
 
     {point}                 names, listed          {distance}            number with its unit
+    {parameters:@all}       all names, listed
     {points:point}          "3 points"             {count:point}         the same for a number
     {points:is|are}         agrees with the count  {count:is|are}        the same for a number
     {change:+}              with its sign          {share:%}             in per cent
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.conventions import METRES, finer_unit
-from sfm.display import agreeing, listed, plural
+from sfm.display import MAX_LISTED, agreeing, listed, plural
 from sfm.remarks.remark import SEVERITIES, Quantity, Remark, Severity
 
 # A value that is further off than this number of standard deviations is wrong, and a result with such a
@@ -239,7 +240,8 @@ def _written(parts: Mapping[str, tuple[str, ...] | Quantity], name: str, spec: s
     if spec == "@?" and not isinstance(part, Quantity):
         return listed(_nouns(part, ""), separator=", or if ")
     if not isinstance(part, Quantity):
-        return listed(_nouns(part, spec[1:]) if spec else part)
+        names = part if spec in ("", "@all") else _nouns(part, spec[1:])
+        return listed(names, most=len(names) if spec == "@all" else MAX_LISTED)
     return _number(part, spec, _digits(part, parts.values()))
 
 

@@ -78,3 +78,14 @@ def test_a_model_without_solution_is_passed_over_unless_a_test_has_decided_on_it
     assert choose(0.0, [open_row], solve) == 1.0
     with pytest.raises(GeometryError, match="no solution"):
         choose(0.0, [Choice(lambda _: [-1.0])], solve)
+
+
+@pytest.mark.parametrize(("onward", "taken"), [(True, 3.0), (False, 0.0)])
+def test_a_solution_that_is_not_taken_may_suggest_the_next_model(onward: bool, taken: float) -> None:
+    """From 0 over 1 and 2, which do not fit, to 3, which does."""
+    row: Choice[float, float] = Choice(
+        lambda present: [present + 1] if present < 5 else [],
+        lambda _, after: math.inf if after == 3 else -math.inf,
+        onward=onward,
+    )
+    assert choose(0.0, [row], solve) == taken

@@ -25,6 +25,10 @@ from sfm.network import rows_of
 from sfm.similarity import mean_distance
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
+CAMERA_ROLES = (
+    *(Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL, Role.RADIAL),
+    *(Role.DECENTRING, Role.DECENTRING, Role.AFFINITY, Role.SHEAR),
+)
 STRAIN, BENDING = 5, 18  # columns
 CAMERA_PLACES = tuple(range(len(CAMERA)))  # indices in the freedoms of a photograph
 STRAIN_PLACES = tuple(range(len(CAMERA), len(CAMERA) + STRAIN))

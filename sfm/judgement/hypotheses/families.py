@@ -18,6 +18,7 @@ from sfm.judgement.hypotheses.columns import (
     BENDING_PLACES,
     CAMERA,
     CAMERA_PLACES,
+    CAMERA_ROLES,
     STRAIN_PLACES,
     Columns,
     interior_columns,
@@ -206,9 +207,13 @@ class CameraFamily(OfPhotographs):
 
     def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the photographs and the differences of c and of the principal point."""
-        half = max(a.estimate.cameras[a.network.camera[one.photographs[0]]].size_px) / 2
+        camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
+        half = max(camera.size_px) / 2
         if one.pattern == "each":
-            return self._of_each(beta.reshape(-1, len(self.places)), half)
+            varying = camera.plays(*(CAMERA_ROLES[place] for place in self.places))
+            varying = varying & camera.free if (varying & camera.free).any() else varying
+            of_each = self._of_each(beta.reshape(-1, len(self.places)), half)
+            return {**of_each, "parameters": tuple(np.array(camera.names)[varying])}
         linear = one.pattern == "linear"
         sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
         # a column of 1 moves an image point at the edge by 1 px
@@ -217,7 +222,6 @@ class CameraFamily(OfPhotographs):
         if abs(largest * float(beta[0])) > SEEN_PX:
             parts["change"] = (100 * sign * largest * float(beta[0]) / half, "%")
         if one.among is not None and not one.among.all():
-            camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
             parts["camera"] = camera.shared_name
         if len(beta) > 2 and not linear and np.hypot(beta[1], beta[2]) > SEEN_PX:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")

@@ -130,11 +130,11 @@ ROWS: tuple[Kind, ...] = (
     Kind(
         "camera_varies",
         SHIFT,
-        "The camera changes between photographs[[, c by up to {change}]][[, principal point by up to "
-        "{away}]][[, distortion at the edge by up to {distortion}]]. Standard deviations are too small, by a "
-        f"factor of {{factor}} or more. {SHIFTED}{INSTEAD}",
+        "The camera changes between photographs ({parameters:@all})[[, c by up to {change}]][[, principal "
+        "point by up to {away}]][[, distortion at the edge by up to {distortion}]]. Standard deviations are "
+        f"too small, by a factor of {{factor}} or more. {SHIFTED}{INSTEAD}",
         "autofocus, a stabiliser or a loose lens",
-        "Set per_photograph for these parameters; switch off autofocus and stabiliser.",
+        "Set per_photograph for {parameters:@all}; switch off autofocus and stabiliser.",
         short="a camera that changes from photograph to photograph",
         explains=OF_GIVEN,
     ),
@@ -223,7 +223,7 @@ ROWS: tuple[Kind, ...] = (
         "points_moved",
         SHIFT,  # not the RMS of all points, which a few points hardly change
         "{points:point} moved from {from} on, by up to {distance}, {shift} standard deviations: {points}."
-        f"[[ {{left_out:point}} {{left_out:is|are}} not in the result.]]{INSTEAD}",
+        f"[[ The result contains their positions {{state}} the move.]]{INSTEAD}",
         "targets or parts of the object moved during the survey",
         "Adjust the two states as two surveys, or remove {points:this point|these points}.",
         short="points that moved",

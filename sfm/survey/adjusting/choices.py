@@ -2,8 +2,8 @@
 
 Copies of photographs are left out, as they are no second observation. Photographs of a rig that lose their
 points, while others of their moment fit, are adjusted free of the rig. If texture shows that photographs were
-zoomed, c is adjusted per photograph. Points that moved so far that their coordinates are wrong have no single
-position: they are left out, and the rest is judged without them.
+zoomed, c is adjusted per photograph. Points that moved so far that their coordinates are wrong keep the image
+points of one state, that of the middle of the sequence, and the rest is judged with these.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sfm.conventions import IntArray
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.verdict import judge_adjustment
 from sfm.network import Mounts
-from sfm.remarks.remark import Quantity, Remark, of_kind, remark
+from sfm.remarks.remark import Quantity, of_kind, remark
 from sfm.runtime.progress import report_step
 from sfm.survey.adjusting.solution import (
     SolvedSurvey,
@@ -145,54 +145,43 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
     )
 
 
-# Largest share of points that is left out. Which of two bodies is the object, a person decides.
+# Largest share of the image points that is left out. Which of two states is the object, a person decides.
 MAX_MOVED = 0.1
 
 
-def _models_without_moved_points(found: SolvedSurvey) -> Iterator[SurveyModel]:
-    """Yield the model without the points that moved, if these are few and outliers are rejected.
+def _models_with_one_state(found: SolvedSurvey) -> Iterator[SurveyModel]:
+    """Yield the model without the image points of another state of points that moved, if these are few.
 
-    Control and ends of bars are not left out: a person must decide about them.
+    Of the photographs before a move and those after it, those with the middle of the sequence stay. So the
+    coordinates of all points describe one state. Control and ends of bars are left to a person.
     """
-    model, moved = found.model, _moved_points(found)
-    reasons = tuple((name, named) for named in moved for name in named.names("points"))
-    points, estimate = found.adjustment.network.points, model.matched.estimate
-    network, bars = model.matched.network, model.matched.network.scale_bars
-    given = {network.points[j] for j in (*network.control.point, *bars.start, *bars.end)}
-    few = len(reasons) < MAX_MOVED * len(points) and given.isdisjoint(name for name, _ in reasons)
-    if reasons and few and model.survey.reject != "none":
-        report_step("adjusting without the points that moved")
-        gone = np.isin(model.matched.network.points, [name for name, _ in reasons])
-        estimate = replace(estimate, points=np.where(gone[:, None], np.nan, estimate.points))
-        failures = (*model.matched.point_failures, *reasons)
-        yield replace(model, matched=replace(model.matched, estimate=estimate, point_failures=failures))
+    model, network = found.model, found.model.matched.network
+    moved = tuple(one for one in of_kind(found.remarks, "points_moved") if one not in model.moved)
+    if model.survey.reject == "none" or not any(one.severity == "error" for one in moved):
+        return
+    seen, bars, middle = network.image_points, network.scale_bars, (len(network.images) - 1) // 2
+    gone, states = np.zeros(len(seen), dtype=bool), []
+    for one in moved:
+        start = network.image_index(one.names("from")[0])
+        another = seen.image >= start if middle < start else seen.image < start
+        gone |= another & np.isin(network.points, one.names("points"))[seen.point]
+        state = ("before" if middle < start else "after",)
+        numbers = {**one.numbers, "wrong": Quantity(0.0)}  # they shift the others no longer
+        states.append(replace(one, subjects={**one.subjects, "state": state}, numbers=numbers))
+    given = np.isin(seen.point, np.concatenate([network.control.point, bars.start, bars.end]))
+    unused = model.unused + int(gone.sum())
+    if gone.any() and not (gone & given).any() and unused < MAX_MOVED * (len(seen) + model.unused):
+        report_step("adjusting one state of the points that moved")
+        matched = replace(model.matched, network=replace(network, image_points=seen.select(~gone)))
+        yield replace(model, matched=matched, moved=(*model.moved, *states), unused=unused)
 
 
-def _moved_points(found: SolvedSurvey) -> list[Remark]:
-    """Return the remarks on points that moved, if some moved so far that the result is wrong."""
-    moved = list(of_kind(found.remarks, "points_moved"))
-    return moved if any(named.severity == "error" for named in moved) else []
-
-
-def _gain_without_moved_points(_: SolvedSurvey, after: SolvedSurvey) -> float:
+def _gain_of_one_state(_: SolvedSurvey, after: SolvedSurvey) -> float:
     """Return whether the rest fits; a test has decided before that the points moved."""
     verdict = judge_adjustment(after.adjustment).verdict
     fits = verdict is not None and verdict.level != "bad"
     fits &= not any(named.severity == "error" for named in after.remarks)
     return float("inf") if fits else -float("inf")
-
-
-def _report_moved_points(before: SolvedSurvey, after: SolvedSurvey) -> SolvedSurvey:
-    """Return the solution with the remarks on the points that moved, which bend it no longer."""
-    moved = (
-        replace(
-            named,
-            subjects={**named.subjects, "left_out": named.names("points")},
-            numbers={**named.numbers, "wrong": Quantity(0.0)},
-        )
-        for named in _moved_points(before)
-    )
-    return replace(after, remarks=(*after.remarks, *moved))
 
 
 def _gain_of_free_photographs(before: SolvedSurvey, after: SolvedSurvey) -> float:
@@ -275,6 +264,6 @@ CHOICES = (
     Choice(_models_without_copies),
     FREE_OF_RIGS,
     FREE_OF_RIGS,  # others, which those found first concealed
-    Choice(_models_without_moved_points, _gain_without_moved_points, report=_report_moved_points),
+    Choice(_models_with_one_state, _gain_of_one_state, onward=True),
     Choice(_models_with_varying_c, _gain_of_varying_c, _freed_by_varying_c, _report_varying_c),
 )

@@ -94,6 +94,8 @@ class SurveyModel:
     # moments that the survey states, (m,); photographs with others in the network are free of their rig; None
     # if none is free
     stated_moment: IntArray | None = None
+    moved: tuple[Remark, ...] = ()  # on points of which the image points of one state are left out
+    unused: int = 0  # image points of the other states, which the matched ones lack
 
 
 @dataclass(frozen=True)
@@ -161,13 +163,15 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
             *remarks_on_uncalibrated(survey, final.estimate),
             *handedness_unchecked(whole, checked=given.checks_handedness),
             *windows_elsewhere(whole, judged.causes),
+            *model.moved,
             *judged.unchecked,
             *bump_remarks(final, unit, stated),
             *windows_elsewhere(whole, explain_rejections(final, unit=unit)),
             *remarks_on_held_c(found.c_held, judged.causes),
         ),
         left_out,
-        unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
+        model.unused
+        + unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
         given.tests,
         found.others,
     )

@@ -234,12 +234,7 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> t
     automatic = [point for point in left_out if point.point in texture]
     listed = [point for point in left_out if point.point not in texture]
     groups = {
-        "points_contradicted": [
-            point.point
-            for point in listed
-            if point.reason.severity != "note"
-            and point.reason.kind != "points_moved"  # that remark names them
-        ],
+        "points_contradicted": [point.point for point in listed if point.reason.severity != "note"],
         "points_not_determined": [point.point for point in listed if point.reason.severity == "note"],
     }
     measured = len(whole.points)
