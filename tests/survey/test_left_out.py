@@ -88,7 +88,7 @@ def test_what_is_left_out_is_counted_and_named_everywhere(tmp_path: Path) -> Non
     assert left and set(left) <= set(wrong)
     assert set(result.network.points) | set(left) == set(network.points)
     assert len(result.adjustment.rejected) + result.unused_image_points == len(network.image_points)
-    assert all(one.reason.kind == "point_contradicted" for one in left.values())
+    assert all(one.reason.kind == "points_contradicted" for one in left.values())
     findings = findings_of(result)
     (lost,) = of_kind(result.remarks, "points_contradicted")
     assert set(lost.names("points")) == set(left) and lost.number("measured") == 80
@@ -121,7 +121,7 @@ def test_rays_parallel_within_their_precision_are_named() -> None:
     assert result.adjustment.converged and len(result.network.points) == 60
     assert {one.point for one in result.left_out} == {"w1", "w2", "w3"}
     for one in result.left_out:
-        assert one.reason.kind in ("point_not_determined", "point_contradicted")
+        assert one.reason.kind in ("points_not_determined", "points_contradicted")
 
 
 def test_carriers_of_a_datum_are_those_whose_rays_meet_clearly() -> None:
@@ -181,8 +181,8 @@ def test_far_points_are_left_out_by_name(count: int, distance: float) -> None:
         measured = {network.points[j] for j in np.flatnonzero(network.rays())}
         assert {one.point for one in result.left_out} == measured - set(network.points[:30])
         assert {one.reason.kind for one in result.left_out} <= {
-            "point_not_determined",
-            "point_contradicted",
+            "points_not_determined",
+            "points_contradicted",
         }
 
 

@@ -147,7 +147,7 @@ def test_points_that_leave_with_a_photograph_are_reported_so() -> None:
     network = replace(network, image_points=seen.select(keep))
     found = solve_survey(survey_of(network, truth), textured(network, truth))
     reasons = {(one.reason.kind, one.reason.number("least")) for one in found.left_out}
-    assert reasons == {("point_not_determined", 3)}
+    assert reasons == {("points_not_determined", 3)}
 
 
 IMAGES, ZOOMED = 9, (3, 4, 7)

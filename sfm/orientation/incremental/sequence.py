@@ -486,12 +486,12 @@ def _reasons(growth: Growth, rays: IntArray, parallel: BoolArray) -> tuple[tuple
     out = []
     for j in np.flatnonzero(~growth.estimate.determined & (measured > 0)):
         if measured[j] < 2:
-            reason = remark("point_not_determined", rays=1, needed=2)
+            reason = remark("points_not_determined", rays=1, needed=2)
         elif rays[j] < 2:
-            reason = remark("point_not_determined", measured=int(measured[j]), least=2)
+            reason = remark("points_not_determined", measured=int(measured[j]), least=2)
         elif parallel[j]:
-            reason = remark("point_not_determined", parallel=int(rays[j]))
+            reason = remark("points_not_determined", parallel=int(rays[j]))
         else:
-            reason = remark("point_contradicted", rays=int(rays[j]))
+            reason = remark("points_contradicted", rays=int(rays[j]))
         out.append((growth.network.points[j], reason))
     return tuple(out)

@@ -8,35 +8,21 @@ POINTS = (
     Kind(
         "points_not_determined",
         "note",
-        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
-        "determine {points:it|them}: {points}.",
-        "a point is in fewer photographs than it needs, or its rays are almost parallel",
-        "Add photographs of {points:this point|these points}, if you need {points:it|them}.",
+        "[[{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "determine {points:it|them}: {points}]][[It has {rays:ray}; {needed} are needed]][[Fewer than "
+        "{least} of its {measured} rays are from photographs in the result]][[Its {parallel} rays are "
+        "parallel within their precision]].",
+        "a point is in fewer photographs than it needs, is far away, or they were taken from one place",
+        "Add photographs from other positions, if you need the point.",
     ),
     Kind(
         "points_contradicted",
         "warning",
-        "{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
-        "meet: {points}.",
-        "a point moved, or was misidentified in a photograph",
-        "Look at the reasons in left_out.csv; correct {points:its|their} image points, or do without "
-        "{points:it|them}.",
-    ),
-    Kind(
-        "point_not_determined",
-        "note",
-        "[[It has {rays:ray}; {needed} are needed]][[Fewer than {least} of its {measured} rays are from "
-        "photographs in the result]][[Its {parallel} rays are parallel within their precision]].",
-        "the point is far away, in fewer photographs than it needs, or they were taken from one place",
-        "Add photographs of the point from other positions, if you need it.",
-    ),
-    Kind(
-        "point_contradicted",
-        "warning",
-        "[[Its {rays} rays do not meet in front of their photographs]][[{accepted} of its {measured} rays "
-        "{accepted:was|were} accepted; {needed} are needed]].",
-        "the point moved, was misidentified in a photograph, or its rays are almost parallel",
-        "Correct its image points, or do without it.",
+        "[[{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
+        "meet: {points}]][[Its {rays} rays do not meet in front of their photographs]][[{accepted} of its "
+        "{measured} rays {accepted:was|were} accepted; {needed} are needed]].",
+        "a point moved, was misidentified in a photograph, or its rays are almost parallel",
+        "Correct the image points for the reason that left_out.csv states, or do without the point.",
     ),
     Kind(
         "points_doubtful",

@@ -200,14 +200,14 @@ def left_out_points(
         if name in kept or not rays[j]:
             continue
         if rays[j] < needed[j]:
-            reason = remark("point_not_determined", rays=int(rays[j]), needed=int(needed[j]))
+            reason = remark("points_not_determined", rays=int(rays[j]), needed=int(needed[j]))
         elif name in known:
             reason = known[name]
         elif accepted_rays[j] >= needed[j]:
-            reason = remark("point_not_determined", measured=int(rays[j]), least=int(needed[j]))
+            reason = remark("points_not_determined", measured=int(rays[j]), least=int(needed[j]))
         else:
             reason = remark(
-                "point_contradicted",
+                "points_contradicted",
                 accepted=int(accepted_rays[j]),
                 measured=int(rays[j]),
                 needed=int(needed[j]),
