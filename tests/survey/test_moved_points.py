@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.quality.consistency import consistency_of
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.network import Estimate, Network
+from sfm.network import Estimate, ImagePoints, Network
 from sfm.remarks.remark import of_kind
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity
@@ -43,6 +44,16 @@ def turned(X: FloatArray, part: BoolArray, by: float, rng: np.random.Generator) 
     return moved
 
 
+def observed_exactly(network: Network, truth: Estimate) -> ImagePoints:
+    """Return the image points of a network without noise."""
+    seen = network.image_points
+    xy = seen.xy.copy()
+    for i in range(len(network.images)):
+        rows, camera = seen.image == i, truth.cameras[network.camera[i]]
+        xy[rows] = project(camera, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+    return replace(seen, xy=xy)
+
+
 def run(network: Network, truth: Estimate, **settings: object) -> SurveyResult:
     return sfm.run_survey(survey_of(network, truth, **settings))
 
@@ -66,6 +77,26 @@ def test_half_of_the_points_turned_between_halves_of_the_photographs(
         assert one.names("next") == (network.images[images // 2],) and 1.2 < one.number("times") < 4
     (tested,) = of_kind(result.verdict.tests, "parts_tested")
     assert tested.number("parts") == min(images - 3, 15) and tested.number("different") == (by > 0)
+
+
+@pytest.mark.parametrize(("start", "warned"), [(10, True), (5, True), (3, False)])
+def test_photographs_that_differ_count_by_the_shift_of_the_result(start: int, warned: bool) -> None:
+    """Of a change after 3 of 20 photographs little remains in the result, whose points are those after it."""
+    rng = seed_of("half turned 20")
+    network, truth = make_network(rng, images=20, points=60, noise_px=NOISE_PX)
+    X = turned(truth.points, rng.random(60) < 0.5, 0.7e-3, rng)
+    exact = replace(network, image_points=observed_exactly(network, truth))
+    a, b = (sfm.adjust(moved_from(one, truth, start, X), truth, reject="none") for one in (network, exact))
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    places = b.estimate.points
+    shift = min(
+        float(np.abs((fit_similarity(places, state).apply(places) - state) / sigma).max())
+        for state in (truth.points, X)
+    )
+    change = consistency_of(a).change
+    assert change is not None and change.shift == pytest.approx(shift, rel=0.25)
+    assert a.verdict is not None
+    assert bool(of_kind(a.verdict.remarks, "photographs_differ")) == warned
 
 
 @pytest.mark.parametrize(

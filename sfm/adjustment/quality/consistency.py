@@ -56,7 +56,9 @@ class Change:
     next: str  # first photograph of the second part
     points: int  # that both parts determine
     times: float  # RMS difference over its standard deviation
-    shift: float  # largest half of a difference of coordinates over their standard deviation in the result
+    # largest difference of a coordinate of the result, the weighted mean of both parts, from those of the
+    # nearer part, over its standard deviation
+    shift: float
 
 
 @dataclass(frozen=True)
@@ -145,15 +147,18 @@ def _change(adjustment: Adjustment, parts: PointNormals, level: float) -> tuple[
         )
         known = np.minimum(rays1, rays2) >= MIN_PART
         d, freedom = (second - first)[known], 3 * int(known.sum())
-        square = float(np.einsum("ni,nij,nj->", d, np.linalg.pinv((Q1 + Q2)[known], hermitian=True), d))
+        weighted = np.einsum("nij,nj->ni", np.linalg.pinv((Q1 + Q2)[known], hermitian=True), d)
+        square = float((d * weighted).sum())
         if not 0 < freedom < redundancy:
             continue
         F = square / freedom / max((total - square) / (redundancy - freedom), np.finfo(float).tiny)
         probability = float(f_sf(F, freedom, redundancy - freedom))
         if probability < least:
-            shift = np.abs(d) / 2 / np.where(sigma[known] > 0, sigma[known], np.inf)
+            from_first = np.einsum("nij,nj->ni", Q1[known], weighted)  # to the weighted mean of both parts
+            scale = np.where(sigma[known] > 0, sigma[known], np.inf)
+            nearest = min(float((np.abs(away) / scale).max()) for away in (from_first, d - from_first))
             names = a.network.images[end], a.network.images[end + 1]
-            best = Change(*names, int(known.sum()), float(np.sqrt(F)), float(shift.max()))
+            best = Change(*names, int(known.sum()), float(np.sqrt(F)), nearest)
             least = probability
     return len(ends), best
 
