@@ -109,6 +109,13 @@ def test_one_wrong_point_is_identified(by: float) -> None:
     np.testing.assert_allclose(placed, np.eye(3), atol=5e-3)
 
 
+def test_a_very_wrong_point_hides_nothing_of_the_others() -> None:
+    """Ten times the error costs 2 ln 10 for each coordinate, and the others misfit as before."""
+    near, far = (judge(moved(points(8, "huge"), 4, np.array([0.0, 0.0, by])), LEVEL) for by in (1e3, 1e4))
+    assert near is not None and far is not None
+    assert far.misfit - near.misfit == pytest.approx(3 * 2 * np.log(10), abs=1e-3)
+
+
 def test_many_wrong_points_of_many_are_identified() -> None:
     one, rng = points(60, "many wrong"), seed_of("which are wrong")
     wrong = sorted(rng.permutation(60)[:20].tolist())

@@ -27,7 +27,9 @@ from sfm.judgement.hypotheses.columns import (
 from sfm.judgement.hypotheses.families import GIVEN, HELD
 from sfm.judgement.hypotheses.hypotheses import (
     JudgedAssumptions,
+    cause_in_calibration,
     contradicted_parameters,
+    free_network,
     judge_alternatives,
 )
 from sfm.judgement.hypotheses.rejections import explain_rejections
@@ -518,6 +520,17 @@ def test_a_plate_that_is_not_as_given_is_named_and_its_remedy_works(bend: float,
         sigma = first[0].number("sigma")
         assert judge_alternatives(plate_as_printed(seed, bend, scatter, stated=sigma)).causes == ()
     assert judge_alternatives(plate_as_printed(7, 0.0, 0.0)).causes == ()
+
+
+def test_another_shape_of_given_points_costs_all_their_coordinates() -> None:
+    """Of 60 points in 12 photographs, but for a similarity: 173 parameters, each of 12 image points."""
+    held = plate_as_printed(3, 0.0, 0.0005)
+    free = free_network(held)
+    assert free is not None
+    cause = cause_in_calibration(held, free)
+    assert cause is not None and cause.alternative.kind == "shape_of_control"
+    gain = held.redundancy / 2 * np.log(held.vPv / free.vPv)
+    assert cause.evidence == pytest.approx(gain - 173 / 2 * np.log(2 * 12), abs=1.0)
 
 
 def test_what_given_points_say_of_freedoms_is_what_an_adjustment_with_them_finds() -> None:

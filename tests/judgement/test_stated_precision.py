@@ -80,3 +80,20 @@ def test_few_image_points_that_scatter_more_may_do_so_by_chance(points: int, nam
     network, truth = stated("by chance", 3.5, points=points)
     a = sfm.adjust(network, truth, datum=Datum("free"), reject="none")
     assert bool(of_kind(a.verdict.remarks, "image_sigmas")) == named
+
+
+@pytest.mark.parametrize(("ratio", "points"), [(1.003, 16), (1.0095, 8)])
+def test_standard_deviations_within_one_per_cent_are_one_class(ratio: float, points: int) -> None:
+    """Two times eight points that scatter three times as much as stated, at almost the same value."""
+    rng = seed_of("classes")
+    network, truth = make_network(rng, images=8, points=32, free=("c",))
+    xy, exact = (observed_anew(network, truth, noise, rng).image_points.xy for noise in (0.1, 0.0))
+    seen = network.image_points
+    worse = np.where(seen.point < 16, 3.0, 1.0)[:, None]
+    least = np.exp(-2.3)  # px, the middle of a class
+    sigma = np.select([seen.point < 8, seen.point < 16], [least, ratio * least], 0.12)
+    covariance = sigma[:, None, None] ** 2 * np.eye(2)
+    points_seen = replace(seen, xy=exact + worse * (xy - exact), covariance=covariance)
+    a = sfm.adjust(replace(network, image_points=points_seen), truth, datum=Datum("free"), reject="none")
+    (said,) = of_kind(a.verdict.remarks, "image_sigmas")
+    assert len(said.names("points")) == points

@@ -20,7 +20,7 @@ from sfm.judgement.hypotheses.columns import columns_of, interior_columns
 from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.remarks.remark import kinds_of, of_kind
-from sfm.similarity import fit_similarity
+from sfm.similarity import fit_similarity, without_motions
 from tests.synthetic import make_network, observed_anew, seed_of
 
 
@@ -95,6 +95,24 @@ def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
         away = np.abs(one.family.displaced(one, a.estimate.points, beta)) / sigma
         farthest = max(farthest, float(away.max()))
     assert 0.8 * reach < farthest < 1.01 * reach
+
+
+def test_what_a_photograph_alone_may_hide_is_priced_by_its_image_points() -> None:
+    """Another c in the last of ten photographs moves a tenth of the image points."""
+    a = adjusted()
+    columns = columns_of(a)
+    reduced = reduce_adjustment(a, columns)
+    factor = (np.arange(10) == 9).astype(float)
+    one = families.Alternative(families.CAMERA_FAMILIES[0], "single", factor)
+    D = reduced.whiten(one.columns(a, columns))
+    H = float(reduced.project(D)[0][0, 0])
+    count = int((a.network.image_points.image == 9).sum())
+    needed = needed_gain(1, count, 0.0, 1, 0.01)
+    least = next(x for x in np.linspace(needed, 3 * needed, 30000) if stats.ncx2.sf(needed, 1, x) > 0.8)
+    X, sigma = a.estimate.points, np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    moved = without_motions(X, reduced.absorb(D)[0] * np.sqrt(least / H))
+    expected = float((np.abs(moved[:, :, 0]) / sigma).max())
+    assert reach_of(one, a, reduced, columns, rows=1) == pytest.approx(expected, rel=2e-3)
 
 
 def test_weak_networks_say_what_they_cannot_test_and_strong_ones_nothing() -> None:

@@ -233,7 +233,7 @@ def scale_of_points(placed: PlacedPoints) -> Scales | None:
             return None
         turn = Rotation.align_vectors(apart[None], apart_free[None])[0].as_matrix()
         scale = float(np.linalg.norm(apart) / np.linalg.norm(apart_free))
-        placing = Similarity(scale, turn, points.given[0] - scale * turn @ points.free[0])
+        placing = Similarity(scale, turn, np.zeros(3))  # a shift does not change the scale
     elif len(complete) < 3 or placed.model.kept(out).dof < 0:
         return None
     estimated = placed.model.estimated

@@ -194,8 +194,7 @@ def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray
         (t, R), (t_usual, R_usual) = relative(x, 0), relative(x, 2)
         return np.concatenate([t - t_usual, Rotation.from_matrix(R @ R_usual.T).as_rotvec()])
 
-    size = float(np.linalg.norm(start[:3] - start[6:9]))
-    steps = STEP * np.tile(np.r_[np.full(3, size), np.ones(3)], 4)
+    steps = np.tile(np.r_[np.ones(3), np.full(3, STEP)], 4)  # it is linear in the positions
     rows = [
         (difference(start + step) - difference(start - step)) / (2 * step.sum()) for step in np.diag(steps)
     ]
