@@ -15,7 +15,7 @@ from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import Role
 from sfm.judgement.hypotheses import columns
-from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields
+from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields, rigid_motions
 from tests.synthetic import make_network, seed_of
 
 
@@ -54,6 +54,14 @@ def test_fields_of_the_object_by_hand() -> None:
     products = np.array([x * x, y * y, z * z, x * y, x * z, y * z])
     np.testing.assert_allclose(bending[0] / size, np.einsum("t,cd->ctd", products, np.eye(3)).reshape(3, 18))
     assert not object_fields(points)[0][4].any()
+
+
+def test_motions_of_a_body_move_its_points_by_one() -> None:
+    """The rotation about z moves each point across its arm; the fourth point is not on the body."""
+    points = np.array([[5.0, 1, 2], [1, 1, 2], [3, 3, 2], [9, 9, 9], [3, -1, 2]])
+    motions = rigid_motions(points, np.array([0, 1, 2, 4]))
+    np.testing.assert_allclose(motions[:, :, :3], np.tile(np.eye(3), (5, 1, 1)))
+    np.testing.assert_allclose(motions[:, :, 5], [[0, 1, 0], [0, -1, 0], [-1, 0, 0], [-4, 3, 0], [1, 0, 0]])
 
 
 def test_columns_are_differences(a: Adjustment) -> None:

@@ -125,15 +125,14 @@ def _testable(a: Adjustment) -> IntArray:
 
 def _of_mounted(a: Adjustment, tested: IntArray, critical: float) -> Iterator[Bump]:
     """Yield the bumps of photographs that share the pose of their rig, until the largest is chance."""
-    moment = a.network.moment
-    if not len(tested) or moment is None:
+    if not len(tested):
         return
     s, G = _scores(a, tested)
     taken: list[int] = []
     while len(taken) < len(tested):
         best, chi2, step = -1, 0.0, np.zeros(6)
         for k in range(len(tested)):
-            if k in taken or _same_moment(moment, tested, k, taken):
+            if k in taken:
                 continue
             value, d = _gain(s, G, k, taken)
             if value > chi2:
@@ -199,12 +198,6 @@ def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray
         (difference(start + step) - difference(start - step)) / (2 * step.sum()) for step in np.diag(steps)
     ]
     return difference(start), np.array(rows).T
-
-
-def _same_moment(moment: IntArray, tested: IntArray, k: int, taken: list[int]) -> bool:
-    """Return whether all other photographs of the same moment already have a separate pose."""
-    taken_with = sum(int(moment[tested[t]] == moment[tested[k]]) for t in taken)
-    return taken_with + 2 > int((moment == moment[tested[k]]).sum())
 
 
 def _scores(a: Adjustment, tested: IntArray) -> tuple[FloatArray, FloatArray]:
