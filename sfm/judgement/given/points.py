@@ -256,7 +256,7 @@ def judge_points(
     either = next((one for one in like if one.mirrored), None)
     if either is not None:
         # names of left and right may be exchanged as a whole, which is not a choice among all orders
-        like = [one for one in others if one.order and one.misfit < either.misfit + MARGIN]
+        like = [one for one in others if one.misfit < either.misfit + MARGIN]
         return replace(either, exchangeable=_points_of(like))
     if len(like) > 1:
         return _contradiction(found, like)
