@@ -46,6 +46,7 @@ def test_a_bump_of_six_sigma_is_named(cameras: int, moved: int) -> None:
     assert found.shift == pytest.approx(shift, rel=0.7)
     (said,) = bump_remarks(b, "m")
     assert said.kind == "rig_contradicted" and said.names("photographs") == (network.images[moved],)
+    assert said.severity == "warning" and said.number("share") == pytest.approx(1 / 8)  # of its camera
 
 
 def test_two_bumps_are_both_named() -> None:
