@@ -50,7 +50,7 @@ from sfm.matching.tracks.feature_tracks import (
     joined_features,
     link_features,
 )
-from sfm.matching.tracks.features import Features, matched_features, sift_features
+from sfm.matching.tracks.features import Features, PairMatches, matched_features, sift_features
 from sfm.matching.tracks.interest import foerstner_points, natural_points, textured_squares
 from sfm.network import Estimate, ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
@@ -335,7 +335,7 @@ def test_pairs_whose_matches_are_known_are_not_matched_again(monkeypatch: pytest
     natural = [natural_points(one, max_features=600) for one in photographs]
     matched: list[tuple[int, int]] = []
 
-    def match(a: Features, b: Features, *, seed: int) -> tuple[IntArray, FloatArray]:
+    def match(a: Features, b: Features, *, seed: int) -> PairMatches:
         matched.append((len(a), len(b)))
         return matched_features(a, b, seed=seed)
 

@@ -155,6 +155,7 @@ LIMITS: dict[
     "photographs_differ": ("shift", 3.0, None),
     "windows_disagree": ("share", 0.3, 0.6),
     "second_motion": ("share", 0.01, 0.05),
+    "still_features": ("share", 0.05, None),
     "key_points_not_measured": ("missing", 0.5, None),
     "targets_blurred": ("blur", 2.5, None),
 }

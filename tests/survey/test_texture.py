@@ -19,7 +19,18 @@ from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.inputs.sources import MARKS, TEXTURE
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.survey.sources.source import Correspondences
-from tests.survey.texture_scenes import KINDS, NUMBERS, SHARE, WRONG, outcome_of, study, water, write_scene
+from tests.survey.texture_scenes import (
+    KINDS,
+    NUMBERS,
+    SHARE,
+    WRONG,
+    outcome_of,
+    study,
+    turntable,
+    water,
+    write_masks,
+    write_scene,
+)
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 
@@ -220,6 +231,22 @@ def test_moving_water_is_left_out_of_a_shore(tmp_path: Path) -> None:
     assert found.oriented == len(scene.position) and found.level in ("good", "fair")
     assert found.over_sigma < WRONG and found.share < SHARE
     assert replace(found, over_sigma=2 * WRONG, share=2 * SHARE).is_wrong_and_believed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("masked", [True, False])
+def test_an_object_on_a_turntable_is_oriented_without_its_background(tmp_path: Path, masked: bool) -> None:
+    rng = seed_of("turntable 0")
+    scene = turntable(rng)
+    write_scene(tmp_path, scene, rng)
+    if masked:
+        write_masks(tmp_path / "masks", scene)
+        text = (tmp_path / "survey.toml").read_text(encoding="utf-8")
+        masks = text.replace("[survey]\n", '[survey]\nmasks = "masks"\n')
+        (tmp_path / "survey.toml").write_text(masks, encoding="utf-8")
+    found = outcome_of(tmp_path, scene)
+    assert found.oriented == 24 and found.over_sigma < WRONG
+    assert ("still_features" in found.kinds) != masked
 
 
 @pytest.mark.slow

@@ -240,6 +240,56 @@ def low_overlap(rng: np.random.Generator) -> Scene:
     return Scene(planes, position, np.array([upright(one) for one in directions]))
 
 
+def turntable(rng: np.random.Generator, count: int = 24, step: float = 2 * np.pi / 24) -> Scene:
+    """An object that turns before a camera and a textured room that stand still, in the frame of the object.
+
+    It covers a third of the photographs.
+    """
+    around_object = [
+        (np.array([np.sin(turn), 0.0, np.cos(turn)]), np.array([np.cos(turn), 0.0, -np.sin(turn)]))
+        for turn in 0.3 + np.pi / 2 * np.arange(4)
+    ]
+    up, half, top = np.array([0.0, 2.2, 0.0]), 1.15, np.array([0.0, 2.2, 0.0])
+    sides = [wall(rng, half * out + up / 2, 2 * half * right, up) for out, right in around_object]
+    (out, right), *_ = around_object
+    lid = wall(rng, top, 2 * half * right, -2 * half * out)
+    room = [
+        wall(rng, np.array([0.0, 2.0, -4.0]), np.array([16.0, 0.0, 0.0]), np.array([0.0, 10.0, 0.0])),
+        wall(rng, np.array([0.0, -0.1, 0.0]), np.array([16.0, 0.0, 0.0]), np.array([0.0, 0.0, -9.0])),
+    ]
+    station, aim = np.array([0.0, 3.2, 5.6]), np.array([0.0, 1.0, 0.0])
+    view = upright(aim - station)
+    scene = Scene([*sides, lid], np.zeros((count, 3)), np.zeros((count, 3, 3)))
+    for i in range(count):
+        cos, sin = np.cos(step * i), np.sin(step * i)
+        turned = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+        scene.position[i], scene.rotation[i] = turned @ station, turned @ view
+        facing = [
+            side
+            for side, (out, _) in zip(sides, around_object, strict=True)
+            if (scene.position[i] - half * out) @ out > 0
+        ]
+        behind = [
+            Plane(turned @ one.corner, turned @ one.right, turned @ one.up, one.texture) for one in room
+        ]
+        scene.in_photograph[i] = [*behind, *facing, lid]
+    return scene
+
+
+def write_masks(folder: Path, scene: Scene) -> None:
+    """Write the masks of photographs, white where they show planes of the scene and not others before it."""
+    folder.mkdir()
+    for i in range(len(scene.position)):
+        shown = [
+            Plane(one.corner, one.right, one.up, np.full_like(one.texture, 255.0))
+            for one in scene.in_photograph[i]
+            if any(one is plane for plane in scene.planes)
+        ]
+        alone = Scene(shown, scene.position, scene.rotation)
+        mask = np.where(_photograph(alone, i) > 128, 255, 0).astype(np.uint8)
+        cv2.imwrite(str(folder / f"photo_{i:02d}.png.png"), mask)
+
+
 KINDS: dict[str, Callable[[np.random.Generator], Scene]] = {
     one.__name__: one
     for one in (

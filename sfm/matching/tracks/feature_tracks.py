@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +26,11 @@ from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks.features import (
+    EPIPOLAR_PX,
+    MIN_PAIR_MATCHES,
     Features,
+    PairMatches,
+    TwoMotions,
     common_features,
     connected_parts,
     connecting_pairs,
@@ -40,8 +45,7 @@ WINDOW_PX = 15  # larger windows are less noisy, but over them an affine warp ca
 SNAP_PX = 6.0  # an interest point this close to a feature replaces its position
 
 
-# For pairs of photographs: pairs of features, and how distinctive they are; see `matched_features`.
-Matches = dict[tuple[int, int], tuple[IntArray, FloatArray]]
+Matches = dict[tuple[int, int], PairMatches]  # of pairs of photographs
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class Tracks:
     image: IntArray  # (k,)
     feature: IntArray  # index among the features of that photograph, (k,)
     point: IntArray  # 0 to n - 1, sorted, (k,)
+    still: FloatArray  # share of the matched features of each photograph that stand still, (m,)
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,7 @@ class TiePoints:
     xy: FloatArray  # px, (k, 2)
     covariance: FloatArray  # px^2, (k, 2, 2)
     reference: IntArray  # the photograph in which each point was chosen, (n,)
+    still: FloatArray  # share of the matched features of each photograph that stand still, (m,)
 
     def __len__(self) -> int:
         return len(self.image)
@@ -118,7 +124,7 @@ def find_tie_points(
     return measure_tracks(
         photographs,
         natural,
-        Tracks(tracks.image[kept], tracks.feature[kept], point.ravel()),
+        Tracks(tracks.image[kept], tracks.feature[kept], point.ravel(), tracks.still),
         window_px=window_px,
         min_rays=min_rays,
         min_image_points=min_image_points,
@@ -152,7 +158,7 @@ def link_features(
 
     A point has at most one feature in each photograph. The most distinctive matches are used first. A match
     that would join two features of one photograph is skipped, so a wrong match splits a track but does not
-    lose it.
+    lose it. Features that stand still before a camera that does are no points.
 
     Args:
         features: features of m photographs.
@@ -167,36 +173,82 @@ def link_features(
     score = common_features([one.descriptor for one in features], [one.scale for one in features])
     pairs = overlapping_pairs(score, neighbours=neighbours)
 
-    def matched_pairs(of: IntArray) -> list[tuple[IntArray, FloatArray]]:
+    def match(of: IntArray) -> _MatchedFeatures:
         every = [(i, j) for i, j in of.tolist()]
         new = [pair for pair in every if pair not in known]
         matches = in_threads(
             lambda p: matched_features(features[p[0]], features[p[1]], seed=seed), new, threads
         )
         known.update(zip(new, reported("pairs of photographs matched", matches, len(new)), strict=True))
-        return [known[pair] for pair in every]
+        return _matched_features({pair: known[pair] for pair in every}, features, first)
 
-    matched = matched_pairs(pairs)
-    linked = pairs[np.array([len(rows) > 0 for rows, _ in matched], dtype=bool)]
-    part = connected_parts(linked, len(features))
+    matched = match(pairs)
+    part = connected_parts(pairs[np.unique(matched.pair)], len(features))
     if part.max(initial=0):
-        rest = connecting_pairs(score, part, pairs)
-        pairs, matched = np.concatenate([pairs, rest]), matched + matched_pairs(rest)
-    edges = [np.zeros((0, 2), dtype=np.int64)]
-    edges += [
-        rows + np.array([first[i], first[j]])
-        for (i, j), (rows, _) in zip(pairs.tolist(), matched, strict=True)
-    ]
-    edge = np.concatenate(edges)
-    distinct = np.concatenate([np.zeros(0), *(one for _, one in matched)])
+        matched = match(np.concatenate([pairs, connecting_pairs(score, part, pairs)]))
     image = np.repeat(np.arange(len(features)), np.diff(first))
-    group = joined_features(edge[np.argsort(-distinct, kind="stable")], image, len(features))
+    edge = matched.edge[np.argsort(-matched.distinct, kind="stable")]
+    group = joined_features(edge, image, len(features))
     size = np.bincount(group, minlength=len(group))
     rows = np.flatnonzero(size[group] >= min_rays)
     _, point = np.unique(group[rows], return_inverse=True)
     order = np.argsort(point, kind="stable")
     rows = rows[order]
-    return Tracks(image[rows], rows - first[image[rows]], point[order])
+    return Tracks(image[rows], rows - first[image[rows]], point[order], matched.still)
+
+
+class _MatchedFeatures(NamedTuple):
+    """Matches between the features of all photographs, numbered together."""
+
+    edge: IntArray  # the two features of a match, (e, 2)
+    distinct: FloatArray  # see `sfm.matching.tracks.features.PairMatches`, (e,)
+    pair: IntArray  # number of the pair of photographs, (e,)
+    still: FloatArray  # see `Tracks`, (m,)
+
+
+def _matched_features(matches: Matches, features: Sequence[Features], first: IntArray) -> _MatchedFeatures:
+    """Return the matches of all pairs, without the features that stand still before a camera that does.
+
+    It does if more than half of the photographs are connected by pairs in which some features stand still and
+    the others agree on another motion: an object turns before its background, or writing is burned into the
+    photographs. Features that stand still in a pair of these photographs and move in none are left out.
+    Where a camera on a tripod takes each of several places twice, what stands still is the object itself.
+
+    Args:
+        matches: matches of each pair.
+        features: features of m photographs.
+        first: number of the first feature of each photograph, and the number of all, (m + 1,).
+    """
+    m, xy = len(features), np.concatenate([one.xy for one in features])
+    pairs = np.array(list(matches), dtype=np.int64).reshape(-1, 2)
+    camera = connected_parts(pairs[[one.motions is not None for one in matches.values()]], m)
+    sizes = np.bincount(camera)
+    standing = (camera == np.argmax(sizes)) & (2 * sizes.max() > m)
+    inside = standing[pairs].all(axis=1)
+    used = [
+        one.motions if within and one.motions is not None else one
+        for one, within in zip(matches.values(), inside.tolist(), strict=True)
+    ]
+    none = np.zeros((0, 2), dtype=np.int64)
+    edge = np.concatenate([none, *(one.rows + first[row] for one, row in zip(used, pairs, strict=True))])
+    distinct = np.concatenate([np.zeros(0), *(one.distinct for one in used)])
+    pair = np.repeat(np.arange(len(used)), [len(one.rows) for one in used])
+    moves = np.linalg.norm(xy[edge[:, 0]] - xy[edge[:, 1]], axis=1) > EPIPOLAR_PX
+    beside = [
+        one.still + first[row] for one, row in zip(used, pairs, strict=True) if isinstance(one, TwoMotions)
+    ]
+    stands = np.concatenate([none, *beside, edge[inside[pair] & ~moves]])
+    still, moving, seen = (
+        np.isin(np.arange(len(xy)), rows) for rows in (stands, edge[moves], np.concatenate([edge, stands]))
+    )
+    still &= ~moving
+    kept = ~still[edge].any(axis=1)
+    kept &= (np.bincount(pair[kept], minlength=len(used)) >= MIN_PAIR_MATCHES)[pair]
+    photograph = np.repeat(np.arange(m), np.diff(first))
+    share = np.bincount(photograph[still], minlength=m) / np.maximum(
+        np.bincount(photograph[seen], minlength=m), 1
+    )
+    return _MatchedFeatures(edge[kept], distinct[kept], pair[kept], share)
 
 
 @compiled
@@ -319,7 +371,12 @@ def measure_tracks(
     _, point = np.unique(tracks.point[keep], return_inverse=True)
     kept = np.unique(tracks.point[keep])
     return TiePoints(
-        tracks.image[keep], point, measured[keep], covariance[keep], tracks.image[reference[kept]]
+        tracks.image[keep],
+        point,
+        measured[keep],
+        covariance[keep],
+        tracks.image[reference[kept]],
+        tracks.still,
     )
 
 

@@ -127,14 +127,30 @@ def _strongest_per_cell(xy: FloatArray, strength: FloatArray, shape: tuple[int, 
     return np.sort(chosen)
 
 
+class TwoMotions(NamedTuple):
+    """Features of two photographs of which some stand still while the others agree on another motion."""
+
+    rows: IntArray  # those that fit the epipolar geometry of the moving ones, (k, 2)
+    distinct: FloatArray  # see `PairMatches`, (k,)
+    still: IntArray  # those that stand still and do not fit it, (l, 2)
+
+
+class PairMatches(NamedTuple):
+    """Features of two photographs that choose each other and fit one epipolar geometry."""
+
+    rows: IntArray  # feature in the first and in the second photograph, (k, 2)
+    distinct: FloatArray  # 1 - the ratio of distances to the nearest and second-nearest feature, (k,)
+    motions: TwoMotions | None  # None if the photographs show one motion
+
+
 def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
     """Return pairs of features, (k, 2), that choose each other and fit one epipolar geometry."""
-    return matched_features(a, b, seed=seed)[0]
+    return matched_features(a, b, seed=seed).rows
 
 
-def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, FloatArray]:
-    """Return these pairs, and 1 - the ratio of distances to the nearest and second-nearest feature, (k,)."""
-    none = np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+def matched_features(a: Features, b: Features, *, seed: int) -> PairMatches:
+    """Return the pairs of features that choose each other, and whether they show two motions."""
+    none = PairMatches(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
     if min(len(a), len(b)) < MIN_PAIR_MATCHES:
         return none
     nearest = _nearest_descriptors(a.descriptor, b.descriptor)
@@ -146,19 +162,54 @@ def matched_features(a: Features, b: Features, *, seed: int) -> tuple[IntArray, 
     found = np.column_stack([rows, forth[rows]])
     if len(found) < MIN_PAIR_MATCHES:
         return none
+    first, other = a.xy[found[:, 0]], b.xy[found[:, 1]]
+    motions = None
+    fits, still = _two_motions(first, other, seed)
+    if still.any():
+        motions = TwoMotions(found[fits], distinct[fits], found[still])
+    kept = _epipolar_geometry(first, other, seed)
+    if kept.sum() < MIN_PAIR_MATCHES:
+        return none._replace(motions=motions)
+    return PairMatches(found[kept], distinct[kept], motions)
+
+
+def _two_motions(first: FloatArray, other: FloatArray, seed: int) -> tuple[BoolArray, BoolArray]:
+    """Return which matches fit the epipolar geometry of those that moved, and which stand still beside it.
+
+    There are two motions if most of the matches that moved agree on an epipolar geometry, and most of those
+    at the same place do not fit it. A distant background fits it where a camera moves without turning.
+
+    Args:
+        first: positions in the first photograph, px, (k, 2).
+        other: positions in the second one, px, (k, 2).
+        seed: seed of the random samples.
+    """
+    fits, none = np.zeros(len(first), dtype=bool), np.zeros(len(first), dtype=bool)
+    here = np.linalg.norm(first - other, axis=1) <= EPIPOLAR_PX
+    if here.sum() < MIN_MUTUAL_FEATURES or (~here).sum() < MIN_PAIR_MATCHES:
+        return fits, none
+    fits[~here] = _epipolar_geometry(first[~here], other[~here], seed)
+    if fits.sum() < max(MIN_PAIR_MATCHES, (~here).sum() / 2):
+        return fits, none
+    # of all of them: that of the best sample is not determined well enough where nothing moved
+    F = cv2.findFundamentalMat(first[fits], other[fits], cv2.FM_8POINT)[0]
+    if F is None:
+        return fits, none
+    x, y = (np.column_stack([xy, np.ones(len(xy))])[here] for xy in (first, other))
+    lines, lines_back = x @ F.T, y @ F
+    slope = np.minimum(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(lines_back[:, :2], axis=1))
+    fits[here] = np.abs(np.einsum("ki,ki->k", y, lines)) <= EPIPOLAR_PX * slope
+    still = here & ~fits
+    return fits, still if 2 * still.sum() > here.sum() else none
+
+
+def _epipolar_geometry(first: FloatArray, other: FloatArray, seed: int) -> BoolArray:
+    """Return which matches fit the epipolar geometry that most of them fit, (k,)."""
     cv2.setRNGSeed(seed)
     _, fits = cv2.findFundamentalMat(
-        a.xy[found[:, 0]],
-        b.xy[found[:, 1]],
-        cv2.FM_RANSAC,
-        EPIPOLAR_PX,
-        RANSAC_CONFIDENCE,
-        RANSAC_TRIALS,
+        first, other, cv2.FM_RANSAC, EPIPOLAR_PX, RANSAC_CONFIDENCE, RANSAC_TRIALS
     )
-    if fits is None or fits.sum() < MIN_PAIR_MATCHES:
-        return none
-    kept = fits.ravel() > 0
-    return np.asarray(found[kept], dtype=np.int64), np.asarray(distinct[kept], dtype=float)
+    return np.zeros(len(first), dtype=bool) if fits is None else np.asarray(fits.ravel() > 0)
 
 
 class _Nearest(NamedTuple):

@@ -132,6 +132,15 @@ POINTS = (
         "object without it.",
     ),
     Kind(
+        "still_features",
+        # a twentieth, as for a second motion
+        Grade("share", warning=0.05),
+        "{share:%} of the matched features in {photographs} stand still while the others move, and are left "
+        "out.",
+        "an object that turns before a background that stands still, or writing burned into the photographs",
+        "Mask what stands still ([survey] masks).",
+    ),
+    Kind(
         "windows_disagree",
         # The share is 0.04 to 0.09 on stone and rendered surfaces. Of windows placed at random within 3 px of
         # the predicted positions, 0.33 agree by chance (ten photographs of a telephone).

@@ -296,10 +296,14 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     parallax = _least_parallax(network, cameras, pairs)
     if parallax is None or not parallax.max() < needed:
         return
+    xy = network.image_points.xy
+    moved = np.concatenate([np.linalg.norm(xy[a] - xy[b], axis=1) for a, b in pairs])
+    turns = "; if the object turns before a background that stands still, mask the background"
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one position; "
         f"rotations alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, "
         f"and depths need {needed:.2g} px; photograph from several places"
+        f"{turns if np.quantile(moved, MAX_DISTANT_FRACTION) < needed else ''}"
     )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.conventions import AnyArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
@@ -45,6 +45,9 @@ MIN_SPREAD_SIGMAS = 2.0
 # A photograph with fewer image points is searched for more features. Three photographs of a portal, taken
 # while walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
+# Share of the features of a photograph from which those that stand still are reported. Dirt on the sensor
+# makes a few.
+STILL_SHARE = 0.01
 # Photographs that must agree on a point: two rays do not reveal an error along the epipolar line. Points of
 # two rays are used if a photograph, or a part of it, has no others.
 MIN_RAYS = 3
@@ -145,7 +148,7 @@ def tie_photographs(
         failed,
         tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
         files,
-        remarks=_remarks_on_pairs(len(matches), neighbours),
+        remarks=_remarks_on_pairs(len(matches), neighbours) + _remarks_on_still(tied.still, names),
     )
 
 
@@ -171,6 +174,15 @@ def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remar
             "pairs_matched", pairs=pairs, possible=possible, by_position=by_position, in_sequence=in_sequence
         ),
     )
+
+
+def _remarks_on_still(share: FloatArray, names: Sequence[str]) -> tuple[Remark, ...]:
+    """Return the remark on features that stand still, from their share in each photograph, (m,)."""
+    there = np.flatnonzero(share >= STILL_SHARE)
+    if not len(there):
+        return ()
+    stated = float(np.median(share[there]))
+    return (remark("still_features", share=stated, photographs=[names[i] for i in there.tolist()]),)
 
 
 def needed_rays(network: Network) -> IntArray:
