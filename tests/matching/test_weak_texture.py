@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 
+from sfm.errors import GeometryError
 from sfm.matching.tracks.features import sift_features
+from sfm.matching.tracks.interest import natural_points
+from sfm.pipeline import run_survey
+from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring import tie_points
+from tests.survey.texture_scenes import outcome_of, usual, write_scene
+from tests.synthetic import seed_of
 
 
 def _texture(contrast: float, noise: float, seed: int = 0) -> np.ndarray:
@@ -38,3 +48,34 @@ def test_strong_texture_keeps_its_features() -> None:
     photograph = _texture(30.0, 1.0)
     before, now = (sift_features(photograph, max_features=200, noise=noise) for noise in (None, 1 / 255))
     np.testing.assert_array_equal(before.xy, now.xy)
+
+
+@pytest.mark.parametrize("contrast", [0.0, 30.0])
+def test_photographs_that_show_nothing_in_common_are_searched_once(
+    contrast: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither those without texture, which has no more features, nor those of different places."""
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), _texture(contrast, 1.0, seed=number))
+    (tmp_path / "survey.toml").write_text(draft_survey(tmp_path).text, encoding="utf-8")
+    searched: list[int] = []
+    monkeypatch.setattr(
+        tie_points,
+        "natural_points",
+        lambda photograph, **options: (
+            searched.append(options["max_features"]) or natural_points(photograph, **options)
+        ),
+    )
+    with pytest.raises(GeometryError, match="no texture that two photographs have in common"):
+        run_survey(read_survey(tmp_path / "survey.toml"))
+    assert searched == [2000] * 4
+
+
+@pytest.mark.slow
+def test_an_object_of_a_tenth_of_the_contrast_is_oriented(tmp_path: Path) -> None:
+    rng = seed_of("weak 0")
+    scene = usual(rng)
+    scene.finish = lambda _, grey: 128 + (grey - 128) / 10
+    write_scene(tmp_path, scene, rng)
+    found = outcome_of(tmp_path, scene)
+    assert found.oriented == len(scene.position) and not found.is_wrong and found.level in ("good", "fair")

@@ -41,6 +41,7 @@ MIN_CONTRAST = 0.01
 # Gaussians of the finest octave (0.10 of the noise), times the three layers of an octave. White noise of 0.5
 # to 4 grey values has 30 to 70 such features in a megapixel, 0.6 of it 300 to 400.
 NOISE_CONTRAST = 0.9
+LAYERS = 3  # of an octave, as in Lowe (2004)
 ROUNDING_8 = 1 / FULL_SCALE_8 / np.sqrt(12)  # standard deviation of rounding to 8 bit, over the full scale
 # Features are extracted from an image of at most this side, reduced at least by 2: they only start the
 # matching, which measures in the photograph itself. If too few are found, a finer image is used.
@@ -79,21 +80,21 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: floa
     shrink = 2
     while max(eight_bit.shape) > shrink * MAX_SIDE_PX:
         shrink *= 2
-    contrast = MIN_CONTRAST
     least = MIN_CONTRAST if noise is None else NOISE_CONTRAST * float(np.hypot(noise, ROUNDING_8))
     while True:
-        sift = cv2.SIFT.create(contrastThreshold=contrast, enable_precise_upscale=True)
+        contrast = min(MIN_CONTRAST, least) if shrink == 1 else MIN_CONTRAST
+        sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=contrast, enable_precise_upscale=True)
         height, width = (max(1, side // shrink) for side in eight_bit.shape)
         # whole blocks of pixels: a remainder at the border belongs to none
         whole = eight_bit[: height * shrink, : width * shrink]
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
-        if len(points) >= max_features or (shrink == 1 and contrast <= least):
+        if len(points) >= max_features or shrink == 1:
             break
-        if shrink > 1:
-            shrink //= 2
-        else:
-            contrast = max(contrast / 2, least)
+        shrink //= 2
+    response = np.array([p.response for p in points], dtype=np.float32)
+    if shrink == 1:
+        points = [points[k] for k in _least_contrast(response, max_features, least).tolist()]
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     kept = _strongest_per_cell(xy, np.array([p.response for p in points]), picture.shape, max_features)
     points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
@@ -107,6 +108,20 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: floa
         np.radians([p.angle for p in points]),
         np.sqrt(descriptor / norm),
     )
+
+
+def _least_contrast(response: AnyArray, most: int, least: float) -> IntArray:
+    """Return the features of the largest contrast, MIN_CONTRAST halved as often as needed, that has enough.
+
+    Args:
+        response: contrast of each feature in a layer of the octave, over the full scale, float32, (k,).
+        most: number of features that is enough.
+        least: smallest contrast.
+    """
+    contrast, of_octave = MIN_CONTRAST, (response * np.float32(LAYERS)).astype(float)
+    while contrast > least and np.count_nonzero(of_octave >= contrast) < most:
+        contrast = max(contrast / 2, least)
+    return np.flatnonzero(of_octave >= contrast)
 
 
 def _strongest_per_cell(xy: FloatArray, strength: FloatArray, shape: tuple[int, ...], most: int) -> IntArray:
@@ -140,6 +155,7 @@ class PairMatches(NamedTuple):
 
     rows: IntArray  # feature in the first and in the second photograph, (k, 2)
     distinct: FloatArray  # 1 - the ratio of distances to the nearest and second-nearest feature, (k,)
+    candidates: int  # pairs that choose each other, of which these fit the geometry
     motions: TwoMotions | None  # None if the photographs show one motion
 
 
@@ -150,7 +166,7 @@ def match_features(a: Features, b: Features, *, seed: int = 0) -> IntArray:
 
 def matched_features(a: Features, b: Features, *, seed: int) -> PairMatches:
     """Return the pairs of features that choose each other, and whether they show two motions."""
-    none = PairMatches(np.zeros((0, 2), dtype=np.int64), np.zeros(0), None)
+    none = PairMatches(np.zeros((0, 2), dtype=np.int64), np.zeros(0), 0, None)
     if min(len(a), len(b)) < MIN_PAIR_MATCHES:
         return none
     nearest = _nearest_descriptors(a.descriptor, b.descriptor)
@@ -160,6 +176,7 @@ def matched_features(a: Features, b: Features, *, seed: int) -> PairMatches:
     forth, best, second = nearest.forth, nearest.best[rows], nearest.second[rows]
     distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
     found = np.column_stack([rows, forth[rows]])
+    none = none._replace(candidates=len(found))
     if len(found) < MIN_PAIR_MATCHES:
         return none
     first, other = a.xy[found[:, 0]], b.xy[found[:, 1]]
@@ -170,7 +187,7 @@ def matched_features(a: Features, b: Features, *, seed: int) -> PairMatches:
     kept = _epipolar_geometry(first, other, seed)
     if kept.sum() < MIN_PAIR_MATCHES:
         return none._replace(motions=motions)
-    return PairMatches(found[kept], distinct[kept], motions)
+    return PairMatches(found[kept], distinct[kept], len(found), motions)
 
 
 def _two_motions(first: FloatArray, other: FloatArray, seed: int) -> tuple[BoolArray, BoolArray]:

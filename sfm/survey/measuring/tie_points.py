@@ -20,7 +20,7 @@ from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
-from sfm.matching.tracks.features import PARTNERS, Features
+from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS, Features
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
@@ -42,8 +42,10 @@ NONE = -1  # no photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
 # their errors: errors alone give 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
-# A photograph with fewer image points is searched for more features. Three photographs of a portal, taken
-# while walking towards it, have 36 tie points in common with 2,000 features each, and 249 with 8,000.
+# A photograph with fewer image points is searched for more features, if it had as many as were asked for, and
+# more in common with another one than chance gives: at most 14 pairs of 2,000 features of different textures
+# choose each other. Three photographs of a portal, taken while walking towards it, have 36 tie points in
+# common with 2,000 features each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
 # Share of the features of a photograph from which those that stand still are reported. Dirt on the sensor
 # makes a few.
@@ -94,6 +96,7 @@ def tie_photographs(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([files.paths[k] for k in read])
+    most_found = [len(found[k][2]) for k in read]
     natural = [
         _visible(Masks(survey.masks), name, found[k][2], found[k][0].size_px)
         for k, name in zip(read, names, strict=True)
@@ -119,14 +122,16 @@ def tie_photographs(
 
     tied = tie(0)
     scarce = np.flatnonzero(np.bincount(tied.image, minlength=len(read)) < SCARCE_TIE_POINTS).tolist()
-    if scarce and "max_features" not in settings.model_fields_set:
+    if "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
-        for a in reported("photographs searched for more features", scarce, len(scarce)):
+        alike = {a for pair, one in matches.items() if one.candidates >= MIN_PAIR_MATCHES for a in pair}
+        searched = [a for a in scarce if a in alike and most_found[a] >= settings.max_features]
+        for a in reported("photographs searched for more features", searched, len(searched)):
             again = natural_points_of(files.paths[read[a]], more, store)[0]
             natural[a] = _visible(Masks(survey.masks), names[a], again, metadata[a].size_px)
-        for pair in [pair for pair in matches if not set(pair).isdisjoint(scarce)]:
+        for pair in [pair for pair in matches if not set(pair).isdisjoint(searched)]:
             del matches[pair]
-    if scarce:
+    if scarce and matches:
         tied = tie(SCARCE_TIE_POINTS)
     if not len(tied):
         raise GeometryError(
