@@ -27,6 +27,7 @@ from sfm.survey.inputs.measurements import (
     find_photographs,
     refuse_incomplete_cameras,
 )
+from sfm.survey.inputs.photograph_names import name_photographs
 from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
@@ -93,7 +94,8 @@ def _measure(
     if not reads_photographs(survey):
         return survey, measure_sources(survey, NO_PHOTOGRAPHS, jobs=jobs, store=store, clock=clock)
     files = find_photographs(survey, images_dir=images_dir)
-    survey, clocks = moments_from_exif(survey, files)
+    named = name_photographs(survey, files)
+    survey, clocks = moments_from_exif(named.survey, files)
     survey, positions = exterior_from_exif(survey, files)
     refuse_unknown_photographs(survey, files.names)
     Masks(survey.masks).refuse_without(files.names)
@@ -102,11 +104,11 @@ def _measure(
     if survey.start_cameras is None:
         refuse_incomplete_cameras(survey.cameras, survey.source, sizes.files)
     measured = measure_sources(survey, sizes.files, jobs=jobs, store=store, clock=clock)
-    return survey, replace(
+    return named.without_unmarked(survey, measured.network.points), replace(
         measured,
         images=tuple(dict.fromkeys((*files.names, *measured.images))),
         failed=sizes.left_out + measured.failed,
-        remarks=clocks + positions + sizes.remarks + measured.remarks,
+        remarks=named.remarks + clocks + positions + sizes.remarks + measured.remarks,
     )
 
 

@@ -44,8 +44,8 @@ class FailedImage:
 
     @property
     def is_counted(self) -> bool:
-        """Whether it counts as a photograph: copies and files that cannot be read do not."""
-        return not (self.is_copy or self.is_unreadable)
+        """Whether it counts as a photograph: copies, and files that are not here or not readable, do not."""
+        return not (self.is_copy or self.is_unreadable or self.reason.kind == "photographs_without_file")
 
 
 @dataclass(frozen=True)

@@ -202,6 +202,7 @@ def array_table(
     numbers: Mapping[str, FloatArray],
     *,
     blank: tuple[str, ...] = (),
+    line: Sequence[int] | None = None,
 ) -> CsvTable:
     """Return arrays as a table, with the same checks as for a file.
 
@@ -210,6 +211,7 @@ def array_table(
         texts: columns of names.
         numbers: columns of numbers, of the same length.
         blank: columns of numbers that may be NaN.
+        line: line of each row in the file that the arrays are from; rows are counted if not given.
 
     Raises:
         SurveyFileError: columns of different lengths, no rows, a bad name, or a number that is not finite or
@@ -221,12 +223,13 @@ def array_table(
             raise SurveyFileError(f"{what}: {counted(len(column), 'value')} of {name}, expected {rows}")
     if not rows:
         raise SurveyFileError(f"{what}: no rows, at least one is needed")
+    word, places = ("row", range(1, rows + 1)) if line is None else ("line", line)
     names = tuple(
-        tuple(_name(str(cell), f"{what}, row {k}: {name}") for k, cell in enumerate(column, 1))
+        tuple(_name(str(cell), f"{what}, {word} {k}: {name}") for k, cell in zip(places, column, strict=True))
         for name, column in texts.items()
     )
     values = np.column_stack(list(numbers.values()))
-    table = CsvTable(Path(what), tuple(texts), names, values, np.arange(1, rows + 1), "row", tuple(numbers))
+    table = CsvTable(Path(what), tuple(texts), names, values, np.array(places), word, tuple(numbers))
     wrong = ~(np.abs(values) <= MAX_NUMBER)
     wrong &= ~(np.isnan(values) & np.isin(list(numbers), blank))
     table.refuse(values, wrong, tuple(numbers), f"a finite number of at most {MAX_NUMBER:g}")

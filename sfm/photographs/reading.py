@@ -18,6 +18,7 @@ from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_
 # PhotographError states the fault of a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 CHANNELS = ("luminance", "red", "green", "blue")
 # IEC 61966-2-1 (sRGB): linear below this signal, a power law above it.
 SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4

@@ -48,10 +48,14 @@ def assemble_result(
     survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     adjustment, naming = solution.adjustment, matched.naming
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
+    files = measured.images if measured.files is None else measured.files.names
     reasons: dict[str, Remark] = {}  # of a photograph placed by its rig: that of its orientation
     for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
         if name not in is_in:
-            reasons.setdefault(name, reason)
+            here = name in files
+            reasons.setdefault(
+                name, reason if here else remark("photographs_without_file", photographs=[name])
+            )
     failed = (*measured.failed, *(FailedImage(*one) for one in reasons.items()))
     before = (*measured.left_out, *matched.left_out_image_points)
     correlations = exterior_correlations(adjustment)

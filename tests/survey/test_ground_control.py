@@ -114,6 +114,11 @@ def test_ground_control_by_latitude_and_longitude_is_local(tmp_path: Path) -> No
         ("WGS84\n1 2 three 4 5 a.png\n", "line 2: found 'three', expected a number"),
         ("WGS84\n1 NaN 3 4 5 a.png\n", "line 2: found NaN"),
         ("WGS84\n1 2 3 4 5 a.png p\n1 2 4 4 5 b.png p\n", "line 3: point 'p' has other coordinates"),
+        ("WGS84\n13.4 97.5 3 4 5 a.png\n", "line 2: latitude 97.5, needed -90 to 90 degrees"),
+        ("\n# by hand\nEPSG:4326\n190 52.5 3 4 5 a.png\n", "line 4: longitude 190, needed -180 to 180"),
+        ("WGS84\n1 2_0 3 4 5 a.png\n", "line 2: found '2_0', expected a number"),
+        ("WGS84 UTM 33N\n\n1 2 1e300 4 5 a.png\n", r"gcp_list.txt, line 3: column Z contains 1e\+300"),
+        ("WGS84 UTM 33N\n1 2 3 4 5 a.png p\n1 2 3 4 5 \x00 p\n", "gcp_list.txt, line 3: image contains"),
         ("WGS84\n", "no point of the file has coordinates"),
         ("WGS84 UTM 33N\n1 2 3 4 5 a.png p\n", "no point 'q', which control.check names"),
     ],
@@ -123,3 +128,45 @@ def test_wrong_ground_control_is_refused_in_one_line(tmp_path: Path, text: str, 
     with pytest.raises(SurveyFileError, match=message) as refused:
         read_survey(path)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"latitude": 95, "longitude": 13}, "ground_control_points.json, point 'p': latitude 95"),
+        ({"latitude": 52, "longitude": float("nan")}, "point 'p': longitude nan"),
+    ],
+)
+def test_degrees_that_cannot_be_are_refused(tmp_path: Path, content: dict[str, float], message: str) -> None:
+    points = {"points": [{"id": "p", "position": content}]}
+    path = survey_with(tmp_path / "degrees", "ground_control_points.json", json.dumps(points))
+    with pytest.raises(SurveyFileError, match=message):
+        read_survey(path)
+
+
+def test_control_that_is_all_check_points_is_no_datum(tmp_path: Path) -> None:
+    text = "\n".join(["WGS84 UTM 33N", *lines_of()])
+    names, datum = json.dumps(list(PLACES)), '[datum]\nkind = "control"\n'
+    path = survey_with(tmp_path / "all", "gcp_list.txt", text, f"check = {names}\n{datum}")
+    with pytest.raises(SurveyFileError, match="all 7 control points are check points, and datum kind"):
+        read_survey(path)
+    some = survey_with(tmp_path / "some", "gcp_list.txt", text, f'check = ["top", "flat"]\n{datum}')
+    assert read_survey(some).control is not None
+
+
+def test_names_of_photographs_may_have_spaces_and_points_none(tmp_path: Path) -> None:
+    """A point without a name is where its coordinates are, whatever their digits."""
+    lines = [
+        "WGS84 UTM 33N",
+        "1.0 2.00 NaN 4 5 photo  1.JPG",
+        "1 2 nan 6 7 photo 2.jpeg  ",
+        "1 3 3 4 5 photo 1.JPG corner extra",
+        "1 4 3 4 5 raw.dng wall",
+        "1 5 3 4 5 photo.jpg.copy",
+    ]
+    path = survey_with(tmp_path / "names", "gcp_list.txt", "\n".join(lines))
+    survey = read_survey(path)
+    (table,) = survey.observations  # type: ignore[misc]
+    assert table.image == ("photo  1.JPG", "photo 2.jpeg", "photo 1.JPG", "raw.dng", "photo.jpg.copy")
+    assert table.point == ("gcp 1", "gcp 1", "corner", "wall", "gcp 2")
+    assert survey.control is not None and survey.control.names == ("gcp 1", "corner", "wall", "gcp 2")

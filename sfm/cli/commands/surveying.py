@@ -226,6 +226,7 @@ def _run_survey(
         from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
         from sfm.kernels.threads import cores
+        from sfm.photographs.reading import SUFFIXES
         from sfm.pipeline import run_survey
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings import findings_of
@@ -237,7 +238,6 @@ def _run_survey(
             write_unfinished,
         )
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.survey.drafting.draft import SUFFIXES
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
         from sfm.survey.inputs.sources import reads_photographs

@@ -75,8 +75,9 @@ POINTS = (
         "photographs_without_file",
         "note",
         "{photographs:photograph} with given image points {photographs:is|are} not among the files: "
-        "{photographs}.",
-        "only their image points were handed over, or a name in the table differs from that of the file",
+        "{photographs}[[; {points} {points:is|are} marked in no other]].",
+        "the survey is a part of more photographs, only their image points were handed over, or a name in "
+        "the table differs from that of the file",
         "Correct the table if the photograph is here.",
     ),
     Kind(

@@ -21,6 +21,7 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
+from sfm.photographs.reading import SUFFIXES
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.drafting.camera_groups import (
@@ -40,7 +41,6 @@ from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
 from sfm.targets.codes.plates import BOARDS, FAMILIES, GRIDS, PLATES, PlateFamily
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
 DEPTHS = ("*", "*/*")  # where photographs are searched; the first that has some is used
 COMMENT_WIDTH = 100  # characters
 MOMENT_IN_NAMES = "in brackets: what photographs of one moment have in common"

@@ -50,18 +50,28 @@ def camera_of_image(cameras: Sequence[CameraSettings], image: str, source: str) 
     Raises:
         SurveyFileError: the globs of no camera match, or those of several cameras.
     """
-    if len(cameras) == 1 and cameras[0].images is None:
-        return 0
-    matches = [
-        index
-        for index, camera in enumerate(cameras)
-        if any(fnmatch.fnmatchcase(image, glob) for glob in camera.images or ())
-    ]
+    matches = cameras_of_image(cameras, image)
     if len(matches) != 1:
         globs = ", ".join(f"{c.name} {', '.join(map(repr, c.images or ()))}" for c in cameras)
         many = "no camera" if not matches else f"{counted(len(matches), 'camera')}"
         raise SurveyFileError(f"{source}: image '{image}' matches the glob of {many}: {globs}")
     return matches[0]
+
+
+def cameras_of_image(cameras: Sequence[CameraSettings], image: str) -> list[int]:
+    """Return the indices of the cameras whose globs match the name of a photograph.
+
+    Args:
+        cameras: cameras of the survey; a single one without globs has all photographs.
+        image: name of the photograph.
+    """
+    if len(cameras) == 1 and cameras[0].images is None:
+        return [0]
+    return [
+        index
+        for index, camera in enumerate(cameras)
+        if any(fnmatch.fnmatchcase(image, glob) for glob in camera.images or ())
+    ]
 
 
 def start_cameras(

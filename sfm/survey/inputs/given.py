@@ -8,7 +8,8 @@ rules of all tables.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,22 @@ class KnownPoints:
                 C[:, row, column] = C[:, column, row] = self.covariances[:, k]
         return C
 
+    @property
+    def only_checks(self) -> bool:
+        """Whether all known coordinates check the result, and none is adjusted."""
+        return self.check is not None and bool((self.check | ~np.isfinite(self.xyz)).all())
+
+    def select(self, rows: BoolArray) -> KnownPoints:
+        """Return some of the points."""
+        return replace(
+            self,
+            names=tuple(compress(self.names, rows)),
+            xyz=self.xyz[rows],
+            sigma=self.sigma[rows],
+            covariances=None if self.covariances is None else self.covariances[rows],
+            check=None if self.check is None else self.check[rows],
+        )
+
     @classmethod
     def from_arrays(cls, names: Sequence[str], xyz: npt.ArrayLike, sigma: npt.ArrayLike = 0.0) -> KnownPoints:
         """Return points from arrays.
@@ -84,7 +101,7 @@ class KnownPoints:
             SurveyFileError: as in `read_control`.
         """
         columns = columns_of("control", (*AXES, *SIGMAS_OF_AXES), len(names), (xyz, 3), (sigma, 3))
-        return _known_points(array_table("control", {"id": names}, columns, blank=AXES))
+        return known_points(array_table("control", {"id": names}, columns, blank=AXES))
 
 
 @dataclass(frozen=True)
@@ -146,9 +163,22 @@ class Observations:
     table: CsvTable  # their table, for error messages
     covariance: FloatArray | None = None  # of x and y in the square of the unit, 0 if None, (k,)
     sigma_px: float | None = None  # of rows without standard deviations; None: that of the survey
+    of_control: bool = False  # whether control has them, whose photographs may not be those of the survey
 
     def __len__(self) -> int:
         return len(self.point)
+
+    def select(self, rows: BoolArray) -> Observations:
+        """Return some of the image points."""
+        return replace(
+            self,
+            image=tuple(compress(self.image, rows)),
+            point=tuple(compress(self.point, rows)),
+            xy=self.xy[rows],
+            sigma=None if self.sigma is None else self.sigma[rows],
+            table=self.table.select(rows),
+            covariance=None if self.covariance is None else self.covariance[rows],
+        )
 
     @classmethod
     def from_arrays(
@@ -235,7 +265,7 @@ def read_control(path: Path) -> KnownPoints:
         aliases=(("point", "id"),),
         blank=(*AXES, *SIGMAS_OF_AXES, *more),
     )
-    return _known_points(table, len(covariances))
+    return known_points(table, len(covariances))
 
 
 def refuse_tiny_sigmas(
@@ -259,8 +289,16 @@ def refuse_tiny_sigmas(
         table.refuse(sigma, tiny, columns, needed)
 
 
-def _known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
-    """Return the points of a table that may have sigmas, `covariances` columns of covariances, and checks."""
+def known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
+    """Return the points of a table that may have sigmas, `covariances` columns of covariances, and checks.
+
+    Args:
+        table: id, and X, Y, Z with these further columns.
+        covariances: number of columns of covariances.
+
+    Raises:
+        SurveyFileError: as in `read_control`.
+    """
     xyz, sigma, mixed, check = np.split(table.values, (3, 6, 6 + covariances), axis=1)
     if not sigma.size:
         sigma = np.zeros_like(xyz)

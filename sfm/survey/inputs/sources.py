@@ -37,6 +37,7 @@ class Declared:
     stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
     is_stated: Callable[[Any], bool] = lambda settings: settings is not None
     is_alone: Callable[[Any], bool] = lambda settings: False  # whether it leaves no place for others
+    is_listed: bool = False  # whether its first image points are listed in files, whose faults show at once
 
 
 ROWS = (  # in the order of their points in a network; the first is that of a survey that states none
@@ -53,6 +54,7 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
         lambda given: counted(sum(map(len, tables_of(given))), "image point"),
         is_stated=lambda given: bool(tables_of(given)),
         is_alone=lambda given: not isinstance(given, tuple),  # one table, in place of photographs
+        is_listed=True,
     ),
     Declared(
         MARKS,
@@ -60,6 +62,7 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
         lambda marks: counted(len({mark.name for mark in marks}), "named point"),
         "named points",
         is_stated=bool,
+        is_listed=True,
     ),
     Declared(TEXTURE, "tie_points", lambda _: "tie points of natural texture", "tie points"),
 )

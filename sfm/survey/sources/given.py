@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
-from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -70,8 +69,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
     Args:
         survey: gives cameras, and masks.
         tables: the image points.
-        files: photographs; none if the image points stand in their place. A table may name a photograph
-            without its folder, and photographs that are not here.
+        files: photographs; none if the image points stand in their place. A table may name others.
 
     Raises:
         SurveyFileError: image points are outside their photographs, or the start values of a camera are
@@ -87,7 +85,6 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         tuple(files.names[k] for k in readable),
         survey.start_cameras,
     )
-    tables = tuple(_with_full_names(table, files) for table in tables)
     images, image = _numbered([name for table in tables for name in table.image])
     refuse_many(str(tables[0].table.path), images)
     points, point = _numbered([name for table in tables for name in table.point])
@@ -137,8 +134,6 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         for name in [f"{points[j]} in {images[i]}"]
     )
     outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
-    no_file = [name for name in images if len(files) and name not in of_file]
-    without_file = (remark("photographs_without_file", photographs=no_file),) if no_file else ()
     return Measurements(
         network,
         cameras,
@@ -146,18 +141,12 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         np.full(len(points), MIN_RAYS),
         failed,
         _overlays(network, files, readable),
-        remarks=(*offsets, *merged.remarks(images, points), *outside_remark, *without_file),
+        remarks=(*offsets, *merged.remarks(images, points), *outside_remark),
         left_out=(
             *contradicting,
             *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
         ),
     )
-
-
-def _with_full_names(table: Observations, files: PhotographList) -> Observations:
-    """Return the image points of a table with the names that the files of their photographs have."""
-    full = full_names(files)
-    return replace(table, image=tuple(full.get(name, name) for name in table.image))
 
 
 def _used_photographs(images: Sequence[str], files: PhotographList, copies: Collection[int]) -> BoolArray:
@@ -202,18 +191,6 @@ def _merge_tables(
         ),
         once.remarks,
     )
-
-
-def full_names(files: PhotographList) -> dict[str, str]:
-    """Return the name of each photograph whose name without folders is that of no other, by that name."""
-    count = Counter(PurePosixPath(name).name for name in files.names)
-    known = set(files.names)
-    return {
-        short: name
-        for name in files.names
-        for short in [PurePosixPath(name).name]
-        if count[short] == 1 and short not in known
-    }
 
 
 def _numbered(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:

@@ -59,11 +59,12 @@ def measure_sources(
         store: keeps the measurements; None to measure all anew.
         clock: times the stages.
     """
-    parts = []
-    for row, source in sources_of(survey):
+    measured = {}
+    sources = sources_of(survey)
+    for row, source in sorted(sources, key=lambda one: not one[0].is_listed):  # faults of files show first
         with clock.stage(row.stage, len(files)) if row.stage else nullcontext():
-            parts.append(source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress))
-    return _joined_measurements(survey, parts)
+            measured[row] = source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress)
+    return _joined_measurements(survey, [measured[row] for row, _ in sources])
 
 
 def complete_sources(oriented: Oriented, *, jobs: int = 1) -> Correspondences:
