@@ -1,20 +1,27 @@
 """Masks of photographs: what is black in them is ignored.
 
-The mask of `a/b.jpg` is the picture `a/b.jpg.png` in the folder of masks, of the size of the photograph, as
-in COLMAP and OpenSfM. A photograph without a mask is used whole.
+The mask of `a/b.jpg` is the picture `a/b.jpg.png` in the folder of masks, of the size of the photograph, or
+`b.jpg.png` there. That of `c.png` may be `c.png` too. COLMAP and OpenSfM name masks so. A photograph without
+a mask is used whole.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import SurveyFileError
+from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
+from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
+
+SUFFIX = ".png"
+MASKS = "masks"  # folder in which masks are searched
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,21 @@ class Masks:
     """The masks of a survey; without a folder, no photograph has one."""
 
     folder: Path | None = None
+
+    def path_of(self, name: str) -> Path | None:
+        """Return the mask of a photograph; None if it has none.
+
+        Args:
+            name: name of the photograph.
+        """
+        path = PurePosixPath(name)
+        if self.folder is None or path.is_absolute() or ".." in path.parts:
+            return None
+        for text in (name, path.name):
+            for mask in (f"{text}{SUFFIX}", text):
+                if mask.endswith(SUFFIX) and (self.folder / mask).is_file():
+                    return self.folder / mask
+        return None
 
     def visible(self, name: str, xy: FloatArray, size_px: tuple[int, int]) -> BoolArray:
         """Return which positions in a photograph are not masked, (k,).
@@ -53,22 +75,41 @@ class Masks:
             SurveyFileError: the mask has another size than the photograph.
             PhotographError: the mask cannot be read.
         """
-        path = None if self.folder is None else self.folder / f"{name}.png"
-        if path is None or not path.is_file():
+        path = self.path_of(name)
+        if path is None:
             return None
         mask = read_photograph(path)
-        height, width = mask.shape[:2]
-        if (width, height) != tuple(size_px):
-            raise SurveyFileError(
-                f"{path}: the mask has {width} x {height} px, its photograph {size_px[0]} x {size_px[1]} px"
-            )
+        _refuse_size(path, (mask.shape[1], mask.shape[0]), size_px)
         return np.asarray(mask == 0)
 
-    def refuse_without(self, names: tuple[str, ...]) -> None:
-        """Raise SurveyFileError if the folder has a mask of no photograph.
+    def cover(self, name: str, photograph: AnyArray) -> AnyArray:
+        """Return the photograph with the median of its visible pixels where it is masked, (H, W).
 
         Args:
-            names: names of all photographs.
+            name: name of the photograph.
+            photograph: intensities, (H, W).
+
+        Raises:
+            SurveyFileError: the mask has another size than the photograph.
+            PhotographError: the mask cannot be read.
+        """
+        height, width = photograph.shape
+        black = self.black(name, (width, height))
+        if black is None or not black.any():
+            return photograph
+        usual = 0 if black.all() else np.median(photograph[~black])
+        return np.where(black, np.asarray(usual).astype(photograph.dtype), photograph)
+
+    def refuse_wrong(self, paths: Mapping[str, Path]) -> None:
+        """Raise SurveyFileError if no photograph has a mask, or one has that of another.
+
+        Args:
+            paths: paths of all photographs, by their names; those that cannot be read are not checked.
+
+        Raises:
+            SurveyFileError: no photograph has a mask; a mask has another size than its photograph, is that of
+                two photographs, or a photograph.
+            PhotographError: a mask cannot be read.
         """
         if self.folder is None:
             return
@@ -76,7 +117,44 @@ class Masks:
             raise SurveyFileError(
                 f"{self.folder}: {why_no_folder(self.folder)}; needed the folder of the masks"
             )
-        if not any((self.folder / f"{name}.png").is_file() for name in names):
+        owner: dict[Path, str] = {}
+        photographs = {path.resolve() for path in paths.values()}
+        for name, path in paths.items():
+            mask = self.path_of(name)
+            if mask is None:
+                continue
+            if mask.resolve() in photographs:
+                raise SurveyFileError(f"{mask}: is a photograph, needed the mask of {name}")
+            if mask in owner:
+                raise SurveyFileError(f"{mask}: the mask would be that of {owner[mask]} and of {name}")
+            owner[mask] = name
+            with suppress(PhotographError):  # reported when it is measured
+                _refuse_size(mask, read_metadata(mask).size_px, read_metadata(path).size_px)
+        if not owner:
+            first = next(iter(paths))
             raise SurveyFileError(
-                f"{self.folder}: no mask of a photograph; that of {names[0]} would be {names[0]}.png"
+                f"{self.folder}: no mask of a photograph; that of {first} would be {first}{SUFFIX}"
             )
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> tuple[Masks, str]:
+    """Return the masks in a folder of photographs, and the path of their folder from there.
+
+    Args:
+        folder: contains the photographs, and a folder of masks; or one is beside it, as OpenSfM has it. The
+            masks of that are not returned, as a survey uses no files outside its folder.
+        names: names of the photographs.
+    """
+    for path in (MASKS, f"../{MASKS}"):
+        masks = Masks(folder / path)
+        if any(map(masks.path_of, names)):
+            return masks if path == MASKS else Masks(), path
+    return Masks(), ""
+
+
+def _refuse_size(mask: Path, size_px: tuple[int, int], needed: tuple[int, int]) -> None:
+    if size_px != tuple(needed):
+        raise SurveyFileError(
+            f"{mask}: the mask has {size_px[0]} x {size_px[1]} px, its photograph {needed[0]} x "
+            f"{needed[1]} px"
+        )

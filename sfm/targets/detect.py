@@ -78,6 +78,11 @@ class Targets:
     def __len__(self) -> int:
         return len(self.xy)
 
+    @property
+    def is_circle(self) -> BoolArray:
+        """Which targets are circles, and not corners of tags, (k,)."""
+        return np.asarray(np.isfinite(self.axes_covariance[:, 0, 0]))
+
     def select(self, rows: BoolArray) -> Targets:
         """Return some of the targets, with all rejected candidates."""
         if rows.all():

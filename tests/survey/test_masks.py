@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from sfm.errors import SurveyFileError
+from sfm.photographs.masks import Masks
 from sfm.pipeline import run_survey
+from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from tests.survey.test_sources import CORNERS, write, write_given
 
@@ -43,12 +45,74 @@ def test_nothing_is_measured_under_black(tmp_path: Path) -> None:
     assert len(seen) < len(whole)
 
 
-def test_masks_of_another_size_or_other_photographs_are_refused(tmp_path: Path) -> None:
+def test_masks_of_another_size_or_other_photographs_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sfm.pipeline.measure_sources", lambda *a, **k: pytest.fail("measured"))
     path = masked(tmp_path)
     cv2.imwrite(str(tmp_path / "masks" / "photo 3.png.png"), np.full((240, 320), 255, np.uint8))
-    with pytest.raises(SurveyFileError, match=r"photo 3.png.png: the mask has 320 x 240 px, .* 640 x 480 px"):
+    wrong_size = r"photo 3.png.png: the mask has 320 x 240 px, .* 640 x 480 px"
+    with pytest.raises(SurveyFileError, match=wrong_size):
         run_survey(read_survey(path))
+    with pytest.raises(SurveyFileError, match=wrong_size):
+        draft_survey(tmp_path)
     for mask in (tmp_path / "masks").iterdir():
         mask.rename(mask.with_name(mask.name.replace(".png.png", "_mask.png")))
     with pytest.raises(SurveyFileError, match=r"no mask of a photograph; .* would be photo 1.png.png"):
         run_survey(read_survey(path))
+    path.write_text(path.read_text("utf-8").replace('masks = "masks"', 'masks = "."'), "utf-8")
+    with pytest.raises(SurveyFileError, match=r"photo 1.png: is a photograph, needed the mask of photo 1"):
+        run_survey(read_survey(path))
+
+
+@pytest.mark.parametrize(
+    ("files", "name", "mask"),
+    [
+        (["a.jpg.png"], "a.jpg", "a.jpg.png"),
+        (["sub/a.jpg.png", "a.jpg.png"], "sub/a.jpg", "sub/a.jpg.png"),
+        (["a.jpg.png"], "images/a.jpg", "a.jpg.png"),
+        (["a.png", "a.png.png"], "a.png", "a.png.png"),
+        (["a.png"], "a.png", "a.png"),
+        (["a.png"], "a.jpg", None),
+        (["a.jpg"], "a.jpg", None),
+        (["a.jpg.png"], "../a.jpg", None),
+    ],
+)
+def test_the_mask_of_a_photograph_has_its_name(
+    tmp_path: Path, files: list[str], name: str, mask: str | None
+) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    found = Masks(tmp_path).path_of(name)
+    assert found == (None if mask is None else tmp_path / mask)
+
+
+def test_a_mask_is_that_of_one_photograph(tmp_path: Path) -> None:
+    for name in ("one/a.png", "two/a.png", "masks/a.png.png"):
+        (tmp_path / name).parent.mkdir()
+        cv2.imwrite(str(tmp_path / name), np.full((6, 8), 255, np.uint8))
+    paths = {name: tmp_path / name for name in ("one/a.png", "two/a.png")}
+    with pytest.raises(SurveyFileError, match=r"the mask would be that of one/a.png and of two/a.png"):
+        Masks(tmp_path / "masks").refuse_wrong(paths)
+
+
+def test_a_draft_has_the_masks_beside_the_photographs_and_ignores_what_they_hide(tmp_path: Path) -> None:
+    masked(tmp_path)
+    codes, line = 'codes = "ring14"', 'masks = "masks"'
+    draft = draft_survey(tmp_path).text
+    assert codes in draft and f"\n{line}" in draft
+    for path in (tmp_path / "masks").iterdir():
+        cv2.imwrite(str(path), np.zeros((480, 640), np.uint8))
+    draft = draft_survey(tmp_path).text
+    assert codes not in draft and "\n[tie_points]" in draft and f"\n{line}" in draft
+    (tmp_path / "masks").rename(tmp_path / "hidden")
+    assert "masks =" not in draft_survey(tmp_path).text
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in tmp_path.glob("*.png"):
+        path.rename(images / path.name)
+    (tmp_path / "hidden").rename(tmp_path / "masks")
+    outside = draft_survey(images)  # as OpenSfM has them; a survey uses no files outside its folder
+    assert codes in outside.text and '\n# masks = "../masks"' in outside.text
+    assert any("--allow-outside" in found for subject, found in outside.found if subject == "masks")

@@ -346,7 +346,7 @@ def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         refine(tmp_path / "model", tmp_path, masks=masks)
     (masks / "a").mkdir(parents=True)
     cv2.imwrite(str(masks / "a" / "0.png.png"), np.zeros((10, 10), np.uint8))
-    with pytest.raises(PhotographError, match="the mask has 10 x 10 px, its photograph 300 x 240 px"):
+    with pytest.raises(SurveyFileError, match="the mask has 10 x 10 px, its photograph 300 x 240 px"):
         refine(tmp_path / "model", tmp_path, masks=masks)
     for name in ("a/0", "b/1", "a/2", "b/3"):
         (masks / name).parent.mkdir(exist_ok=True)

@@ -13,7 +13,6 @@ from pathlib import Path
 from textwrap import fill
 from typing import NoReturn
 
-import cv2
 import numpy as np
 
 from sfm.display import agreeing, counted
@@ -21,6 +20,7 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
+from sfm.photographs.masks import MASKS, find_masks
 from sfm.photographs.reading import SUFFIXES
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
@@ -35,6 +35,7 @@ from sfm.survey.drafting.camera_groups import (
 from sfm.survey.drafting.camera_names import IN_ORDER
 from sfm.survey.drafting.camera_times import USUAL_S
 from sfm.survey.drafting.lens_models import with_lens_models
+from sfm.survey.drafting.ringed_dots import picture_of_rings
 from sfm.survey.drafting.target_trial import MIN_REPEATED, MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -56,7 +57,6 @@ SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings a
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
 MAX_SHOWN = 8  # names listed on a line
-SHOWN_ROWS, SHOWN_COLUMNS = 4, 6  # dots in a picture of unread rings
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,8 @@ def draft_survey(
         GeometryError: fewer than two readable photographs.
     """
     metadata, unreadable = _metadata(folder)
+    masks, masked = find_masks(folder, tuple(metadata))
+    masks.refuse_wrong({name: folder / name for name in metadata})
     grouping = group_photographs(metadata, sensor_width)
     if grouping.rig is None and any("/" in name for name in metadata):
         _refuse_folder(folder)
@@ -105,21 +107,22 @@ def draft_survey(
             f"{folder}: {counted(len(used), 'photograph')} of one camera, at least 2 are needed"
             + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:MAX_SHOWN])
         )
-    trial = try_targets([folder / name for name in used], folder=folder, store=store, progress=progress)
+    paths = [folder / name for name in used]
+    trial = try_targets(paths, folder=folder, masks=masks, store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
     positions = sum(metadata[one].position is not None for one in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     if trial.plate is not None:
-        silent = _text(name, grouping, trial, pitch, left_out, positions, models=False)
+        silent = _text(name, grouping, trial, pitch, left_out, positions, masked, models=False)
         cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
         grouping = replace(grouping, cameras=cameras)
     return Draft(
         name,
-        _text(name, grouping, trial, pitch, left_out, positions),
-        _findings(grouping, trial, positions),
+        _text(name, grouping, trial, pitch, left_out, positions, masked),
+        _findings(grouping, trial, positions, masked),
         _remarks(grouping, trial, pitch),
         left_out,
-        _rings_picture(trial),
+        picture_of_rings(trial.ringed),
     )
 
 
@@ -128,6 +131,7 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
     files = next((files for depth in DEPTHS if (files := _files(folder, depth))), [])
+    files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
     if all(conversion_of(path) for path in files):
         _refuse_folder(folder, files)
     metadata, unreadable = {}, []
@@ -164,7 +168,9 @@ def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
         else "it is empty"
     )
     content += f": {conversion_of(raw[0])}" if raw else ""
-    content += "".join(f"; try {as_plain(str(path))}" for path in every if _has_photographs(path))
+    content += "".join(
+        f"; try {as_plain(str(path))}" for path in every if path.name != MASKS and _has_photographs(path)
+    )
     raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
 
 
@@ -183,6 +189,7 @@ def _text(
     pitch: float | None,
     left_out: Sequence[tuple[str, str]],
     positions: int,
+    masked: str,
     *,
     models: bool = True,
 ) -> str:
@@ -192,6 +199,9 @@ def _text(
         f"name = {_quoted(name)}",
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
+    if masked:
+        beside = "# " if masked != MASKS else ""
+        lines.append(f"{beside}masks = {_quoted(masked)}  # what is black there is ignored")
     for camera in grouping.cameras:
         lines += ["", *_camera_lines(camera, _free_parameters(trial), models=models)]
     if grouping.rig is not None:
@@ -314,16 +324,6 @@ def _lattice_lines(lattice: tuple[int, int], pitch: float | None) -> list[str]:
     ]
 
 
-def _rings_picture(trial: TargetTrial) -> bytes:
-    """Return a picture of the dots with unread rings of the photograph that has most; empty without any."""
-    if not trial.ringed:
-        return b""
-    crops = list(max(trial.ringed, key=lambda one: len(one.crops)).crops[: SHOWN_ROWS * SHOWN_COLUMNS])
-    crops += [np.full_like(crops[0], 255)] * (-len(crops) % SHOWN_COLUMNS)
-    rows = [np.hstack(crops[k : k + SHOWN_COLUMNS]) for k in range(0, len(crops), SHOWN_COLUMNS)]
-    return cv2.imencode(".png", np.vstack(rows))[1].tobytes()
-
-
 def _kinds_of_codes() -> str:
     """Return a comment that lists the kinds of codes and plates; an ellipsis stands for more of one kind."""
     kinds: dict[str, list[str]] = {}
@@ -410,7 +410,9 @@ def _position_lines(positions: int) -> list[str]:
     ]
 
 
-def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[tuple[str, str], ...]:
+def _findings(
+    grouping: Grouping, trial: TargetTrial, positions: int, masked: str
+) -> tuple[tuple[str, str], ...]:
     """Return the findings for the terminal."""
     found = [
         (
@@ -442,6 +444,10 @@ def _findings(grouping: Grouping, trial: TargetTrial, positions: int) -> tuple[t
         found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
         found.append(("targets", "none with codes: points of natural texture"))
+    if masked:
+        outside = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
+        used = "what is black in them is ignored" if masked == MASKS else outside
+        found.append(("masks", f"in {masked}; {used}"))
     if positions:
         found.append(
             ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")

@@ -43,7 +43,8 @@ def with_lens_models(
         store: stores the measurements, so that the survey need not repeat them.
         progress: receives every photograph.
     """
-    survey = replace(survey_of_file(SurveyFile.model_validate(tomllib.loads(text))), rigs=())
+    survey = survey_of_file(SurveyFile.model_validate(tomllib.loads(text)))
+    survey = replace(survey, rigs=(), masks=survey.masks and folder / survey.masks)
     names, owner = list[str](), list[int]()
     for index, camera in enumerate(cameras):
         count = len(camera.photographs)

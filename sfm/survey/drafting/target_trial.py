@@ -11,14 +11,16 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, PhotographError
+from sfm.photographs.exif import read_metadata
+from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.drafting.ringed_dots import MIN_REPEATED, Ringed, ringed_dots
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
@@ -32,7 +34,6 @@ from sfm.targets.codes.plate_search import (
     SEARCHED_PX,
     Part,
     checkerboard_of_parts,
-    has_interrupted_ring,
     lattice_size,
     part_of_checkerboard,
     search_april_grids,
@@ -58,31 +59,38 @@ from sfm.targets.outlines import as_bytes, scale_of
 TRIED, PLATES_TRIED = 3, 8  # photographs that are tried, spread over the folder
 MIN_READABLE = 2  # photographs
 MIN_CODES = 2  # of a family in one picture; chance seldom reads so many
-MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 LOOK_PX = 900  # longer side of the pictures for a first look
 # Longer side of the picture in which few small circles are searched, and their smallest diameter in it. In
 # 24 million px of texture this takes 1 to 2 s a photograph, at full size 5 to 15 s.
 FEW_PX, FEW_DIAMETER_PX, MANY_DIAMETER_PX = 1800, 6.0, 4.0
 # Pixels of a photograph over pixels of such a picture beyond which a first look saves time.
 MIN_PIXEL_RATIO = 3.0
-CROP_PX, CROP_RADII = 160, 6.0  # side of the picture of a dot with its ring; half of it in radii of the dot
 Tags = dict[str, tuple[IntArray, FloatArray]]  # of a photograph, by dictionary, see `read_dictionaries`
 NO_TAGS = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
 MIN_TARGETS = 12  # circles in a photograph; chance seldom finds so many
 
 
+NO_MASKS = Masks()
+
+
 @dataclass(frozen=True)
-class Ringed:
-    """Dots of a photograph with interrupted rings around them, as codes have."""
+class _Files:
+    """Photographs of the folder, without what their masks hide."""
 
-    photograph: str
-    crops: tuple[AnyArray, ...]  # pictures of these dots, uint8, each (CROP_PX, CROP_PX)
-    dots: int  # circles of the photograph, with such rings or without
+    folder: Path | None
+    masks: Masks
+    store: MeasuredStore | None
 
-    @property
-    def are_most(self) -> bool:
-        """Whether most dots have rings, and they are enough for two families of codes."""
-        return len(self.crops) >= MIN_REPEATED and 2 * len(self.crops) > self.dots
+    def name(self, path: Path) -> str:
+        return path.name if self.folder is None else path.relative_to(self.folder).as_posix()
+
+    def read(self, path: Path) -> AnyArray:
+        return self.masks.cover(self.name(path), read_photograph(path))
+
+    def measure(self, path: Path, family: str) -> Targets:
+        targets, _ = measure_photograph(path, TargetSettings(), code_family(family), self.store)
+        size_px = read_metadata(path).size_px
+        return targets.select(self.masks.visible(self.name(path), targets.xy, size_px))
 
 
 @dataclass(frozen=True)
@@ -113,6 +121,7 @@ def try_targets(
     paths: Sequence[Path],
     *,
     folder: Path | None = None,
+    masks: Masks = NO_MASKS,
     store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> TargetTrial:
@@ -124,6 +133,7 @@ def try_targets(
     Args:
         paths: photographs in their order; those that cannot be decoded are skipped.
         folder: folder to which their names are relative; only the names of the files if not given.
+        masks: what is black in them is ignored.
         store: stores the measurements, so that the survey need not repeat them.
         progress: receives every photograph and family.
 
@@ -131,8 +141,9 @@ def try_targets(
         GeometryError: fewer than two of them can be decoded.
     """
     progress.stage("trial", TRIED + 5)
-    tried, photographs, unreadable = _read_spread(paths, folder, progress)
-    names = tuple(_name_in(folder, path) for path in tried)
+    files = _Files(folder, masks, store)
+    tried, photographs, unreadable = _read_spread(paths, files, progress)
+    names = tuple(map(files.name, tried))
     tagged = ""
     if min(one.size for one in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
         greys = [_as_bytes(photograph) for photograph in photographs]
@@ -142,7 +153,7 @@ def try_targets(
             circles = float(np.median([look.circles for look in looks]))
             return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
         tagged, _ = _shared_family([look.tags for look in looks])
-    plain = [_measure(path, tagged or "none", store) for path in tried]  # with tags: not measured twice
+    plain = [files.measure(path, tagged or "none") for path in tried]  # with tags: not measured twice
     readers = list(map(_ring_reader, photographs, plain))
     counts = _repeated_rings(readers, RINGS)
     if all(len(codes) < MIN_REPEATED for codes in counts.values()):
@@ -154,21 +165,19 @@ def try_targets(
     if len(counts[best]) < MIN_REPEATED:
         refused = {name for name, _ in unreadable}
         more = [
-            paths[k]
-            for k in _spread_evenly(len(paths), PLATES_TRIED)
-            if _name_in(folder, paths[k]) not in refused
+            paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED) if files.name(paths[k]) not in refused
         ]
         read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
-        tags, plates = _tags_and_boards(read_already, more, progress)
+        tags, plates = _tags_and_boards(read_already, more, files, progress)
         if not plates and tags:
-            measured = plain if tags == tagged else [_measure(path, tags, store) for path in tried]
+            measured = plain if tags == tagged else [files.measure(path, tags) for path in tried]
             counts[tags] = _repeated_codes([one.code for one in measured])
             best = max(counts, key=lambda family: len(counts[family]))
         if plates or len(counts[best]) < MIN_REPEATED:  # else these are tags
-            ringed = tuple(map(_ringed, names, read_already.values(), plain))
+            ringed = tuple(map(ringed_dots, names, read_already.values(), plain))
             dots = None
             if not any(one.are_most for one in ringed):
-                dots = _dot_plate(plain, [path for path in more if path not in tried], store)
+                dots = _dot_plate(plain, [path for path in more if path not in tried], files)
             seen = zip(read_already.values(), plain, strict=True)
             if dots is None or not plates:
                 plates = plates if dots is None else (dots,)
@@ -182,17 +191,17 @@ def try_targets(
             counts |= {family: _repeated_codes([one[family] for one in rings]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
             if len(counts[best]) >= MIN_REPEATED:
-                measured = [_measure(path, best, store) for path in tried]
+                measured = [files.measure(path, best) for path in tried]
         progress.advance("concentric tags")
     coded = len(counts[best]) >= MIN_REPEATED and not plates
     if coded and best in RING_NAMES:
-        measured = [_measure(path, best, store) for path in tried]
+        measured = [files.measure(path, best) for path in tried]
     return TargetTrial(
         best if coded else plates[0].name if plates else "none",
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
-        float(np.median([_is_circle(one).sum() for one in measured])),
+        float(np.median([one.is_circle.sum() for one in measured])),
         _blur(measured),
         names,
         min(int((one.code >= 0).sum()) for one in measured) if coded else 0,
@@ -231,14 +240,9 @@ def _side_by_side(
     return tuple(used), tuple(left_out)
 
 
-def _is_circle(targets: Targets) -> BoolArray:
-    """Return which targets are circles, and not corners of tags, (k,)."""
-    return np.asarray(np.isfinite(targets.axes_covariance[:, 0, 0]))
-
-
 def _ring_reader(photograph: AnyArray, targets: Targets) -> RingReader:
     """Return a reader of rings around the measured circles of a photograph."""
-    circle = _is_circle(targets)
+    circle = targets.is_circle
     levels = np.column_stack([targets.background, targets.contrast])[circle]
     shape = shape_from_axes(targets.semi_axes[circle], targets.angle[circle])
     return RingReader(photograph, targets.xy[circle], shape, levels, blur_px=targets.blur[circle])
@@ -287,41 +291,21 @@ def _repeated_rings(readers: Sequence[RingReader], families: Mapping[str, int]) 
     return counts
 
 
-def _ringed(name: str, grey: AnyArray, targets: Targets) -> Ringed:
-    """Return the dots of a photograph (uint8) that have interrupted rings around them."""
-    circle = _is_circle(targets)
-    xy, shape = targets.xy[circle], shape_from_axes(targets.semi_axes[circle], targets.angle[circle])
-    scale = 255 / scale_of(grey) if grey.dtype != np.uint8 else 1.0
-    levels = scale * np.column_stack([targets.background, targets.contrast])[circle]
-    rows = np.flatnonzero(has_interrupted_ring(grey, xy, shape, levels))
-    side = CROP_RADII * np.sqrt(targets.semi_axes[circle].prod(axis=1))
-    crops = tuple(
-        cv2.warpAffine(
-            grey,
-            np.array([[s, 0, CROP_PX / 2 - s * x], [0, s, CROP_PX / 2 - s * y]]),
-            (CROP_PX, CROP_PX),
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        for (x, y), s in zip(xy[rows], CROP_PX / 2 / side[rows], strict=True)
-    )
-    return Ringed(name, crops, int(circle.sum()))
-
-
 def _largest_lattice(photographs: Sequence[Targets]) -> tuple[int, int] | None:
     """Return the rows and columns of the largest lattice of circles; None without one of a plate's size."""
-    sizes = [size for one in photographs if (size := lattice_size(one.xy[_is_circle(one)])) is not None]
+    sizes = [size for one in photographs if (size := lattice_size(one.xy[one.is_circle])) is not None]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
 def _tags_and_boards(
-    read_already: Mapping[Path, AnyArray], more: Sequence[Path], progress: Progress
+    read_already: Mapping[Path, AnyArray], more: Sequence[Path], files: _Files, progress: Progress
 ) -> tuple[str, tuple[PlateFamily, ...]]:
     """Return the dictionary of tags that photographs have in common, "" if none, and their boards.
 
     Tags on a checkerboard show that it is a ChArUco board.
     """
     tried = list(read_already.values())
-    others = [_as_bytes(read_photograph(path)) for path in more if path not in read_already]
+    others = [_as_bytes(files.read(path)) for path in more if path not in read_already]
     grids = search_april_grids(tried, others)  # first, since modules of tags may look like squares
     if grids:
         return "", grids
@@ -361,18 +345,16 @@ def _shared_numbers(photographs: Sequence[IntArray]) -> IntArray:
     return np.asarray(number[times > 1])
 
 
-def _dot_plate(
-    plain: Sequence[Targets], others: Sequence[Path], store: MeasuredStore | None
-) -> PlateFamily | None:
+def _dot_plate(plain: Sequence[Targets], others: Sequence[Path], files: _Files) -> PlateFamily | None:
     """Return the plate of dots that photographs show; `others` are measured if one has a lattice."""
 
     def circles(targets: Targets) -> tuple[FloatArray, FloatArray, IntArray]:
-        circle = _is_circle(targets)
+        circle = targets.is_circle
         return targets.xy[circle], np.sqrt(targets.semi_axes[circle].prod(axis=1)), targets.polarity[circle]
 
     seen = [circles(one) for one in plain]
     if any(shows_a_lattice(xy) for xy, _, _ in seen):
-        seen += [circles(_measure(path, "none", store)) for path in others]
+        seen += [circles(files.measure(path, "none")) for path in others]
     return search_dots(seen)
 
 
@@ -443,7 +425,7 @@ def _shows_concentric_tags(picture: AnyArray) -> bool:
 
 
 def _read_spread(
-    paths: Sequence[Path], folder: Path | None, progress: Progress
+    paths: Sequence[Path], files: _Files, progress: Progress
 ) -> tuple[list[Path], list[AnyArray], tuple[tuple[str, str], ...]]:
     """Return photographs spread over the folder, their pixels, and the undecodable ones with the reason."""
     tried: dict[int, AnyArray] = {}
@@ -453,11 +435,11 @@ def _read_spread(
             if k in tried or k in refused:
                 continue
             try:
-                tried[k] = read_photograph(paths[k])
+                tried[k] = files.read(paths[k])
             except PhotographError as error:
-                refused[k] = _name_in(folder, paths[k]), str(error).removeprefix(f"{paths[k].name}: ")
+                refused[k] = files.name(paths[k]), str(error).removeprefix(f"{paths[k].name}: ")
                 continue
-            progress.advance(_name_in(folder, paths[k]))
+            progress.advance(files.name(paths[k]))
             break
     if len(tried) < MIN_READABLE:
         why = listed((f"{name}: {reason}" for name, reason in refused.values()), separator="; ")
@@ -465,15 +447,6 @@ def _read_spread(
             f"{counted(len(tried), 'readable photograph')}, at least {MIN_READABLE} are needed ({why})"
         )
     return [paths[k] for k in sorted(tried)], [tried[k] for k in sorted(tried)], tuple(refused.values())
-
-
-def _name_in(folder: Path | None, path: Path) -> str:
-    """Return the name of a photograph in a folder."""
-    return path.name if folder is None else path.relative_to(folder).as_posix()
-
-
-def _measure(path: Path, family: str, store: MeasuredStore | None) -> Targets:
-    return measure_photograph(path, TargetSettings(), code_family(family), store)[0]
 
 
 def _repeated_codes(photographs: Sequence[IntArray]) -> tuple[int, ...]:

@@ -23,6 +23,7 @@ from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import MEMORY_BYTES, Grey, GreyPhotographs, grey_of, shrink_photograph
 from sfm.network import Estimate, ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
+from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
 
@@ -306,37 +307,22 @@ class Photographs:
 def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
     """Return which image points are in the black part of their photograph's mask, (k,).
 
-    The name of a mask is the name of its photograph plus .png, as in COLMAP. Photographs without a mask are
-    used whole.
-
     Args:
         network: the model.
         estimate: solution of the model.
         folder: folder of the masks.
 
     Raises:
-        SurveyFileError: the folder has no mask of any photograph.
-        PhotographError: a mask cannot be read or has another size than its photograph.
+        SurveyFileError: the folder has no mask of any photograph, or one of another size.
+        PhotographError: a mask cannot be read.
     """
-    seen = network.image_points
-    masked = np.zeros(len(seen), dtype=bool)
-    some = False
-    for i, name in enumerate(network.images):
-        path = _path_in(folder, f"{name}.png")
-        if not path.is_file():
-            continue
-        some = True
-        mask, (width, height) = read_photograph(path), estimate.cameras[network.camera[i]].size_px
-        if mask.shape != (height, width):
-            raise PhotographError(
-                f"{path.name}: the mask has {mask.shape[1]} x {mask.shape[0]} px, its photograph {width} x "
-                f"{height} px"
-            )
-        rows = np.flatnonzero(seen.image == i)
-        at = np.clip(np.rint(np.nan_to_num(seen.xy[rows])).astype(int), 0, [width - 1, height - 1])
-        masked[rows] = mask[at[:, 1], at[:, 0]] == 0
-    if not some:
+    seen, masks = network.image_points, Masks(folder)
+    if not any(map(masks.path_of, network.images)):
         raise SurveyFileError(f"{folder}: no mask of any photograph, expected '{network.images[0]}.png'")
+    masked = np.zeros(len(seen), dtype=bool)
+    for i, name in enumerate(network.images):
+        rows = np.flatnonzero(seen.image == i)
+        masked[rows] = ~masks.visible(name, seen.xy[rows], estimate.cameras[network.camera[i]].size_px)
     return masked
 
 

@@ -124,7 +124,7 @@ def with_dots(photograph: AnyArray, *, diameter: int, spacing: int) -> AnyArray:
 def test_texture_is_not_measured_for_targets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for i, photograph in enumerate((texture("look 0"), np.full((SIDE, SIDE), 128, np.uint8))):
         cv2.imwrite(str(tmp_path / f"{i}.png"), photograph)
-    monkeypatch.setattr(target_trial, "_measure", lambda *args: pytest.fail("measured"))
+    monkeypatch.setattr(target_trial, "measure_photograph", lambda *args: pytest.fail("measured"))
     searched: list[AnyArray] = []
 
     def part(grey: AnyArray) -> Part | None:
