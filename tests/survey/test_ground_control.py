@@ -154,6 +154,18 @@ def test_control_that_is_all_check_points_is_no_datum(tmp_path: Path) -> None:
     assert read_survey(some).control is not None
 
 
+@pytest.mark.parametrize("checked", [True, False])
+def test_a_control_point_with_one_ray_is_named_once(tmp_path: Path, checked: bool) -> None:
+    lines = [line for line in lines_of() if not line.endswith("checked") or "photo_2" in line]
+    more = ('check = ["checked"]\n' if checked else "") + '[datum]\nkind = "control"\n'
+    path = survey_with(tmp_path / "once", "gcp_list.txt", "\n".join(["WGS84 UTM 33N", *lines]), more)
+    result = run_survey(read_survey(path))
+    (said,) = [one for one in result.verdict.remarks if "checked" in one.text]
+    assert said.kind == "points_not_determined" and result.verdict.level == "good"
+    assert ("check point without a check" in said.text) == checked
+    assert not len(result.check_points) or checked
+
+
 def test_names_of_photographs_may_have_spaces_and_points_none(tmp_path: Path) -> None:
     """A point without a name is where its coordinates are, whatever their digits."""
     lines = [

@@ -408,7 +408,7 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
     missing = [
         (*one.names("of"), *one.names("names"))
-        for one in datum_remarks(read_survey(path), network, has_scale=True)
+        for one in datum_remarks(read_survey(path), network, network.points, has_scale=True)
     ]
     assert missing == [("control", "elsewhere"), ("bars", "a - lost")]
     assert estimate.oriented.tolist() == [False, True]

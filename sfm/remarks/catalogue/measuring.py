@@ -11,7 +11,8 @@ POINTS = (
         "[[{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "determine {points:it|them}: {points}]][[It has {rays:ray}; {needed} are needed]][[Fewer than "
         "{least} of its {measured} rays are from photographs in the result]][[Its {parallel} rays are "
-        "parallel within their precision]].",
+        "parallel within their precision]]."
+        "[[ {checks} {checks:is a check point|are check points} without a check.]]",
         "a point is in fewer photographs than it needs, is far away, or they were taken from one place",
         "Add photographs from other positions, if you need the point.",
     ),
@@ -20,7 +21,8 @@ POINTS = (
         "warning",
         "[[{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "meet: {points}]][[Its {rays} rays do not meet in front of their photographs]][[{accepted} of its "
-        "{measured} rays {accepted:was|were} accepted; {needed} are needed]].",
+        "{measured} rays {accepted:was|were} accepted; {needed} are needed]]."
+        "[[ {checks} {checks:is a check point|are check points} without a check.]]",
         "a point moved, was misidentified in a photograph, or its rays are almost parallel",
         "Correct the image points for the reason that left_out.csv states, or do without the point.",
     ),

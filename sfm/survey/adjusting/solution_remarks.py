@@ -6,8 +6,9 @@ to a false minimum with a small standard deviation. Only a comparison with its s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -49,11 +50,11 @@ def remarks_on_solution(
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     return (
         *adjustment.remarks,
-        *remarks_on_left_out(left_out, whole),
+        *remarks_on_left_out(left_out, whole, _check_points(survey)),
         *([remark("names_missing", of="datum", names=absent)] if absent else []),
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
-        *datum_remarks(survey, adjustment.network, has_scale=adjustment.has_scale),
+        *datum_remarks(survey, adjustment.network, whole.points, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
         *weak_scale(adjustment),
         *scale_alone(adjustment),
@@ -151,7 +152,9 @@ def scale_alone(a: Adjustment) -> tuple[Remark, ...]:
     return (remark("scale_unchecked", given=sources[0]),) if len(sources) == 1 else ()
 
 
-def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple[Remark, ...]:
+def datum_remarks(
+    survey: Survey, network: Network, measured: Collection[str], *, has_scale: bool
+) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
 
     Points of a plate may be out of view, so not all of them are expected in the result.
@@ -159,11 +162,12 @@ def datum_remarks(survey: Survey, network: Network, *, has_scale: bool) -> tuple
     Args:
         survey: states control, scale bars and targets.
         network: network of the result.
+        measured: names of all measured points; those that are not in the result have their own remarks.
         has_scale: whether anything gives the network a scale.
     """
     remarks, known = [], set(network.points)
     plate = is_plate_control(survey.control, plate_control(survey.targets))
-    control = [name for name in survey.control.names if name not in known] if survey.control else []
+    control = [name for name in survey.control.names if name not in measured] if survey.control else []
     if control and not plate:
         remarks.append(remark("names_missing", of="control", names=control))
     if survey.targets.pitch_assumed and survey.targets.pitch is not None:
@@ -222,13 +226,23 @@ def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) ->
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
-def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> tuple[Remark, ...]:
+def _check_points(survey: Survey) -> frozenset[str]:
+    control = survey.control
+    if control is None or control.check is None:
+        return frozenset()
+    return frozenset(compress(control.names, control.check.any(axis=1)))
+
+
+def remarks_on_left_out(
+    left_out: tuple[LeftOutPoint, ...], whole: Network, checks: Collection[str] = ()
+) -> tuple[Remark, ...]:
     """Return the remarks on points that are not in the result: contradicted, or only not determined.
 
     Args:
         left_out: measured points that are not in the result, with the reason.
         whole: network of all measured points. A person can correct those that keep their names; those of
             natural texture are a test.
+        checks: names of check points.
     """
     texture = whole.automatic_points
     automatic = [point for point in left_out if point.point in texture]
@@ -240,7 +254,16 @@ def remarks_on_left_out(left_out: tuple[LeftOutPoint, ...], whole: Network) -> t
     measured = len(whole.points)
     return (
         *([remark("points_left_out", points=len(automatic), measured=measured)] if automatic else []),
-        *(remark(kind, points=names, measured=measured) for kind, names in groups.items() if names),
+        *(
+            remark(
+                kind,
+                points=names,
+                measured=measured,
+                checks=[name for name in names if name in checks] or None,
+            )
+            for kind, names in groups.items()
+            if names
+        ),
     )
 
 

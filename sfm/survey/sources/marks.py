@@ -52,7 +52,7 @@ from sfm.survey.measuring.surface_points import masked_pixels
 from sfm.survey.measuring.templates import NONE, TemplateRays, TemplateScene, match_templates
 from sfm.survey.measuring.tie_points import drawn_windows
 from sfm.survey.orientation import Oriented
-from sfm.survey.sources.given import full_names, read_tables
+from sfm.survey.sources.given import read_tables
 from sfm.survey.sources.source import Correspondences, SurveySource
 
 EARLIER = "earlier"  # name of a photograph of an earlier epoch, which takes no part in the network
@@ -68,17 +68,10 @@ def measure_marks(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
         files: its photographs.
 
     Raises:
-        SurveyFileError: the photograph of a named point does not exist, or shows less than its place.
+        SurveyFileError: the photograph of a named point shows less than its place.
         PhotographError: photographs of different sizes have the same camera.
     """
-    known = _names_of(files)
-    here = [mark for mark in survey.marks if mark.image in known]
-    for mark in survey.marks:
-        if mark.image not in known and not _path_of(survey, mark).is_file():
-            raise SurveyFileError(
-                f"{survey.source}: point '{mark.name}' is named in '{mark.image}', which is neither a "
-                "photograph of the survey nor a file of an earlier epoch"
-            )
+    here = [mark for mark in survey.marks if mark.image in files.names]
     if not here:
         nothing = ImagePoints(NONE, NONE, np.zeros((0, 2)), np.zeros((0, 2, 2)))
         return Measurements(Network((), NONE, (), nothing), (), (), NONE)
@@ -90,11 +83,6 @@ def measure_marks(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
     )
     table = replace(table, table=replace(table.table, path=Path(f"{survey.source}: [[point]]")))
     return read_tables(survey, (table,), files)
-
-
-def _names_of(files: PhotographList | None) -> frozenset[str]:
-    """Return the names of photographs, with folders and without."""
-    return frozenset() if files is None else frozenset({*files.names, *full_names(files)})
 
 
 def _path_of(survey: Survey, mark: PointSettings) -> Path:
@@ -114,8 +102,7 @@ def match_marks(
         jobs: number of photographs processed in parallel.
 
     Raises:
-        SurveyFileError: a named point has the name of a target, or its place is outside a photograph of an
-            earlier epoch.
+        SurveyFileError: a named point has the name of a target.
         PhotographError: a photograph of an earlier epoch cannot be read.
     """
     survey, whole, part = oriented.survey, oriented.measured.network, measured.network
