@@ -166,6 +166,17 @@ def test_a_control_point_with_one_ray_is_named_once(tmp_path: Path, checked: boo
     assert not len(result.check_points) or checked
 
 
+@pytest.mark.parametrize("control", [1, 2])
+def test_too_little_control_for_a_scale_is_stated(tmp_path: Path, control: int) -> None:
+    check = json.dumps(["north", "south", "east", "west", "checked", "flat"][control - 1 :])
+    text = "\n".join(["WGS84 UTM 33N", *lines_of()])
+    result = run_survey(
+        read_survey(survey_with(tmp_path / "few", "gcp_list.txt", text, f"check = {check}\n"))
+    )
+    said = [one for one in result.verdict.remarks if one.kind == "scale_undefined"]
+    assert [one.number("control") for one in said] == [1] * (control == 1)
+
+
 def test_names_of_photographs_may_have_spaces_and_points_none(tmp_path: Path) -> None:
     """A point without a name is where its coordinates are, whatever their digits."""
     lines = [

@@ -16,7 +16,8 @@ DATUM = (
     Kind(
         "scale_undefined",
         "note",
-        "The scale is undefined: lengths are not in {unit}.",
+        "The scale is undefined: lengths are not in {unit}[[; {control:control point} of the {needed} that "
+        "give it {control:is|are} used]].",
         "photographs alone have no scale",
         "Measure a scale bar or control.",
     ),

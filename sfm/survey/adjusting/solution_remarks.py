@@ -176,7 +176,8 @@ def datum_remarks(
     if bars:
         remarks.append(remark("names_missing", of="bars", names=bars))
     if not has_scale:
-        remarks.append(remark("scale_undefined", unit=survey.unit))
+        seen = None if survey.control is None else len(network.control)
+        remarks.append(remark("scale_undefined", unit=survey.unit, control=seen, needed=2))
     return tuple(remarks)
 
 
