@@ -20,7 +20,7 @@ from sfm.errors import KolinearError, MissingLibraryError
 from sfm.judgement.verdict import judge_survey
 from sfm.network import Estimate, Network
 from sfm.remarks.remark import Remark, remark
-from sfm.result import CheckPoint, FailedImage, SeenPlate, StageTime, SurveyResult
+from sfm.result import CheckPoint, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
@@ -48,15 +48,11 @@ def assemble_result(
     survey, measured, start = oriented.survey, oriented.measured, oriented.orientation
     adjustment, naming = solution.adjustment, matched.naming
     is_in = set(adjustment.network.images)  # a failed photograph may fit later with a per-photograph camera
-    files = measured.images if measured.files is None else measured.files.names
     reasons: dict[str, Remark] = {}  # of a photograph placed by its rig: that of its orientation
     for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
         if name not in is_in:
-            here = name in files
-            reasons.setdefault(
-                name, reason if here else remark("photographs_without_file", photographs=[name])
-            )
-    failed = (*measured.failed, *(FailedImage(*one) for one in reasons.items()))
+            reasons.setdefault(name, reason)
+    failed = (*measured.failed, *(measured.not_in_result(*one) for one in reasons.items()))
     before = (*measured.left_out, *matched.left_out_image_points)
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)

@@ -99,7 +99,7 @@ def unfinished_survey(
         stage=clock.last,
         seconds=tuple(StageTime(*one) for one in clock.seconds),
         images=measured.images,
-        failed=(*measured.failed, *(FailedImage(*one) for one in (*reasons, *left_out))),
+        failed=(*measured.failed, *(measured.not_in_result(*one) for one in (*reasons, *left_out))),
         network=network,
         oriented=None if estimate is None else estimate.oriented,
         determined=None if estimate is None else estimate.determined,

@@ -321,6 +321,11 @@ def test_covariances_of_control_are_weights(tmp_path: Path) -> None:
             tmp_path / "control.csv",
             "id,X,Y,Z,sX,sY,sZ,cXY,cXZ,cYZ\n1,0,0,0,0.1,0.2,0.1,0.03,,\n2,1,1,1,0.1,0.1,0.1,,,\n",
         )
+    with pytest.raises(SurveyFileError, match=r"control.csv: control point 1: .* a positive definite matrix"):
+        _control(
+            tmp_path / "control.csv",
+            "id,X,Y,Z,sX,sY,sZ,cXY,cXZ,cYZ\n1,0,0,0,1,1,1,0.9,0.9,-0.9\n2,9,9,9,1,1,1,,,\n",
+        )
 
 
 @pytest.mark.parametrize(("unit", "expected"), [("px", 0.005), ("mm", -0.005)])

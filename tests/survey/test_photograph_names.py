@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -74,6 +75,29 @@ def test_a_mark_and_a_start_value_name_photographs_too(tmp_path: Path) -> None:
     survey = replace(survey, start_orientations=twice)
     with pytest.raises(SurveyFileError, match=r"row 2: image 'one/a.png' is on row 1 already"):
         name_photographs(survey, find_photographs(survey))
+
+
+@pytest.mark.parametrize(
+    ("image", "x", "message"),
+    [
+        ("first.tif", 3.0, "neither a photograph of the survey nor a file of an earlier epoch"),
+        ("first.bmp", 8.0, r"point 'p' is at 8, 2 px, outside first.bmp of 8 x 6 px"),
+        ("first.bmp", 7.0, None),
+        ("../first.bmp", 7.0, "leaves the survey's folder"),
+    ],
+)
+def test_the_place_of_an_earlier_epoch_is_checked_before_measuring(
+    tmp_path: Path, image: str, x: float, message: str | None
+) -> None:
+    survey = replace(survey_of(tmp_path, ["a.png"]), allow_outside=False)
+    cv2.imwrite(str(tmp_path / "first.bmp"), np.zeros((6, 8), np.uint8))
+    survey = replace(survey, marks=(PointSettings(name="p", image=image, x_px=x, y_px=2.0),))
+    files = find_photographs(survey)
+    if message is None:
+        assert name_photographs(survey, files).survey.marks == survey.marks
+        return
+    with pytest.raises(SurveyFileError, match=message):
+        name_photographs(survey, files)
 
 
 def test_ground_control_of_a_whole_flight_serves_a_part_of_it(tmp_path: Path) -> None:

@@ -314,11 +314,11 @@ def known_points(table: CsvTable, covariances: int = 0) -> KnownPoints:
     check = np.nan_to_num(check) if check.size else np.zeros_like(xyz)
     table.refuse(check, (check != 0) & (check != 1), CHECKS, "0, 1 or nothing")
     table.refuse(check, (check == 1) & unknown, CHECKS, "0 or nothing for a coordinate that is not known")
-    return KnownPoints(
-        table.keys("id"),
-        *(xyz, sigma, _covariances(table, sigma, mixed)),
-        check == 1 if check.any() else None,
-    )
+    names, mixed_or_none = table.keys("id"), _covariances(table, sigma, mixed)
+    try:
+        return KnownPoints(names, xyz, sigma, mixed_or_none, check == 1 if check.any() else None)
+    except SurveyFileError as error:
+        raise SurveyFileError(f"{table.path}: {error}") from None
 
 
 def _covariances(table: CsvTable, sigma: FloatArray, given: FloatArray) -> FloatArray | None:

@@ -18,7 +18,7 @@ from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.network import Network
 from sfm.photographs.exif import Metadata, read_metadata
-from sfm.remarks.remark import Remark
+from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
@@ -129,6 +129,17 @@ class Measurements:
     remarks: tuple[Remark, ...] = ()  # on the given and measured values
     left_out: tuple[LeftOutPoint, ...] = ()  # image points that contradict one another
     parts: tuple[Measurements, ...] = ()  # of each source; empty with one source
+
+    def not_in_result(self, image: str, reason: Remark) -> FailedImage:
+        """Return a photograph that is not in the result; one without a file is not missed for any reason.
+
+        Args:
+            image: name of the photograph.
+            reason: what a photograph with a file lacks.
+        """
+        if self.files is not None and image not in self.files.names:
+            reason = remark("photographs_without_file", photographs=[image])
+        return FailedImage(image, reason)
 
 
 def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:

@@ -22,11 +22,13 @@ import numpy as np
 
 from sfm.display import listed
 from sfm.errors import SurveyFileError
+from sfm.photographs.exif import read_metadata
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.cameras import cameras_of_image
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import Observations, StartOrientations
 from sfm.survey.inputs.measurements import PhotographList
+from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import tables_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import path_inside
@@ -65,21 +67,16 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
 
     Raises:
         SurveyFileError: no photograph of a table is one of the survey, a table of orientations names one
-            twice, or that of a named point is neither here nor a file of an earlier epoch.
+            twice, or that of a named point is neither here nor a file of an earlier epoch, or does not show
+            its place.
+        PhotographError: a photograph of an earlier epoch cannot be read.
     """
     name_of = _names_by_text(files, survey.folder)
     marks = tuple(mark.model_copy(update={"image": name_of(mark.image)}) for mark in survey.marks)
     known = frozenset(files.names)
     for mark in marks:
-        allowed = {"allow_outside": survey.allow_outside}
-        if (
-            mark.image not in known
-            and not path_inside(survey.folder, mark.image, survey.source, **allowed).is_file()
-        ):
-            raise SurveyFileError(
-                f"{survey.source}: point '{mark.name}' is named in '{mark.image}', which is neither a "
-                "photograph of the survey nor a file of an earlier epoch"
-            )
+        if mark.image not in known:
+            _refuse_no_template(mark, survey)
     given = tables_of(survey.observations)
     named = [replace(table, image=tuple(map(name_of, table.image))) for table in given]
     without_file = dict.fromkeys(name for table in named for name in table.image if name not in known)
@@ -97,6 +94,22 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
     unmarked = dict.fromkeys(name for table in given for name in table.point if name not in marked)
     said = remark("photographs_without_file", photographs=without_file, points=unmarked or None)
     return NamedPhotographs(survey, frozenset(unmarked), (said,))
+
+
+def _refuse_no_template(mark: PointSettings, survey: Survey) -> None:
+    """Raise SurveyFileError unless a mark is in a photograph of an earlier epoch."""
+    path = path_inside(survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside)
+    if not path.is_file():
+        raise SurveyFileError(
+            f"{survey.source}: point '{mark.name}' is named in '{mark.image}', which is neither a "
+            "photograph of the survey nor a file of an earlier epoch"
+        )
+    width, height = read_metadata(path).size_px
+    if not (0 <= mark.x_px < width and 0 <= mark.y_px < height):
+        raise SurveyFileError(
+            f"{survey.source}: point '{mark.name}' is at {mark.x_px:g}, {mark.y_px:g} px, outside "
+            f"{mark.image} of {width} x {height} px"
+        )
 
 
 def _of_survey(table: Observations, survey: Survey, files: PhotographList) -> Observations:
