@@ -231,7 +231,7 @@ def _check_points(survey: Survey) -> frozenset[str]:
     control = survey.control
     if control is None or control.check is None:
         return frozenset()
-    return frozenset(compress(control.names, control.check.any(axis=1)))
+    return frozenset(compress(control.names, control.check.any(axis=1).tolist()))
 
 
 def remarks_on_left_out(

@@ -35,8 +35,8 @@ from sfm.survey.drafting.camera_groups import (
 from sfm.survey.drafting.camera_names import IN_ORDER
 from sfm.survey.drafting.camera_times import USUAL_S
 from sfm.survey.drafting.lens_models import with_lens_models
-from sfm.survey.drafting.ringed_dots import picture_of_rings
-from sfm.survey.drafting.target_trial import MIN_REPEATED, MIN_TARGETS, TargetTrial, try_targets
+from sfm.survey.drafting.ringed_dots import MIN_REPEATED, picture_of_rings
+from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
