@@ -177,6 +177,19 @@ def test_too_little_control_for_a_scale_is_stated(tmp_path: Path, control: int) 
     assert [one.number("control") for one in said] == [1] * (control == 1)
 
 
+def test_exchanged_coordinates_are_refused_before_measuring(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "sfm.survey.target_network.measure_photographs", lambda *a, **k: pytest.fail("measured")
+    )
+    rows = [line.split() for line in lines_of()]
+    lines = [" ".join([*row[:3], row[4], row[3], *row[5:]]) for row in rows]
+    path = survey_with(tmp_path / "exchanged", "gcp_list.txt", "\n".join(["WGS84 UTM 33N", *lines]))
+    with pytest.raises(SurveyFileError, match=r"gcp_list.txt, line \d+: .* with x and y exchanged"):
+        run_survey(read_survey(path))
+
+
 def test_names_of_photographs_may_have_spaces_and_points_none(tmp_path: Path) -> None:
     """A point without a name is where its coordinates are, whatever their digits."""
     lines = [
