@@ -280,9 +280,16 @@ def standard_deviations(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.where(diagonal >= 0, diagonal, np.nan)))
 
 
-def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
-    """Return the coordinates that check a datum of control, with the test of their differences."""
+def check_coordinates(result: SurveyResult, *, placed: bool = False) -> tuple[ControlCoordinate, ...]:
+    """Return the coordinates that check a datum of control, with the test of their differences.
+
+    Args:
+        result: result of a survey.
+        placed: whether to return those that check a network placed on its control, too; their standard
+            deviations do not include those of the placing.
+    """
     a = result.adjustment
+    compared = a.datum == "control" or (placed and result.control_check is not None)
     index_of = {name: j for j, name in enumerate(a.network.points)}
     posterior = standard_deviations(a.covariance.points)
     points = a.estimate.points
@@ -290,7 +297,7 @@ def check_coordinates(result: SurveyResult) -> tuple[ControlCoordinate, ...]:
         compare_coordinate(
             one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given
         )
-        for one in (result.check_points if a.datum == "control" else ())
+        for one in (result.check_points if compared else ())
         if (j := index_of.get(one.point)) is not None
         for c, given in enumerate(one.xyz)
         if np.isfinite(given)

@@ -74,7 +74,11 @@ def protocol_of(result: SurveyResult, given: Given) -> Protocol:
             *_groups(a, "point", seen.point, a.network.points, seen.image, a.network.images),
         ),
         limits=_limits(result),
-        control=(*_control(a, given), *_checked(a, result.control_check), *check_coordinates(result)),
+        control=(
+            *_control(a, given),
+            *_checked(a, result.control_check),
+            *check_coordinates(result, placed=True),
+        ),
         lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
         cumulative=_cumulative(a),
     )

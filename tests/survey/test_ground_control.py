@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sfm.api import write_result
 from sfm.camera import project
 from sfm.errors import SurveyFileError
 from sfm.photographs.exif import LocalSystem
@@ -188,6 +190,21 @@ def test_exchanged_coordinates_are_refused_before_measuring(
     path = survey_with(tmp_path / "exchanged", "gcp_list.txt", "\n".join(["WGS84 UTM 33N", *lines]))
     with pytest.raises(SurveyFileError, match=r"gcp_list.txt, line \d+: .* with x and y exchanged"):
         run_survey(read_survey(path))
+
+
+def test_check_points_are_compared_in_every_datum(tmp_path: Path) -> None:
+    text = "\n".join(["WGS84 UTM 33N", *lines_of()])
+    more = 'check = ["checked"]\n'
+    for kind in ("control", "free"):
+        path = survey_with(tmp_path / kind, "gcp_list.txt", text, f'{more}[datum]\nkind = "{kind}"\n')
+        write_result(run_survey(read_survey(path)), tmp_path / kind / "out")
+        with (tmp_path / kind / "out" / "control_points.csv").open(encoding="utf-8") as table:
+            rows = [row for row in csv.DictReader(table) if row["point"] == "checked"]
+        assert [(row["use"], row["coordinate"]) for row in rows] == [("check", axis) for axis in "XYZ"]
+        difference = np.array([float(row["difference"]) for row in rows])
+        assert np.abs(difference).max() < 5e-4
+        sigma = np.array([float(row["sigma_posterior"]) for row in rows])
+        assert (np.abs(difference) < 5 * np.hypot(sigma, 1e-4)).all()
 
 
 def test_names_of_photographs_may_have_spaces_and_points_none(tmp_path: Path) -> None:
