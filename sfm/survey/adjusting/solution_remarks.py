@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
@@ -231,7 +230,7 @@ def _check_points(survey: Survey) -> frozenset[str]:
     control = survey.control
     if control is None or control.check is None:
         return frozenset()
-    return frozenset(compress(control.names, control.check.any(axis=1).tolist()))
+    return frozenset(name for name, axes in zip(control.names, control.check, strict=True) if axes.any())
 
 
 def remarks_on_left_out(
