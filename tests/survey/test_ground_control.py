@@ -146,13 +146,14 @@ def test_degrees_that_cannot_be_are_refused(tmp_path: Path, content: dict[str, f
         read_survey(path)
 
 
-def test_control_that_is_all_check_points_is_no_datum(tmp_path: Path) -> None:
+@pytest.mark.parametrize("datum", ["control", "free"])
+def test_control_that_is_all_check_points_places_nothing(tmp_path: Path, datum: str) -> None:
     text = "\n".join(["WGS84 UTM 33N", *lines_of()])
-    names, datum = json.dumps(list(PLACES)), '[datum]\nkind = "control"\n'
-    path = survey_with(tmp_path / "all", "gcp_list.txt", text, f"check = {names}\n{datum}")
-    with pytest.raises(SurveyFileError, match="all 7 control points are check points, and datum kind"):
+    more = f'[datum]\nkind = "{datum}"\n'
+    path = survey_with(tmp_path / "all", "gcp_list.txt", text, f"check = {json.dumps(list(PLACES))}\n{more}")
+    with pytest.raises(SurveyFileError, match="all 7 control points are check points, needed some that"):
         read_survey(path)
-    some = survey_with(tmp_path / "some", "gcp_list.txt", text, f'check = ["top", "flat"]\n{datum}')
+    some = survey_with(tmp_path / "some", "gcp_list.txt", text, f'check = ["top", "flat"]\n{more}')
     assert read_survey(some).control is not None
 
 

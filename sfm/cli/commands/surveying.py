@@ -240,6 +240,7 @@ def _run_survey(
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
+        from sfm.survey.inputs.photograph_names import name_photographs
         from sfm.survey.inputs.sources import reads_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
@@ -281,7 +282,8 @@ def _run_survey(
     if not overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
     if from_photographs:
-        find_photographs(survey, images_dir=images)  # a wrong folder is reported before anything is compiled
+        files = find_photographs(survey, images_dir=images)
+        name_photographs(survey, files)  # wrong folders and names are reported before anything is compiled
     compile_first()
     jobs = jobs or cores()
     workers, store = 1, None
