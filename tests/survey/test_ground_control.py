@@ -117,7 +117,7 @@ def test_ground_control_by_latitude_and_longitude_is_local(tmp_path: Path) -> No
         ("WGS84\n1 NaN 3 4 5 a.png\n", "line 2: found NaN"),
         ("WGS84\n1 2 3 4 5 a.png p\n1 2 4 4 5 b.png p\n", "line 3: point 'p' has other coordinates"),
         ("WGS84\n13.4 97.5 3 4 5 a.png\n", "line 2: latitude 97.5, needed -90 to 90 degrees"),
-        ("\n# by hand\nEPSG:4326\n190 52.5 3 4 5 a.png\n", "line 4: longitude 190, needed -180 to 180"),
+        ("\n  # by hand\nEPSG:4326\n190 52.5 3 4 5 a.png\n", "line 4: longitude 190, needed -180 to 180"),
         ("WGS84\n1 2_0 3 4 5 a.png\n", "line 2: found '2_0', expected a number"),
         ("WGS84 UTM 33N\n\n1 2 1e300 4 5 a.png\n", r"gcp_list.txt, line 3: column Z contains 1e\+300"),
         ("WGS84 UTM 33N\n1 2 3 4 5 a.png p\n1 2 3 4 5 \x00 p\n", "gcp_list.txt, line 3: image contains"),

@@ -12,9 +12,9 @@ import pytest
 from sfm.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
-from sfm.survey.inputs.given import Observations, StartOrientations
+from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.measurements import find_photographs
-from sfm.survey.inputs.photograph_names import name_photographs
+from sfm.survey.inputs.photograph_names import NamedPhotographs, name_photographs
 from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from tests.survey.test_ground_control import lines_of, survey_with
@@ -119,6 +119,23 @@ def test_ground_control_of_a_whole_flight_serves_a_part_of_it(tmp_path: Path) ->
     assert said.kind == "photographs_without_file" and len(said.subjects["photographs"]) == 12
     assert "; far is marked in no other" in said.text
     assert flight.images_total == 6 and flight.failed == ()
+
+
+def test_control_that_is_marked_nowhere_here_is_left_out_unless_it_is_measured(tmp_path: Path) -> None:
+    xyz, check = np.eye(3), np.array([[True] * 3, [False] * 3, [False] * 3])
+    control = replace(KnownPoints.from_arrays(["a", "b", "c"], xyz), check=check)
+    survey = replace(survey_of(tmp_path, ["a.png"]), control=control)
+    for unmarked, measured, kept in (
+        ("", "", "abc"),
+        ("b", "ac", "ac"),
+        ("ab", "b", "bc"),
+        ("abc", "", "abc"),  # nothing would be left
+        ("bc", "a", "abc"),  # a check point alone
+    ):
+        named = NamedPhotographs(survey, frozenset(unmarked))
+        left = named.without_unmarked(survey, tuple(measured)).control
+        assert left is not None and left.names == tuple(kept)
+        assert left.check is not None and left.check.any(axis=1).tolist() == [name == "a" for name in kept]
 
 
 def test_ground_control_of_other_photographs_is_refused_before_measuring(tmp_path: Path) -> None:

@@ -134,7 +134,7 @@ def _read_gcp_list(path: Path) -> _Rows:
         lines = path.read_text("utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise SurveyFileError(f"{path}: not a readable text file: {error}") from None
-    stated = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    stated = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and line.split()[0][0] != "#"]
     first, projection = stated[0] if stated else (1, "")
     projection = projection.strip()
     if not (GEOGRAPHIC.fullmatch(projection) or UTM.fullmatch(projection)):

@@ -54,8 +54,8 @@ class NamedPhotographs:
         lost = self.unmarked.difference(points)
         if survey.control is None or not lost:
             return survey
-        kept = np.array([name not in lost for name in survey.control.names])
-        return replace(survey, control=survey.control.select(kept)) if kept.any() else survey
+        kept = survey.control.select(np.array([name not in lost for name in survey.control.names]))
+        return survey if not kept.names or kept.only_checks else replace(survey, control=kept)
 
 
 def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
