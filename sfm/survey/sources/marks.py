@@ -276,20 +276,12 @@ def _scene_with(
     survey: Survey, scene: TemplateScene, mark: PointSettings, files: PhotographList
 ) -> tuple[TemplateScene, int] | None:
     """Return the scene with the photograph of a mark, and which it is; None if it is not oriented."""
-    if mark.image in _names_of(files):
-        name = full_names(files).get(mark.image, mark.image)
-        oriented = name in scene.network.images and scene.estimate.oriented[scene.network.images.index(name)]
-        return (scene, scene.network.images.index(name)) if oriented else None
-    photograph = grey_of(read_photograph(_path_of(survey, mark)))
-    height, width = photograph.shape
-    for other in survey.marks:
-        if other.image == mark.image and not (0 <= other.x_px < width and 0 <= other.y_px < height):
-            raise SurveyFileError(
-                f"{survey.source}: point '{other.name}' is at {other.x_px:g}, {other.y_px:g} px, outside "
-                f"{other.image} of {width} x {height} px"
-            )
-    with_earlier = _with_earlier(scene, photograph)
-    return None if with_earlier is None else (with_earlier, with_earlier.earlier)
+    if mark.image not in files.names:
+        with_earlier = _with_earlier(scene, grey_of(read_photograph(_path_of(survey, mark))))
+        return None if with_earlier is None else (with_earlier, with_earlier.earlier)
+    images = scene.network.images
+    i = images.index(mark.image) if mark.image in images else -1
+    return (scene, i) if i >= 0 and scene.estimate.oriented[i] else None
 
 
 def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene | None:
