@@ -114,7 +114,7 @@ def match_templates(
         along = _along_rays(scene, i, xy[lost], normal[lost], neighbours, side_px)
         points = np.vstack([known[lost], on_surface[lost], *along])
         template = np.concatenate([lost, lost, np.repeat(lost, [len(some) for some in along])])
-        finite = np.isfinite(points).all(axis=1)
+        finite = np.asarray(np.isfinite(points).all(axis=1))
         if not finite.any():
             continue
         candidates = _Candidates(template, np.arange(len(template)) < len(lost), points).select(finite)
