@@ -148,7 +148,7 @@ def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -
     """Measure a photograph for each source of the survey, and store what is found."""
     counts, stored = dict[str, int](), True
     for _, source in sources_of(survey):
-        of_source, was_stored = source.count(survey, path, store)
+        of_source, was_stored = source.count(survey, image, path, store)
         counts, stored = counts | of_source, stored and was_stored
     return PhotographNote(image, counts, stored=stored)
 

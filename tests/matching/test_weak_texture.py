@@ -79,3 +79,26 @@ def test_an_object_of_a_tenth_of_the_contrast_is_oriented(tmp_path: Path) -> Non
     write_scene(tmp_path, scene, rng)
     found = outcome_of(tmp_path, scene)
     assert found.oriented == len(scene.position) and not found.is_wrong and found.level in ("good", "fair")
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"), [(slice(150, 320), slice(200, 420)), (slice(0, 400), slice(300, 600))]
+)
+def test_what_is_masked_has_no_features_and_changes_no_others(rows: slice, columns: slice) -> None:
+    photograph = _texture(30.0, 1.0)
+    hidden = np.ones(photograph.shape, dtype=bool)
+    hidden[rows, columns] = False
+    whole = natural_points(photograph, max_features=20_000, noise=1 / 255)
+    found = natural_points(photograph, max_features=20_000, noise=1 / 255, hidden=hidden)
+    for xy in (found.xy, found.corners):
+        column, row = np.rint(xy).astype(int).T
+        assert len(xy) > 50 and not hidden[row, column].any()
+    column, row = np.rint(whole.xy).astype(int).T
+    there = {tuple(xy) for xy in whole.xy[~hidden[row, column] & (whole.scale < 16)].round(2).tolist()}
+    same = there & {tuple(xy) for xy in found.xy.round(2).tolist()}
+    assert len(same) > 0.99 * len(there)
+    few = natural_points(photograph, max_features=400, noise=1 / 255, hidden=hidden)
+    assert len(few) == round(400 * (1 - hidden.mean()))
+    hidden[:] = True
+    none = natural_points(photograph, hidden=hidden)
+    assert len(none) == 0 and len(none.corners) == 0

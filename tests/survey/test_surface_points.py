@@ -90,9 +90,9 @@ def test_photographs_with_few_tie_points_are_searched_for_more_features(
     asked = []
     monkeypatch.setattr(tie_points, "SCARCE_TIE_POINTS", 1000)  # those of this scene are fewer
 
-    def found(path: Path, settings: TiePointSettings, *args: object, **rest: object) -> object:
+    def found(path: Path, name: str, settings: TiePointSettings, *args: object, **rest: object) -> object:
         asked.append(settings.max_features)
-        return natural_points_of(path, settings, *args, **rest)
+        return natural_points_of(path, name, settings, *args, **rest)
 
     monkeypatch.setattr(tie_points, "natural_points_of", found)
     tied = tie_points.tie_photographs(survey, measured.files)

@@ -47,6 +47,7 @@ ROUNDING_8 = 1 / FULL_SCALE_8 / np.sqrt(12)  # standard deviation of rounding to
 # matching, which measures in the photograph itself. If too few are found, a finer image is used.
 MAX_SIDE_PX = 1600
 BLOCK = 256  # descriptors of one photograph compared with all of another at a time
+MARGIN_PX = 64  # around what is not masked, in which descriptors reach
 CELLS = 12  # along the longer side of a photograph: each cell receives its share of the features
 
 
@@ -63,23 +64,34 @@ class Features:
         return len(self.xy)
 
 
-def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: float | None = None) -> Features:
+def sift_features(
+    photograph: AnyArray,
+    *,
+    max_features: int = 2000,
+    noise: float | None = None,
+    hidden: BoolArray | None = None,
+) -> Features:
     """Return SIFT features with root-normalised descriptors, spread over the photograph.
 
     Args:
         photograph: (H, W), 8 or 16 bit, grey or colour.
-        max_features: if there are more, every cell of a raster keeps its strongest.
+        max_features: if there are more, every cell of a raster keeps its strongest. What is masked takes its
+            share with it.
         noise: standard deviation of its noise over the full scale; with fewer features than `max_features`
             their smallest contrast sinks to what noise alone would have. Not below MIN_CONTRAST if None.
+        hidden: masked pixels, which have no features, (H, W); only the part around all others is searched.
 
     Source: Lowe (2004), IJCV 60(2); Arandjelovic and Zisserman (2012), CVPR (square roots).
     """
-    eight_bit = photograph
-    if photograph.ndim > 2 or photograph.dtype != np.uint8:
-        eight_bit = np.rint(np.clip(grey_of_8_bit(photograph), 0, FULL_SCALE_8)).astype(np.uint8)
     shrink = 2
-    while max(eight_bit.shape) > shrink * MAX_SIDE_PX:
+    while max(photograph.shape[:2]) > shrink * MAX_SIDE_PX:
         shrink *= 2
+    shown = shown_part(hidden, photograph.shape)
+    if hidden is not None:
+        max_features = round(max_features * (1 - float(hidden.mean())))
+    eight_bit = photograph[shown]
+    if photograph.ndim > 2 or photograph.dtype != np.uint8:
+        eight_bit = np.rint(np.clip(grey_of_8_bit(eight_bit), 0, FULL_SCALE_8)).astype(np.uint8)
     least = MIN_CONTRAST if noise is None else NOISE_CONTRAST * float(np.hypot(noise, ROUNDING_8))
     while True:
         contrast = min(MIN_CONTRAST, least) if shrink == 1 else MIN_CONTRAST
@@ -89,6 +101,11 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: floa
         whole = eight_bit[: height * shrink, : width * shrink]
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
+        if hidden is not None:
+            column, row = (
+                np.rint(shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5).astype(int).T
+            )
+            points = [points[k] for k in np.flatnonzero(~hidden[shown][row, column]).tolist()]
         if len(points) >= max_features or shrink == 1:
             break
         shrink //= 2
@@ -103,11 +120,31 @@ def sift_features(photograph: AnyArray, *, max_features: int = 2000, noise: floa
     norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     return Features(
-        shrink * (xy + 0.5) - 0.5,
+        shrink * (xy + 0.5) - 0.5 + (shown[1].start, shown[0].start),
         shrink * np.array([p.size for p in points], dtype=float),
         np.radians([p.angle for p in points]),
         np.sqrt(descriptor / norm),
     )
+
+
+def shown_part(hidden: BoolArray | None, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return rows and columns of the part of a photograph around all that is not masked.
+
+    It is wider by MARGIN_PX, and begins at a multiple of it, where the reduced images of the whole photograph
+    have a pixel too.
+
+    Args:
+        hidden: masked pixels, (H, W); None if none are.
+        shape: shape of the photograph, (H, W, ...).
+    """
+    parts = []
+    for axis in range(2):
+        there = np.arange(shape[axis]) if hidden is None else np.flatnonzero(~hidden.all(axis=1 - axis))
+        first, last = (there[0], there[-1]) if len(there) else (0, 0)
+        parts.append(
+            slice(max(0, first // MARGIN_PX - 1) * MARGIN_PX, min(shape[axis], last + 1 + MARGIN_PX))
+        )
+    return parts[0], parts[1]
 
 
 def _least_contrast(response: AnyArray, most: int, least: float) -> IntArray:

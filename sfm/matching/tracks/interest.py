@@ -18,7 +18,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import grey_of, odd_window
-from sfm.matching.tracks.features import Features, sift_features
+from sfm.matching.tracks.features import Features, shown_part, sift_features
 
 DETECTORS = ("foerstner", "sift")
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75, and w >= 0.5 to 1.5 times its mean over the photograph.
@@ -261,14 +261,17 @@ def natural_points(
     detector: str = "foerstner",
     max_features: int = 2000,
     noise: float | None = None,
+    hidden: BoolArray | None = None,
 ) -> NaturalPoints:
     """Find the natural points by which a photograph is linked to others and measured.
 
     Args:
         photograph: (H, W), 8 or 16 bit, grey or colour.
         detector: foerstner finds positions for the points, sift keeps those of the features.
-        max_features: largest number of features, the strongest of all parts of the photograph.
+        max_features: largest number of features, the strongest of all parts of the photograph. What is masked
+            takes its share with it.
         noise: standard deviation of its noise over the full scale, down to which weak texture is used.
+        hidden: masked pixels, which have no points, (H, W).
 
     Raises:
         GeometryError: an unknown detector.
@@ -277,6 +280,12 @@ def natural_points(
     """
     if detector not in DETECTORS:
         raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
-    found = sift_features(photograph, max_features=max_features, noise=noise)
-    corners = foerstner_points(photograph).xy if detector == "foerstner" else np.zeros((0, 2))
+    found = sift_features(photograph, max_features=max_features, noise=noise, hidden=hidden)
+    corners = np.zeros((0, 2))
+    if detector == "foerstner":
+        shown = shown_part(hidden, photograph.shape)
+        corners = np.array([shown[1].start, shown[0].start]) + foerstner_points(photograph[shown]).xy
+    if hidden is not None:
+        column, row = np.rint(corners).astype(np.int64).T
+        corners = corners[~hidden[row, column]]
     return NaturalPoints(found.xy, found.scale, found.angle, found.descriptor, corners)

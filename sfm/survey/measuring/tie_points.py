@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import datetime
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
@@ -16,11 +16,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
-from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS, Features
+from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
 from sfm.network import ImagePoints, Network, rows_of
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
@@ -34,7 +34,7 @@ from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, measured_once
+from sfm.survey.measuring.measured_store import TEXTURE, MeasuredStore, content_hash, measured_once
 from sfm.survey.measuring.targets import each_photograph
 from sfm.targets.outlines import estimate_noise
 
@@ -42,10 +42,10 @@ NONE = -1  # no photograph
 # Median distance from the median position, in standard deviations, beyond which positions differ by more than
 # their errors: errors alone give 1.5 (three axes).
 MIN_SPREAD_SIGMAS = 2.0
-# A photograph with fewer image points is searched for more features, if it had as many as were asked for, and
-# more in common with another one than chance gives: at most 14 pairs of 2,000 features of different textures
-# choose each other. Three photographs of a portal, taken while walking towards it, have 36 tie points in
-# common with 2,000 features each, and 249 with 8,000.
+# A photograph with fewer image points is searched for more features, if it has more in common with another
+# one than chance gives: at most 14 pairs of 2,000 features of different textures choose each other. Three
+# photographs of a portal, taken while walking towards it, have 36 tie points in common with 2,000 features
+# each, and 249 with 8,000.
 SCARCE_TIE_POINTS, MORE_FEATURES = 100, 4
 # Share of the features of a photograph from which those that stand still are reported. Dirt on the sensor
 # makes a few.
@@ -80,10 +80,11 @@ def tie_photographs(
         PhotographError: photographs of different sizes have the same camera.
         SurveyFileError: the start values of a camera are incomplete.
     """
-    settings = survey.texture
+    settings, masks = survey.texture, Masks(survey.masks)
+    name_of = dict(zip(files.paths, files.names, strict=True))
     found, failed = each_photograph(
         files,
-        lambda path: _read(path, settings, store),
+        lambda path: _read(path, name_of[path], settings, masks, store),
         picture=lambda one: one[1],
         jobs=jobs,
         progress=progress,
@@ -96,12 +97,7 @@ def tie_photographs(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([files.paths[k] for k in read])
-    most_found = [len(found[k][2]) for k in read]
-    natural = [
-        _visible(Masks(survey.masks), name, found[k][2], found[k][0].size_px)
-        for k, name in zip(read, names, strict=True)
-    ]
-
+    natural = [found[k][2] for k in read]
     neighbours = (
         neighbours_by_position(metadata, PARTNERS),
         neighbours_in_sequence(names, metadata, PARTNERS),
@@ -109,7 +105,7 @@ def tie_photographs(
     matches: Matches = {}
 
     def tie(min_image_points: int) -> TiePoints:
-        return find_tie_points(
+        tied = find_tie_points(
             pictures,
             natural,
             window_px=settings.window_px,
@@ -119,16 +115,19 @@ def tie_photographs(
             known=matches,
             neighbours=neighbours,
         )
+        shown = np.ones(len(tied), dtype=bool)
+        for i, rows in enumerate(rows_of(tied.image, len(read))):
+            shown[rows] = masks.visible(names[i], tied.xy[rows], metadata[i].size_px)
+        return tied if shown.all() else _shown_tie_points(tied, shown)
 
     tied = tie(0)
     scarce = np.flatnonzero(np.bincount(tied.image, minlength=len(read)) < SCARCE_TIE_POINTS).tolist()
     if "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
         alike = {a for pair, one in matches.items() if one.candidates >= MIN_PAIR_MATCHES for a in pair}
-        searched = [a for a in scarce if a in alike and most_found[a] >= settings.max_features]
+        searched = [a for a in scarce if a in alike]
         for a in reported("photographs searched for more features", searched, len(searched)):
-            again = natural_points_of(files.paths[read[a]], more, store)[0]
-            natural[a] = _visible(Masks(survey.masks), names[a], again, metadata[a].size_px)
+            natural[a] = natural_points_of(files.paths[read[a]], names[a], more, masks, store)[0]
         for pair in [pair for pair in matches if not set(pair).isdisjoint(searched)]:
             del matches[pair]
     if scarce and matches:
@@ -157,14 +156,19 @@ def tie_photographs(
     )
 
 
-def _visible(masks: Masks, name: str, found: NaturalPoints, size_px: tuple[int, int]) -> NaturalPoints:
-    """Return the natural points of a photograph that are not masked."""
-    visible = masks.visible(name, np.vstack([found.xy, found.corners]), size_px)
-    rows, corners = visible[: len(found.xy)], visible[len(found.xy) :]
-    if rows.all() and corners.all():
-        return found
-    of_features = {one.name: getattr(found, one.name)[rows] for one in fields(Features)}
-    return NaturalPoints(**of_features, corners=found.corners[corners])
+def _shown_tie_points(tied: TiePoints, shown: BoolArray) -> TiePoints:
+    """Return the image points that are not masked, of points that have as many of them as they need."""
+    rays, left = np.bincount(tied.point), np.bincount(tied.point[shown], minlength=len(tied.reference))
+    kept = shown & (left >= np.minimum(rays, MIN_RAYS))[tied.point]
+    points, point = np.unique(tied.point[kept], return_inverse=True)
+    return TiePoints(
+        tied.image[kept],
+        point.ravel(),
+        tied.xy[kept],
+        tied.covariance[kept],
+        tied.reference[points],
+        tied.still,
+    )
 
 
 def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remark, ...]:
@@ -209,16 +213,22 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
 
 
 def _read(
-    path: Path, settings: TiePointSettings, store: MeasuredStore | None
+    path: Path, name: str, settings: TiePointSettings, masks: Masks, store: MeasuredStore | None
 ) -> tuple[Metadata, bytes, NaturalPoints, bool]:
     photograph = read_photograph(path)
     digest = sha256(photograph.tobytes()).digest()
-    return read_metadata(path), digest, *natural_points_of(path, settings, store, photograph=photograph)
+    return (
+        read_metadata(path),
+        digest,
+        *natural_points_of(path, name, settings, masks, store, photograph=photograph),
+    )
 
 
 def natural_points_of(
     path: Path,
+    name: str,
     settings: TiePointSettings,
+    masks: Masks,
     store: MeasuredStore | None = None,
     *,
     photograph: AnyArray | None = None,
@@ -227,27 +237,33 @@ def natural_points_of(
 
     Args:
         path: the photograph.
+        name: its name.
         settings: detector and number of features.
+        masks: what is black in that of the photograph has no points.
         store: is searched first, and stores new features.
         photograph: pixels of the photograph, (H, W), if already read.
 
     Raises:
-        PhotographError: the photograph cannot be read.
+        PhotographError: the photograph or its mask cannot be read.
+        SurveyFileError: the mask has another size than the photograph.
     """
-    return measured_once(
-        store,
-        path,
-        TEXTURE,
-        settings.model_dump_json(include={"detector", "max_features"}),
-        lambda: _natural_points(read_photograph(path) if photograph is None else photograph, settings),
-    )
+    stated = settings.model_dump_json(include={"detector", "max_features"})
+    mask = masks.path_of(name)
+    if mask is not None:
+        stated += content_hash(mask)
 
+    def measured() -> NaturalPoints:
+        pixels = read_photograph(path) if photograph is None else photograph
+        noise = estimate_noise(grey_of(pixels)) / full_scale(pixels)
+        return natural_points(
+            pixels,
+            detector=settings.detector,
+            max_features=settings.max_features,
+            noise=noise,
+            hidden=masks.black(name, pixels.shape[1::-1]),
+        )
 
-def _natural_points(photograph: AnyArray, settings: TiePointSettings) -> NaturalPoints:
-    noise = estimate_noise(grey_of(photograph)) / full_scale(photograph)
-    return natural_points(
-        photograph, detector=settings.detector, max_features=settings.max_features, noise=noise
-    )
+    return measured_once(store, path, TEXTURE, stated, measured)
 
 
 def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray:

@@ -81,7 +81,9 @@ def _no_settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
     return ()
 
 
-def _no_count(survey: SurveyFile, path: Path, store: MeasuredStore | None) -> tuple[dict[str, int], bool]:
+def _no_count(
+    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
+) -> tuple[dict[str, int], bool]:
     return {}, True
 
 
@@ -93,8 +95,8 @@ class SurveySource:
     complete: Complete
     # (table of the survey file, its settings)
     settings: Callable[[Survey], tuple[tuple[str, Section], ...]] = _no_settings
-    # measures and stores one photograph; returns counts by name, and whether they were read from the store
-    count: Callable[[SurveyFile, Path, MeasuredStore | None], tuple[dict[str, int], bool]] = _no_count
+    # measures and stores a photograph; returns counts by name, and whether they were read from the store
+    count: Callable[[SurveyFile, str, Path, MeasuredStore | None], tuple[dict[str, int], bool]] = _no_count
 
 
 def complete_as_measured(

@@ -14,7 +14,9 @@ from sfm.survey.sources.target_matching import match_targets_of
 from sfm.survey.target_network import measure_targets
 
 
-def _count(survey: SurveyFile, path: Path, store: MeasuredStore | None) -> tuple[dict[str, int], bool]:
+def _count(
+    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
+) -> tuple[dict[str, int], bool]:
     family = survey_family(survey.targets, survey.codes)
     targets, stored = measure_photograph(path, survey.targets, family, store)
     return {"targets": len(targets), "rejected": len(targets.rejected_xy)}, stored

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.photographs.masks import Masks
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import Section, TiePointSettings
 from sfm.survey.inputs.survey import Survey
@@ -38,8 +39,13 @@ def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
     return (("tie_points", survey.texture),)
 
 
-def _count(survey: SurveyFile, path: Path, store: MeasuredStore | None) -> tuple[dict[str, int], bool]:
-    natural, stored = natural_points_of(path, survey.tie_points or TiePointSettings(), store)
+def _count(
+    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
+) -> tuple[dict[str, int], bool]:
+    folder = survey.head.masks
+    masks = Masks(None if folder is None else survey.beside(folder))
+    settings = survey.tie_points or TiePointSettings()
+    natural, stored = natural_points_of(path, image, settings, masks, store)
     return {"features": len(natural)}, stored
 
 
