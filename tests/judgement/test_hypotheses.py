@@ -15,8 +15,8 @@ from sfm.camera import project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
+from sfm.judgement.hypotheses import hypotheses, score
 from sfm.judgement.hypotheses import refit as refitting
-from sfm.judgement.hypotheses import score
 from sfm.judgement.hypotheses.alternatives import interiors
 from sfm.judgement.hypotheses.columns import (
     CAMERA,
@@ -520,6 +520,12 @@ def test_a_plate_that_is_not_as_given_is_named_and_its_remedy_works(bend: float,
         sigma = first[0].number("sigma")
         assert judge_alternatives(plate_as_printed(seed, bend, scatter, stated=sigma)).causes == ()
     assert judge_alternatives(plate_as_printed(7, 0.0, 0.0)).causes == ()
+
+
+def test_another_shape_shows_in_a_sample_of_the_image_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hypotheses, "MAX_IMAGE_POINTS", 400)
+    (cause,) = judge_alternatives(plate_as_printed(0, 0.01, 0.0)).causes
+    assert cause.kind == "shape_of_control"
 
 
 def test_another_shape_of_given_points_costs_all_their_coordinates() -> None:

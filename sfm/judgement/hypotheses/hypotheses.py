@@ -183,7 +183,15 @@ def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
-    cause = _best(final, beside=() if free is None else _with_free_shape(final, free))
+    held: Adjustment | None = final
+    if free is not None and len(free.rejected) < len(final.rejected):
+        start, factor = final.estimate, final.image_sigma_factor  # all are compared on the same sample
+        held = adjust_image_points(
+            final.network, start, final.rejected, factor, datum="control", false_alarm=final.false_alarm
+        )
+    if held is None:
+        return None
+    cause = _best(held, beside=() if free is None else _with_free_shape(held, free))
     if cause is None or (
         cause.refit.shift < MIN_NAMED_SIGMAS and cause.alternative.kind != "shape_of_control"
     ):
@@ -306,16 +314,8 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     The image points alone state the shape. All its coordinates are parameters.
 
     held: adjustment with control.
-    free: adjustment of its image points alone, or of a sample of them.
+    free: adjustment of its image points alone.
     """
-    if len(free.rejected) < len(held.rejected):
-        start, factor = held.estimate, held.image_sigma_factor
-        sample = adjust_image_points(
-            held.network, start, held.rejected, factor, datum="control", false_alarm=held.false_alarm
-        )
-        if sample is None:
-            return []
-        held = sample
     given = held.network.control.complete
     if len(given) < MIN_SHAPE:
         return []
