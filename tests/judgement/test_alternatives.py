@@ -27,6 +27,7 @@ from sfm.judgement.hypotheses.score import (
     Gain,
     Reduced,
     Spread,
+    determined_inverse,
     gain_of,
     least_share,
     log_likelihood_gain,
@@ -35,6 +36,18 @@ from sfm.judgement.hypotheses.score import (
 )
 from sfm.network import ImagePoints, InteriorObservations
 from tests.synthetic import make_network, observed_anew, seed_of
+
+
+def test_the_inverse_is_that_of_the_directions_that_are_determined() -> None:
+    """Three columns, and a fourth one that is the difference of the first two."""
+    rng = seed_of("determined")
+    D = rng.standard_normal((50, 3)) * [1.0, 30.0, 0.02]
+    H = D.T @ D
+    np.testing.assert_allclose(determined_inverse(H, np.diagonal(H)), np.linalg.inv(H), rtol=1e-9)
+    dependent = np.column_stack([D, D[:, 0] - D[:, 1] / 30.0])
+    K = dependent.T @ dependent
+    found = determined_inverse(K, np.diagonal(K))
+    np.testing.assert_allclose(K @ found @ K, K, rtol=1e-7, atol=1e-7)
 
 
 def test_a_gain_is_that_of_determined_parameters() -> None:

@@ -73,6 +73,13 @@ def test_two_of_five_are_identified_and_two_against_two_are_not() -> None:
     assert judge_values(bars(0.0, 0.0, 0.3, 0.3), LEVEL).doubtful == (0, 1, 2, 3)
 
 
+@pytest.mark.parametrize(("apart", "named"), [(3.9, False), (4.1, True)])
+def test_two_that_agree_with_each_other_may_have_one_cause(apart: float, named: bool) -> None:
+    """Of seven: chi-square of the two, apart^2 / 2, against MARGIN less 3 ln 7, as five check more."""
+    found = judge_values(bars(*[0.0] * 5, 1.0, 1.0 + apart * SIGMA), LEVEL)
+    assert found.wrong == ((5, 6) if named else ()) and bool(found.doubtful) != named
+
+
 def test_the_margin_decides_whether_one_is_reported_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Removing either of two of three heals; chi-square differs by 8.2, and 13.8 are needed."""
     model = bars(-2.2 * SIGMA, 0.0, 4.6 * SIGMA)

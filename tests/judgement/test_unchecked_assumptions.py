@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.result import Adjustment
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses import alternatives, families
@@ -21,6 +21,7 @@ from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.similarity import fit_similarity, without_motions
+from sfm.survey.inputs.sources import TEXTURE
 from tests.synthetic import make_network, observed_anew, seed_of
 
 
@@ -73,6 +74,18 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     assert reach == pytest.approx(shift, rel=0.1)
     strict = replace(a, false_alarm=a.false_alarm / 1e6)
     assert reach_of(one, strict, reduced, columns, rows=count_alternatives(a)) > 1.2 * reach
+
+
+def test_common_errors_let_a_held_parameter_reach_farther() -> None:
+    """By the square root of the design effect, with which they multiply a gain by chance."""
+    a = adjusted(points=100)
+    columns, correlation = columns_of(a), ErrorCorrelation(alone=0.1, common=0.9, length_px=300.0)
+    textured = replace(a, network=replace(a.network, sources=(TEXTURE,)), error_correlation=correlation)
+    one = families.Alternative(families.HELD, "all", np.ones(10), parameters=((0, 7),))  # b1
+    reduced, common = reduce_adjustment(a, columns), reduce_adjustment(textured, columns)
+    effect = common.design_effect(common.whiten(one.columns(a, columns)))
+    reach, farther = (reach_of(one, a, which, columns, rows=1) for which in (reduced, common))
+    assert effect > 2 and farther / reach == pytest.approx(np.sqrt(effect))
 
 
 def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
