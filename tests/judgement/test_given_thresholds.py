@@ -20,7 +20,7 @@ from sfm.judgement.given import scales as given_scales
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.scales import Comparison, Scales, Source
 from sfm.judgement.given.values import GivenModel, Judgement
-from sfm.network import ScaleBars
+from sfm.network import Network, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, kinds_of, of_kind
 from sfm.survey.inputs.exterior_table import ObservedExterior
@@ -337,6 +337,19 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
     )
     found = given_groups.Group._confirmed(group, stated, of["rescale"])
     np.testing.assert_allclose(found, np.where(np.isfinite(stated), factor**2 * stated, stated))
+
+
+def test_kinds_of_given_values_share_the_level() -> None:
+    network, truth = make_network(seed_of("shared level"), images=4, points=8)
+    bar = network.with_scale_bar("1", "2", 1.0, 1e-4)
+    nothing: Any = None
+
+    def level_of(network: Network) -> float:
+        settings = given_groups.GivenSettings(Datum("control"), "m")
+        return given_groups.Task(network, nothing, nothing, nothing, nothing, settings).level
+
+    assert level_of(network) == level_of(bar) == LEVEL
+    assert level_of(bar.with_control(["1", "2"], truth.points[:2])) == LEVEL / 2
 
 
 def test_four_points_that_are_not_in_a_plane_are_in_space() -> None:
