@@ -311,7 +311,16 @@ def _about_y(angle: float) -> FloatArray:
 @pytest.mark.parametrize("parallax", [0.0, 0.5])
 def test_photographs_from_one_place_are_refused_with_their_parallax(parallax: float) -> None:
     network, start = turned(parallax * MIN_PARALLAX * SIGMA_PX)
-    with pytest.raises(GeometryError, match="no base: the 6 photographs were taken from one position"):
+    with pytest.raises(
+        GeometryError, match="no base: the 6 photographs were taken from one position"
+    ) as told:
+        refuse_no_base(network, start.cameras)
+    assert "mask the background" not in str(told.value)
+
+
+def test_photographs_without_any_motion_may_show_an_object_that_turns() -> None:
+    network, start = turned(0.0, frontal=True)
+    with pytest.raises(GeometryError, match=r"no base: .* mask the background"):
         refuse_no_base(network, start.cameras)
 
 

@@ -293,17 +293,22 @@ def refuse_no_base(network: Network, cameras: tuple[Camera, ...]) -> None:
     if not pairs:
         return
     needed = MIN_PARALLAX * network.image_points.median_sigma_px
-    parallax = _least_parallax(network, cameras, pairs)
-    if parallax is None or not parallax.max() < needed:
-        return
-    xy = network.image_points.xy
-    moved = np.concatenate([np.linalg.norm(xy[a] - xy[b], axis=1) for a, b in pairs])
-    turns = "; if the object turns before a background that stands still, mask the background"
+    xy, turns = network.image_points.xy, ""
+    parallax = np.array(
+        [np.quantile(np.linalg.norm(xy[a] - xy[b], axis=1), MAX_DISTANT_FRACTION) for a, b in pairs]
+    )
+    if parallax.max() < needed:  # no rotation either, whatever the camera
+        turns = "; if the object turns before a background that stands still, mask the background"
+    else:
+        least = _least_parallax(network, cameras, pairs)
+        if least is None or not least.max() < needed:
+            return
+        parallax = least
     raise GeometryError(
         f"orientation: no base: the {len(network.images)} photographs were taken from one position; "
         f"rotations alone fit {MAX_DISTANT_FRACTION:.0%} of their points to {np.median(parallax):.2g} px, "
         f"and depths need {needed:.2g} px; photograph from several places"
-        f"{turns if np.quantile(moved, MAX_DISTANT_FRACTION) < needed else ''}"
+        f"{turns}"
     )
 
 
