@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.photographs.exif import read_metadata
@@ -63,6 +63,27 @@ class Masks:
         last = np.array(size_px) - 1
         column, row = np.clip(np.rint(np.nan_to_num(xy)).astype(np.int64), 0, last).T
         return np.asarray(~black[row, column])
+
+    def visible_points(
+        self, names: Sequence[str], sizes_px: Sequence[tuple[int, int]], image: IntArray, xy: FloatArray
+    ) -> BoolArray:
+        """Return which positions in several photographs are not masked, (k,).
+
+        Args:
+            names: names of the photographs.
+            sizes_px: width and height of each, px.
+            image: index of the photograph of each position, (k,).
+            xy: positions in the pixel frame, px, (k, 2).
+
+        Raises:
+            SurveyFileError: a mask has another size than its photograph.
+            PhotographError: a mask cannot be read.
+        """
+        visible = np.ones(len(xy), dtype=bool)
+        for i in np.unique(image).tolist() if self.folder is not None else ():
+            rows = np.flatnonzero(image == i)
+            visible[rows] = self.visible(names[i], xy[rows], sizes_px[i])
+        return visible
 
     def black(self, name: str, size_px: tuple[int, int]) -> BoolArray | None:
         """Return which pixels of a photograph are masked, (H, W); None if it has no mask.

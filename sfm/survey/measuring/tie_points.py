@@ -115,9 +115,7 @@ def tie_photographs(
             known=matches,
             neighbours=neighbours,
         )
-        shown = np.ones(len(tied), dtype=bool)
-        for i, rows in enumerate(rows_of(tied.image, len(read))):
-            shown[rows] = masks.visible(names[i], tied.xy[rows], metadata[i].size_px)
+        shown = masks.visible_points(names, [one.size_px for one in metadata], tied.image, tied.xy)
         return tied if shown.all() else _shown_tie_points(tied, shown)
 
     tied = tie(0)

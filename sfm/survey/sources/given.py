@@ -118,7 +118,9 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         FailedImage(every[i], remark("copies", original=every[j], same="image points"))
         for i, j in copies.items()
     )
-    kept = used[seen.image] & ~outside & _visible(survey, seen, images, cameras, owner)
+    sizes = [cameras[camera].size_px for camera in owner.tolist()]
+    kept = used[seen.image] & ~outside
+    kept &= Masks(survey.masks).visible_points(images, sizes, seen.image, seen.xy)
     table_of = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     images, owner = tuple(name for name, keep in zip(images, used, strict=True) if keep), owner[used]
     seen = replace(seen.select(kept), image=number[seen.image[kept]], source=table_of[kept])
@@ -155,16 +157,6 @@ def _used_photographs(images: Sequence[str], files: PhotographList, copies: Coll
     left_out = [name not in known and bool(known) and (files.folder / name).is_file() for name in images]
     distinct = np.isin(np.arange(len(images)), list(copies), invert=True)
     return np.asarray(distinct & ~np.array(left_out, dtype=bool))
-
-
-def _visible(
-    survey: Survey, seen: ImagePoints, images: Sequence[str], cameras: Sequence[Camera], owner: IntArray
-) -> BoolArray:
-    """Return which image points are not masked, (k,)."""
-    visible = np.ones(len(seen), dtype=bool)
-    for name, camera, rows in zip(images, owner.tolist(), rows_of(seen.image, len(images)), strict=True):
-        visible[rows] = Masks(survey.masks).visible(name, seen.xy[rows], cameras[camera].size_px)
-    return visible
 
 
 def _merge_tables(
