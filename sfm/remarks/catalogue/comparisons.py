@@ -18,7 +18,7 @@ OTHER_PROGRAMS = (
         "The camera of {program} with {parameters} free fits {times} times better: RMS {rms} instead of "
         "{before}.",
         "the camera model of the survey does not suit the lens",
-        "Free these parameters.",
+        "Free these parameters, if a camera can have the values in the comparison.",
     ),
     Kind(
         "comparison_failed",

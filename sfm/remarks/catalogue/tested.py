@@ -106,7 +106,7 @@ ROWS = (
         "given_not_judged",
         "given values",
         "{of:@}",
-        "by their residuals only: the image points alone do not determine the network",
+        "not against the image points, which alone do not determine the network",
     ),
     Tested(
         "handedness_unchecked",
