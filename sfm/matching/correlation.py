@@ -190,7 +190,9 @@ def _confirm(
     return replace(matches, flag=flag, xy=xy)
 
 
-def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolArray:
+def ambiguous(
+    best: FloatArray, second: FloatArray, pixels: FloatArray, quantile: float = QUANTILE
+) -> BoolArray:
     """Return whether the second-best position may be as good as the best.
 
     The difference of their Fisher's z is compared with its standard error. This is the standard error for
@@ -201,12 +203,13 @@ def ambiguous(best: FloatArray, second: FloatArray, pixels: FloatArray) -> BoolA
         best: coefficients r of the best positions, (k,).
         second: coefficients r of the second-best positions, -1 if there is none, (k,).
         pixels: number of independent pixels in the template, (k,).
+        quantile: of the normal distribution, one-sided, that the difference must exceed.
 
     Source: Fisher (1921), Metron 1, pp. 3-32.
     """
     z = np.arctanh(np.clip([best, second], -MAX_R, MAX_R))
     deviates = (z[0] - z[1]) * np.sqrt(np.maximum(pixels - 3.0, 0.0) / 2.0)
-    return np.asarray((second > -1.0) & ~(deviates >= QUANTILE))
+    return np.asarray((second > -1.0) & ~(deviates >= quantile))
 
 
 def independent_pixels(grey: AnyArray, xy: FloatArray, template_px: int) -> FloatArray:

@@ -54,6 +54,7 @@ def assemble_result(
             reasons.setdefault(name, reason)
     failed = (*measured.failed, *(measured.not_in_result(*one) for one in reasons.items()))
     before = (*measured.left_out, *matched.left_out_image_points)
+    contradicting = [point.point for point in before if point.reason.kind == "image_points_contradicting"]
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)
     result = SurveyResult(
@@ -68,7 +69,8 @@ def assemble_result(
         photographs=measured.overlays if matched.overlays is None else matched.overlays,
         control_check=solution.control_check,
         stage_remarks=(
-            *measured.remarks,
+            *(one for one in measured.remarks if one.kind != "image_points_contradicting"),
+            *([remark("image_points_contradicting", image_points=contradicting)] if contradicting else []),
             *start.remarks,
             *matched.remarks,
             *solution.remarks,

@@ -6,6 +6,7 @@ import csv
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,8 +15,9 @@ from sfm.camera import project
 from sfm.errors import SurveyFileError
 from sfm.photographs.exif import LocalSystem
 from sfm.pipeline import run_survey
+from sfm.remarks.remark import of_kind
 from sfm.survey.inputs.survey import read_survey
-from tests.surveys import camera, code_centres, stations, write_photograph_survey
+from tests.surveys import SIZE_PX, camera, code_centres, stations, write_photograph_survey
 from tests.synthetic import seed_of
 
 ORIGIN = np.array([391_000.0, 5_820_000.0, 30.0])  # UTM, m
@@ -146,15 +148,36 @@ def test_degrees_that_cannot_be_are_refused(tmp_path: Path, content: dict[str, f
         read_survey(path)
 
 
-@pytest.mark.parametrize("datum", ["control", "free"])
-def test_control_that_is_all_check_points_places_nothing(tmp_path: Path, datum: str) -> None:
+def test_control_that_no_image_point_shows_is_named(tmp_path: Path) -> None:
+    """Under masks, or in one photograph: of the datum and of the checks, none is lost without a word."""
+    one_ray = [line for line in lines_of() if not line.endswith("east") or "photo_1.png" in line]
+    more = 'check = ["checked"]\n[datum]\nkind = "control"\n'
+    path = survey_with(tmp_path / "hidden", "gcp_list.txt", "\n".join(["WGS84 UTM 33N", *one_ray]), more)
+    path.write_text(path.read_text("utf-8").replace('unit = "m"', 'unit = "m"\nmasks = "masks"'), "utf-8")
+    (path.parent / "masks").mkdir()
+    position, rotation = stations(6)
+    for i in range(6):
+        mask = np.full(SIZE_PX[::-1], 255, np.uint8)
+        for name in ("top", "checked"):
+            x, y = project(camera(), position[i], rotation[i], np.array([PLACES[name]]))[0]
+            cv2.circle(mask, (round(x), round(y)), 8, 0, -1)
+        cv2.imwrite(str(path.parent / "masks" / f"photo_{i + 1}.png.png"), mask)
+    result = run_survey(read_survey(path))
+    (said,) = [
+        one for one in of_kind(result.verdict.remarks, "names_missing") if "control" in one.names("of")
+    ]
+    assert set(said.names("names")) == {"top", "checked", "east"} and result.verdict.level == "fair"
+
+
+def test_control_that_is_all_check_points_is_no_datum(tmp_path: Path) -> None:
+    """In a free datum they may check the lengths of a survey with bars."""
     text = "\n".join(["WGS84 UTM 33N", *lines_of()])
-    more = f'[datum]\nkind = "{datum}"\n'
-    path = survey_with(tmp_path / "all", "gcp_list.txt", text, f"check = {json.dumps(list(PLACES))}\n{more}")
-    with pytest.raises(SurveyFileError, match="all 7 control points are check points, needed some that"):
+    all_checks, datum = f"check = {json.dumps(list(PLACES))}\n", '[datum]\nkind = "control"\n'
+    path = survey_with(tmp_path / "all", "gcp_list.txt", text, all_checks + datum)
+    with pytest.raises(SurveyFileError, match="all 7 control points are check points, and datum kind"):
         read_survey(path)
-    some = survey_with(tmp_path / "some", "gcp_list.txt", text, f'check = ["top", "flat"]\n{more}')
-    assert read_survey(some).control is not None
+    for name, more in (("some", f'check = ["top", "flat"]\n{datum}'), ("free", all_checks)):
+        assert read_survey(survey_with(tmp_path / name, "gcp_list.txt", text, more)).control is not None
 
 
 @pytest.mark.parametrize("checked", [True, False])
@@ -164,7 +187,8 @@ def test_a_control_point_with_one_ray_is_named_once(tmp_path: Path, checked: boo
     path = survey_with(tmp_path / "once", "gcp_list.txt", "\n".join(["WGS84 UTM 33N", *lines]), more)
     result = run_survey(read_survey(path))
     (said,) = [one for one in result.verdict.remarks if "checked" in one.text]
-    assert said.kind == "points_not_determined" and result.verdict.level == "good"
+    kind, level = ("points_not_determined", "good") if checked else ("names_missing", "fair")
+    assert said.kind == kind and result.verdict.level == level
     assert ("check point without a check" in said.text) == checked
     assert not len(result.check_points) or checked
 

@@ -121,11 +121,39 @@ def test_points_that_moved_far_keep_one_state(start: int, count: int, by: float,
     assert a.network.points == names
     named = {name for one in moved for name in one.names("points")}
     assert named <= set(names[:count]) and len(named) >= 0.7 * count * (by > 0)  # others are only rejected
-    state = () if level != "fair" else ("after" if start < 6 else "before",)
-    assert {one.names("state") for one in moved if one.number("wrong") == 0} <= {state, ()}
+    state = "after" if start < 6 else "before"
+    kept = {one.names("state") for one in moved if one.number("wrong") == 0}
+    assert kept <= {(state,), ()} and ((state,) in kept) == (level == "fair")
     assert (result.unused_image_points > 0) == (level == "fair")
     if level != "bad":
         true = X if start < 6 else truth.points
         error = fit_similarity(true, a.estimate.points).apply(true) - a.estimate.points
         sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
         assert np.abs(error / sigma).max() < 5
+
+
+def test_points_that_moved_twice_are_in_no_single_state() -> None:
+    """Of one move they keep a state; the image points of the other move still contradict it."""
+    rng = seed_of("twice moved")
+    network, truth = make_network(rng, images=12, points=50, noise_px=NOISE_PX, free=("c",))
+    X = truth.points.copy()
+    X[:3] += 6e-4 * rng.choice([-1.0, 1.0], (3, 3))
+    Y = X.copy()
+    Y[:3] += 6e-4 * rng.choice([-1.0, 1.0], (3, 3))
+    once = moved_from(network, truth, 4, X)
+    seen = once.image_points
+    xy = seen.xy.copy()
+    for i in range(9, 12):
+        rows, camera = seen.image == i, truth.cameras[network.camera[i]]
+        from_xy, to_xy = (
+            project(camera, truth.position[i], truth.rotation[i], places[seen.point[rows]])
+            for places in (X, Y)
+        )
+        xy[rows] += to_xy - from_xy
+    twice = run(replace(once, image_points=replace(seen, xy=xy)), truth, adjust={"reject": "tau"})
+    a = twice.adjustment
+    sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
+    kept = [network.points.index(name) for name in a.network.points]
+    true = X[kept]  # of the middle of the sequence
+    error = np.abs((fit_similarity(true[3:], a.estimate.points[3:]).apply(true) - a.estimate.points) / sigma)
+    assert twice.verdict.level == "bad" or error.max() < 5

@@ -63,6 +63,27 @@ def test_a_text_means_one_photograph(tmp_path: Path, text: str, name: str | None
     assert bool(named.remarks) == (name is None)
 
 
+def test_a_photograph_without_a_file_that_does_not_fit_is_missed_for_that(tmp_path: Path) -> None:
+    """Its image points are all that was handed over; what is wrong with them is the reason."""
+    rng = np.random.default_rng(1)
+    places = {f"more {k}": (20.0 * k, -75.0, 0.0) for k in range(5)}
+    path = write(tmp_path, '[[observations]]\nfile = "corners.csv"\nsigma_px = 0.2\n')
+    table = tmp_path / "corners.csv"
+    write_given(table, {**CORNERS, **places})
+    head, *rows = [row.split(",") for row in table.read_text("utf-8").splitlines()]
+    for i in (4, 5, 6):
+        (tmp_path / f"photo {i}.png").unlink()
+        of_photograph = [k for k, row in enumerate(rows) if row[0] == f"photo {i}.png"]
+        exchanged = [rows[k][2:] for k in rng.permutation(of_photograph)]
+        for k, xy in zip(of_photograph, exchanged, strict=True):
+            rows[k] = [*rows[k][:2], *xy]
+    table.write_text("\n".join(",".join(row) for row in (head, *rows)) + "\n", "utf-8")
+    result = run_survey(read_survey(path))
+    (failed,) = result.failed
+    assert failed.reason.kind != "photographs_without_file" and failed.is_counted
+    assert result.images_total == 6 and of_kind(result.verdict.remarks, "photographs_missing")
+
+
 def test_a_mark_and_a_start_value_name_photographs_too(tmp_path: Path) -> None:
     survey = survey_of(tmp_path, ["a.png"])
     mark = PointSettings(name="p", image="./D.png", x_px=1.0, y_px=2.0)

@@ -17,7 +17,7 @@ from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.verdict import ray_remarks
 from sfm.network import Estimate, ObjectPoints
 from sfm.remarks.remark import Remark, kinds_of, of_kind
-from sfm.survey.adjusting.solution_remarks import datum_remarks, remarks_on_uncalibrated
+from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control, remarks_on_uncalibrated
 from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.calibration import plate_control
 from sfm.survey.inputs.measurements import MeasuredPhotographs
@@ -196,18 +196,17 @@ def test_points_of_a_plate_may_be_out_of_view(tmp_path: Path) -> None:
     assert plate is not None
     network, truth = make_network(seed_of("in view"), images=4, points=20)
     network = replace(network, points=plate.names[:20])
-    assert datum_remarks(survey, network, network.points, has_scale=True) == ()
+    assert missing_control(survey, network, ()) == ()
     given = survey_of(network, truth, control=plate, datum={"kind": "control"})
-    (missing,) = datum_remarks(given, network, network.points, has_scale=True)
-    assert missing.kind == "names_missing" and missing.names("names") == plate.names[20:]
+    missing = missing_control(given, network, ())
+    (said,) = datum_remarks(given, network, missing, has_scale=True)
+    assert said.kind == "names_missing" and said.names("names") == missing == plate.names[20:]
 
 
 def test_an_assumed_pitch_is_a_note_of_the_result(tmp_path: Path) -> None:
     network, _ = make_network(seed_of("pitch"), images=4, points=20)
-    assert datum_remarks(plate_survey(tmp_path), network, network.points, has_scale=True) == ()
-    (note,) = datum_remarks(
-        plate_survey(tmp_path, "pitch_assumed = true"), network, network.points, has_scale=True
-    )
+    assert datum_remarks(plate_survey(tmp_path), network, (), has_scale=True) == ()
+    (note,) = datum_remarks(plate_survey(tmp_path, "pitch_assumed = true"), network, (), has_scale=True)
     assert (note.kind, note.severity) == ("plate_pitch_assumed", "note")
     assert note.numbers["pitch"].value == 8.0 and note.numbers["pitch"].unit == "mm"
 

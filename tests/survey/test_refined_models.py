@@ -342,9 +342,13 @@ def test_a_photograph_that_cannot_be_read_is_named_with_its_folder(tmp_path: Pat
 def test_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _model(tmp_path)
     masks = tmp_path / "masks"
-    with pytest.raises(SurveyFileError, match=r"no mask of any photograph, expected 'a/0\.png\.png'"):
+    with pytest.raises(SurveyFileError, match="needed the folder of the masks"):
         refine(tmp_path / "model", tmp_path, masks=masks)
     (masks / "a").mkdir(parents=True)
+    with pytest.raises(SurveyFileError, match=r"no mask of a photograph; .* would be a/0\.png\.png"):
+        refine(tmp_path / "model", tmp_path, masks=masks)
+    with pytest.raises(SurveyFileError, match=r"a/0\.png: is a photograph, needed the mask of a/0\.png"):
+        refine(tmp_path / "model", tmp_path, masks=tmp_path)
     cv2.imwrite(str(masks / "a" / "0.png.png"), np.zeros((10, 10), np.uint8))
     with pytest.raises(SurveyFileError, match="the mask has 10 x 10 px, its photograph 300 x 240 px"):
         refine(tmp_path / "model", tmp_path, masks=masks)

@@ -12,7 +12,7 @@ from sfm.conventions import angles_from_rotation, image_from_pixel
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.network import Estimate, Network
 from sfm.photographs.exif import Metadata
-from sfm.survey.adjusting.solution_remarks import datum_remarks
+from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.start import start_values
@@ -408,7 +408,8 @@ def test_control_scale_bars_and_start_values(tmp_path: Path) -> None:
     assert (network.scale_bars.start[0], network.scale_bars.end[0]) == (1, 0)
     missing = [
         (*one.names("of"), *one.names("names"))
-        for one in datum_remarks(read_survey(path), network, network.points, has_scale=True)
+        for survey in [read_survey(path)]
+        for one in datum_remarks(survey, network, missing_control(survey, network, ()), has_scale=True)
     ]
     assert missing == [("control", "elsewhere"), ("bars", "a - lost")]
     assert estimate.oriented.tolist() == [False, True]

@@ -177,10 +177,22 @@ def _models_with_one_state(found: SolvedSurvey) -> Iterator[SurveyModel]:
 
 
 def _gain_of_one_state(_: SolvedSurvey, after: SolvedSurvey) -> float:
-    """Return whether the rest fits; a test has decided before that the points moved."""
+    """Return whether the rest fits; a test has decided before that the points moved.
+
+    Points that moved again are in several states still.
+    """
     verdict = judge_adjustment(after.adjustment).verdict
     fits = verdict is not None and verdict.level != "bad"
     fits &= not any(named.severity == "error" for named in after.remarks)
+    once = {name for moved in after.model.moved for name in moved.names("points")}
+    again = {
+        name
+        for moved in after.remarks
+        if moved not in after.model.moved
+        for name in (*moved.names("points"), *moved.names("point"))
+        if moved.kind in ("points_moved", "two_places")
+    }
+    fits &= once.isdisjoint(again)
     return float("inf") if fits else -float("inf")
 
 

@@ -46,14 +46,17 @@ def remarks_on_solution(
         adjustment: the final adjustment.
     """
     sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
+    missing = missing_control(survey, adjustment.network, left_out)
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
     return (
         *adjustment.remarks,
-        *remarks_on_left_out(left_out, whole, _check_points(survey)),
+        *remarks_on_left_out(
+            tuple(point for point in left_out if point.point not in missing), whole, _check_points(survey)
+        ),
         *([remark("names_missing", of="datum", names=absent)] if absent else []),
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
-        *datum_remarks(survey, adjustment.network, whole.points, has_scale=adjustment.has_scale),
+        *datum_remarks(survey, adjustment.network, missing, has_scale=adjustment.has_scale),
         *unused_observations(survey, adjustment.network),
         *weak_scale(adjustment),
         *scale_alone(adjustment),
@@ -152,23 +155,19 @@ def scale_alone(a: Adjustment) -> tuple[Remark, ...]:
 
 
 def datum_remarks(
-    survey: Survey, network: Network, measured: Collection[str], *, has_scale: bool
+    survey: Survey, network: Network, missing: Collection[str], *, has_scale: bool
 ) -> tuple[Remark, ...]:
     """Return remarks on control and scale bars that were not measured, and on a missing or assumed scale.
-
-    Points of a plate may be out of view, so not all of them are expected in the result.
 
     Args:
         survey: states control, scale bars and targets.
         network: network of the result.
-        measured: names of all measured points; those that are not in the result have their own remarks.
+        missing: names of control that is not in the result.
         has_scale: whether anything gives the network a scale.
     """
     remarks, known = [], set(network.points)
-    plate = is_plate_control(survey.control, plate_control(survey.targets))
-    control = [name for name in survey.control.names if name not in measured] if survey.control else []
-    if control and not plate:
-        remarks.append(remark("names_missing", of="control", names=control))
+    if missing:
+        remarks.append(remark("names_missing", of="control", names=missing))
     if survey.targets.pitch_assumed and survey.targets.pitch is not None:
         remarks.append(remark("plate_pitch_assumed", pitch=(survey.targets.pitch, survey.unit)))
     bars = [f"{bar.start} - {bar.end}" for bar in survey.scale_bars if not {bar.start, bar.end} <= known]
@@ -178,6 +177,24 @@ def datum_remarks(
         seen = None if survey.control is None else len(network.control)
         remarks.append(remark("scale_undefined", unit=survey.unit, control=seen, needed=2))
     return tuple(remarks)
+
+
+def missing_control(survey: Survey, network: Network, left_out: tuple[LeftOutPoint, ...]) -> tuple[str, ...]:
+    """Return the names of control that is not in the result, and has no remark of its own.
+
+    Points of a plate may be out of view, so not all of them are expected in the result. Those that
+    contradict, and check points, are named where they are left out.
+
+    Args:
+        survey: states control.
+        network: network of the result.
+        left_out: measured points that are not in the result.
+    """
+    if survey.control is None or is_plate_control(survey.control, plate_control(survey.targets)):
+        return ()
+    checks = _check_points(survey)
+    named = {point.point for point in left_out if point.point in checks or point.reason.severity != "note"}
+    return tuple(name for name in survey.control.names if name not in named.union(network.points))
 
 
 def left_out_points(

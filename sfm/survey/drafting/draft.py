@@ -20,7 +20,7 @@ from sfm.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
-from sfm.photographs.masks import MASKS, find_masks
+from sfm.photographs.masks import MASKS, Masks, find_masks
 from sfm.photographs.reading import SUFFIXES
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress
@@ -54,6 +54,7 @@ FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
 FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
 SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings and natural points
+OUTSIDE = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
 MAX_SHOWN = 8  # names listed on a line
@@ -97,7 +98,11 @@ def draft_survey(
     """
     metadata, unreadable = _metadata(folder)
     masks, masked = find_masks(folder, tuple(metadata))
-    masks.refuse_wrong({name: folder / name for name in metadata})
+    unused = "" if masked == MASKS else OUTSIDE
+    try:
+        masks.refuse_wrong({name: folder / name for name in metadata})
+    except SurveyFileError as error:  # a folder of this name may have another purpose
+        masks, unused = Masks(), f"not used: {error}"
     grouping = group_photographs(metadata, sensor_width)
     if grouping.rig is None and any("/" in name for name in metadata):
         _refuse_folder(folder)
@@ -113,13 +118,13 @@ def draft_survey(
     positions = sum(metadata[one].position is not None for one in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     if trial.plate is not None:
-        silent = _text(name, grouping, trial, pitch, left_out, positions, masked, models=False)
+        silent = _text(name, grouping, trial, pitch, left_out, positions, masked, unused, models=False)
         cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
         grouping = replace(grouping, cameras=cameras)
     return Draft(
         name,
-        _text(name, grouping, trial, pitch, left_out, positions, masked),
-        _findings(grouping, trial, positions, masked),
+        _text(name, grouping, trial, pitch, left_out, positions, masked, unused),
+        _findings(grouping, trial, positions, masked, unused),
         _remarks(grouping, trial, pitch),
         left_out,
         picture_of_rings(trial.ringed),
@@ -190,6 +195,7 @@ def _text(
     left_out: Sequence[tuple[str, str]],
     positions: int,
     masked: str,
+    unused: str,
     *,
     models: bool = True,
 ) -> str:
@@ -200,8 +206,8 @@ def _text(
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
     if masked:
-        beside = "# " if masked != MASKS else ""
-        lines.append(f"{beside}masks = {_quoted(masked)}  # what is black there is ignored")
+        commented = "# " if unused else ""
+        lines.append(f"{commented}masks = {_quoted(masked)}  # what is black there is ignored")
     for camera in grouping.cameras:
         lines += ["", *_camera_lines(camera, _free_parameters(trial), models=models)]
     if grouping.rig is not None:
@@ -411,7 +417,7 @@ def _position_lines(positions: int) -> list[str]:
 
 
 def _findings(
-    grouping: Grouping, trial: TargetTrial, positions: int, masked: str
+    grouping: Grouping, trial: TargetTrial, positions: int, masked: str, unused: str
 ) -> tuple[tuple[str, str], ...]:
     """Return the findings for the terminal."""
     found = [
@@ -445,9 +451,7 @@ def _findings(
     else:
         found.append(("targets", "none with codes: points of natural texture"))
     if masked:
-        outside = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
-        used = "what is black in them is ignored" if masked == MASKS else outside
-        found.append(("masks", f"in {masked}; {used}"))
+        found.append(("masks", f"in {masked}; {unused or 'what is black in them is ignored'}"))
     if positions:
         found.append(
             ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")

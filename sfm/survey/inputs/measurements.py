@@ -131,13 +131,14 @@ class Measurements:
     parts: tuple[Measurements, ...] = ()  # of each source; empty with one source
 
     def not_in_result(self, image: str, reason: Remark) -> FailedImage:
-        """Return a photograph that is not in the result; one without a file is not missed for any reason.
+        """Return a photograph that is not in the result; one without a file is not missed for few points.
 
         Args:
             image: name of the photograph.
             reason: what a photograph with a file lacks.
         """
-        if self.files is not None and image not in self.files.names:
+        has_file = self.files is None or image in self.files.names
+        if not has_file and reason.kind in ("photograph_with_few_points", "not_connected"):
             reason = remark("photographs_without_file", photographs=[image])
         return FailedImage(image, reason)
 

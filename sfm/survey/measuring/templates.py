@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.distributions import Levels, normal_ppf
 from sfm.matching.correlation import MAX_R, ambiguous, independent_pixels
 from sfm.matching.lsm.coverage import CoveredPixels, Windows
 from sfm.matching.lsm.depth_search import search_depths
@@ -89,7 +90,13 @@ class _Matched(_Candidates):
 
 
 def match_templates(
-    scene: TemplateScene, i: int, xy: FloatArray, known: FloatArray, windows: Windows, jobs: int
+    scene: TemplateScene,
+    i: int,
+    xy: FloatArray,
+    known: FloatArray,
+    windows: Windows,
+    levels: Levels,
+    jobs: int,
 ) -> TemplateRays:
     """Return the rays of points with a template in photograph i, in all photographs that show them.
 
@@ -99,6 +106,7 @@ def match_templates(
         xy: middles of the templates, px, (k, 2).
         known: approximate object points, NaN where unknown, (k, 3).
         windows: size of the windows; larger ones are tried where these are not matched.
+        levels: of the comparisons of places that look alike.
         jobs: number of photographs processed in parallel.
     """
     estimate, camera = scene.estimate, scene.network.camera
@@ -122,7 +130,7 @@ def match_templates(
             matched = _matched(scene, i, xy, normal, candidates, replace(windows, side_px=side_px), jobs)
             candidates = matched
         pixels = independent_pixels(grey_of(scene.grey[i].pixels), xy, side_px)
-        rays, doubtful = _most_alike(matched, pixels)
+        rays, doubtful = _most_alike(matched, pixels, levels)
         parts.append(rays)
         alike = np.union1d(alike, doubtful)  # larger windows would only lose some of the places
         lost = np.setdiff1d(lost, np.union1d(rays.point, alike))
@@ -223,12 +231,16 @@ def _matched(
     )
 
 
-def _most_alike(candidates: _Matched, pixels: FloatArray) -> tuple[ImagePoints, IntArray]:
+def _most_alike(candidates: _Matched, pixels: FloatArray, levels: Levels) -> tuple[ImagePoints, IntArray]:
     """Return the rays of templates at the place that photographs show most alike, and templates without one.
+
+    All photographs are compared with the same template, whose errors they share: several are no more
+    evidence than one. A place with fewer rays than another is not the point by its correlation alone.
 
     Args:
         candidates: the places.
         pixels: independent pixels of each template, (k,).
+        levels: of the comparisons of a place with the others.
     """
     chosen, doubtful = [], []
     for template in np.unique(candidates.template).tolist():
@@ -236,14 +248,16 @@ def _most_alike(candidates: _Matched, pixels: FloatArray) -> tuple[ImagePoints, 
         best, *others = numbers[np.argsort(-candidates.r[numbers], kind="stable")].tolist()
         same = [k for k in others if _same_place(candidates.rays, best, k)]
         rivals = np.array([k for k in others if k not in same], dtype=np.int64)
-        rays = np.minimum(candidates.count[best], candidates.count[rivals]) - 1
-        r = np.full(len(rivals), candidates.r[best])
-        if ambiguous(r, candidates.r[rivals], 3.0 + (pixels[template] - 3.0) * rays).any():
+        most = max([best, *same], key=lambda k: candidates.count[k])
+        r, independent = (np.full(len(rivals), value) for value in (candidates.r[best], pixels[template]))
+        quantile = -float(normal_ppf(levels.of_each(len(rivals))))
+        doubt = ambiguous(r, candidates.r[rivals], independent, quantile)
+        if (doubt | (candidates.count[rivals] > candidates.count[most])).any():
             by_marks = numbers[candidates.stated[numbers]]
             chosen += by_marks.tolist()
             doubtful += [] if len(by_marks) else [template]
         else:
-            chosen.append(max([best, *same], key=lambda k: candidates.count[k]))
+            chosen.append(most)
     kept = np.isin(candidates.rays.point, chosen)
     rays = candidates.rays.select(kept)
     return replace(rays, point=candidates.template[rays.point]), np.array(doubtful, dtype=np.int64)

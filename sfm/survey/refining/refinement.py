@@ -249,7 +249,7 @@ def refine_model(
     readjusted = with_neighbours(adjust(first, start, datum=Datum("free"), reject="none"))
     masked = np.zeros(len(seen), dtype=bool)
     if settings.masks_dir is not None:
-        masked = outside_masks(network, estimate, settings.masks_dir)
+        masked = outside_masks(network, estimate, settings.masks_dir, images_dir)
     beyond = int((np.isfinite(depth) & ~usable & ~masked).sum())
     reference = _references(network, estimate, usable & ~masked)
     rows = np.flatnonzero((reference >= 0)[seen.point] & usable & ~masked)

@@ -304,26 +304,23 @@ class Photographs:
         return photograph if self.shrink == 1 else shrink_photograph(grey_of(photograph), self.shrink)
 
 
-def outside_masks(network: Network, estimate: Estimate, folder: Path) -> BoolArray:
+def outside_masks(network: Network, estimate: Estimate, folder: Path, photographs: Path) -> BoolArray:
     """Return which image points are in the black part of their photograph's mask, (k,).
 
     Args:
         network: the model.
         estimate: solution of the model.
         folder: folder of the masks.
+        photographs: folder of the photographs.
 
     Raises:
-        SurveyFileError: the folder has no mask of any photograph, or one of another size.
+        SurveyFileError: the folder has no mask of any photograph, or one that cannot be its mask.
         PhotographError: a mask cannot be read.
     """
     seen, masks = network.image_points, Masks(folder)
-    if not any(map(masks.path_of, network.images)):
-        raise SurveyFileError(f"{folder}: no mask of any photograph, expected '{network.images[0]}.png'")
-    masked = np.zeros(len(seen), dtype=bool)
-    for i, name in enumerate(network.images):
-        rows = np.flatnonzero(seen.image == i)
-        masked[rows] = ~masks.visible(name, seen.xy[rows], estimate.cameras[network.camera[i]].size_px)
-    return masked
+    masks.refuse_wrong({name: photographs / name for name in network.images})
+    sizes = [estimate.cameras[lens].size_px for lens in network.camera]
+    return ~masks.visible_points(network.images, sizes, seen.image, seen.xy)
 
 
 def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list[Path]:

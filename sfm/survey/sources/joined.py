@@ -318,7 +318,7 @@ def _joined_correspondences(
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
         tuple(name for matched in completed for name in matched.no_circles),
-        (*(said for matched in completed for said in matched.remarks), *repeated.remarks),
+        (*(said for matched in completed for said in matched.remarks), *repeated.of_sources),
         start.point_failures,
         start.kind == "given",
         tuple(elsewhere.items()),

@@ -118,7 +118,7 @@ def match_marks(
     by_hand = replace(seen, image=image[seen.image], point=point[seen.point], source=None)
     found = _match_all(oriented, scene, points, known, jobs)
     used = _without_contradictions(scene, found.image_points, by_hand, survey.adjust.levels)
-    lost = np.setdiff1d(np.arange(len(points)), used.matched.point)
+    lost = np.setdiff1d(np.arange(len(points)), found.image_points.point)
     matched = _with_pointing(survey, whole, points, used.matched)
     key, by_hand_key = (rows.image * len(points) + rows.point for rows in (matched, used.by_hand))
     everything = ImagePoints.joined([matched, used.by_hand.select(~np.isin(by_hand_key, key))])
@@ -139,9 +139,7 @@ def match_marks(
     remarks = []
     if len(lost):
         alike = [points[j] for j in np.intersect1d(found.alike, lost)]
-        remarks.append(remark("marks_unmatched", points=[points[j] for j in lost], alike=alike))
-    if contradicting:
-        remarks.append(remark("image_points_contradicting", image_points=contradicting))
+        remarks.append(remark("marks_unmatched", points=[points[j] for j in lost], alike=alike or None))
     return Correspondences(
         network,
         replace(scene.estimate, points=placed.points),
@@ -194,7 +192,7 @@ def _without_contradictions(
     """Return the matched image points and the marks that are where the point is.
 
     Where most further marks of a point contradict, its template is not where the person means it to be: what
-    was matched is left out. Otherwise the marks are left out.
+    was matched is left out, with the marks that agree with it. Otherwise the others are left out.
     """
     n = 1 + int(max(by_hand.point.max(initial=-1), matched.point.max(initial=-1)))
     placed = intersect_image_points(
@@ -206,7 +204,7 @@ def _without_contradictions(
     tested = np.bincount(by_hand.point[np.isfinite(off)], minlength=n)
     of_point = np.bincount(by_hand.point[wrong], minlength=n)
     elsewhere = (of_point > 1) & (2 * of_point >= tested)
-    wrong &= ~elsewhere[by_hand.point]
+    wrong = np.where(elsewhere[by_hand.point], np.isfinite(off) & ~wrong, wrong)
     contradicting = zip(by_hand.image[wrong].tolist(), by_hand.point[wrong].tolist(), strict=True)
     kept = ~elsewhere[matched.point]
     return _Used(matched.select(kept), by_hand.select(~wrong), tuple(contradicting))
@@ -266,7 +264,7 @@ def _match_all(
         with_template, i = cast(tuple[TemplateScene, int], scenes[name])
         xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
         point = np.array([points.index(mark.name) for mark in marks])
-        found = match_templates(with_template, i, xy, known[point], windows, jobs)
+        found = match_templates(with_template, i, xy, known[point], windows, survey.adjust.levels, jobs)
         parts.append(replace(found.image_points, point=point[found.image_points.point]))
         alike.append(point[found.alike])
     return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))

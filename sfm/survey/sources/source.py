@@ -36,7 +36,7 @@ class Correspondences:
     given: bool = False  # whether the orientation started from approximate values of the survey
     left_out: tuple[tuple[str, Remark], ...] = ()  # photographs of another object, with the reason
     suspected: tuple[str, ...] = ()  # photographs matched only with a per-photograph camera
-    left_out_image_points: tuple[LeftOutPoint, ...] = ()  # that contradict others of their point
+    left_out_image_points: tuple[LeftOutPoint, ...] = ()  # that contradict one another
     overlays: tuple[PhotographTargets, ...] | None = None  # drawn in the report; None: those measured
 
 

@@ -95,10 +95,10 @@ def refuse_contradictions(survey: Survey | SurveyFile) -> None:
             f"{where}: datum kind 'control' needs [control] with the file of known points, or [exterior]"
         )
     given = survey.control if isinstance(survey.control, KnownPoints) else None
-    if given is not None and given.only_checks and not observed:
+    if survey.datum.kind == "control" and given is not None and given.only_checks and not observed:
         raise SurveyFileError(
-            f"{where}: all {counted(len(given.names), 'control point')} are check points, needed some that "
-            "are not: the result is placed on them"
+            f"{where}: all {counted(len(given.names), 'control point')} are check points, and datum kind "
+            "'control' needs some that are not"
         )
     for bar in survey.scale_bars:
         if bar.start == bar.end:
