@@ -189,7 +189,7 @@ def test_a_control_point_with_one_ray_is_named_once(tmp_path: Path, checked: boo
     (said,) = [one for one in result.verdict.remarks if "checked" in one.text]
     kind, level = ("points_not_determined", "good") if checked else ("names_missing", "fair")
     assert said.kind == kind and result.verdict.level == level
-    assert ("check point without a check" in said.text) == checked
+    assert ("check point that checks nothing" in said.text) == checked
     assert not len(result.check_points) or checked
 
 

@@ -12,9 +12,9 @@ POINTS = (
         "determine {points:it|them}: {points}]][[It has {rays:ray}; {needed} are needed]][[Fewer than "
         "{least} of its {measured} rays are from photographs in the result]][[Its {parallel} rays are "
         "parallel within their precision]]."
-        "[[ {checks} {checks:is a check point|are check points} without a check.]]",
-        "a point is in fewer photographs than it needs, is far away, or they were taken from one place",
-        "Add photographs from other positions, if you need the point.",
+        "[[ {checks} {checks:is a check point that checks|are check points that check} nothing.]]",
+        "too few photographs, a point far away, or photographs from one place",
+        "Add photographs from other positions where you need the coordinates.",
     ),
     Kind(
         "points_contradicted",
@@ -22,9 +22,9 @@ POINTS = (
         "[[{points:point} of {measured} {points:is|are} not in the result, as {points:its|their} rays do not "
         "meet: {points}]][[Its {rays} rays do not meet in front of their photographs]][[{accepted} of its "
         "{measured} rays {accepted:was|were} accepted; {needed} are needed]]."
-        "[[ {checks} {checks:is a check point|are check points} without a check.]]",
+        "[[ {checks} {checks:is a check point that checks|are check points that check} nothing.]]",
         "a point moved, was misidentified in a photograph, or its rays are almost parallel",
-        "Correct the image points for the reason that left_out.csv states, or do without the point.",
+        "Correct the image points for the reason that left_out.csv states, or leave them out.",
     ),
     Kind(
         "points_doubtful",
@@ -141,7 +141,7 @@ POINTS = (
         "{share:%} of the matched features in {photographs} stand still while the others move, and are left "
         "out.",
         "an object that turns before a background that stands still, or writing burned into the photographs",
-        "Mask what stands still ([survey] masks).",
+        "Mask it ([survey] masks), if the result is not of the object.",
     ),
     Kind(
         "windows_disagree",

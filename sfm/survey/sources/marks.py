@@ -102,7 +102,7 @@ def match_marks(
         jobs: number of photographs processed in parallel.
 
     Raises:
-        SurveyFileError: a named point has the name of a target.
+        SurveyFileError: a named point has the name of one that another source measured.
         PhotographError: a photograph of an earlier epoch cannot be read.
     """
     survey, whole, part = oriented.survey, oriented.measured.network, measured.network
@@ -234,7 +234,7 @@ def _refuse_names_of_others(survey: Survey, network: Network, points: Sequence[s
     for name in points:
         if name in measured:
             raise SurveyFileError(
-                f"{survey.source}: point '{name}' has the name of a target, needed another name"
+                f"{survey.source}: point '{name}' has the name of a target or tie point, needed another name"
             )
 
 
