@@ -56,7 +56,7 @@ class Source:
 
     name: str
     names_last: bool = True  # whether its points keep their names in later runs
-    fewest: int = 4  # image points of a photograph: three determine it, the fourth checks
+    fewest: int = 4  # image points that orient a photograph: three determine it, the fourth checks
     is_exact: bool = False  # whether they were handed over as they are
     has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
     is_matched: bool = False  # whether its image points are windows that were matched with one another

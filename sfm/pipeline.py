@@ -98,7 +98,7 @@ def _measure(
     survey, clocks = moments_from_exif(named.survey, files)
     survey, positions = exterior_from_exif(survey, files)
     refuse_unknown_photographs(survey, files.names)
-    Masks(survey.masks).refuse_wrong(dict(zip(files.names, files.paths, strict=True)))
+    Masks(survey.masks).refuse_wrong(files.path_of())
     sizes = separate_sizes(survey, files)
     survey = sizes.survey
     if survey.start_cameras is None:

@@ -24,7 +24,7 @@ from sfm.result import CheckPoint, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
-from sfm.survey.inputs.measurements import PhotographList
+from sfm.survey.inputs.measurements import PhotographList, remarks_on_contradicting
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.sources import tables_of
 from sfm.survey.inputs.survey import Survey
@@ -54,7 +54,6 @@ def assemble_result(
             reasons.setdefault(name, reason)
     failed = (*measured.failed, *(measured.not_in_result(*one) for one in reasons.items()))
     before = (*measured.left_out, *matched.left_out_image_points)
-    contradicting = [point.point for point in before if point.reason.kind == "image_points_contradicting"]
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)
     result = SurveyResult(
@@ -69,8 +68,8 @@ def assemble_result(
         photographs=measured.overlays if matched.overlays is None else matched.overlays,
         control_check=solution.control_check,
         stage_remarks=(
-            *(one for one in measured.remarks if one.kind != "image_points_contradicting"),
-            *([remark("image_points_contradicting", image_points=contradicting)] if contradicting else []),
+            *measured.remarks,
+            *remarks_on_contradicting(before),
             *start.remarks,
             *matched.remarks,
             *solution.remarks,

@@ -16,7 +16,7 @@ from sfm.remarks.remark import Remark
 from sfm.result import FailedImage, PhotographTargets, StageTime
 from sfm.runtime.progress import StageClock
 from sfm.survey.assembly import settings_by_table
-from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.measurements import Measurements, remarks_on_contradicting
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.source import Correspondences
@@ -92,6 +92,7 @@ def unfinished_survey(
         overlays = overlays if matched.overlays is None else matched.overlays
     reasons = _reasons_of(error) if start is None else start.failures
     left_out = () if matched is None else matched.left_out
+    contradicting = (*measured.left_out, *(() if matched is None else matched.left_out_image_points))
     return UnfinishedSurvey(
         survey=survey.name,
         unit=survey.unit,
@@ -107,6 +108,7 @@ def unfinished_survey(
         photographs=overlays,
         remarks=(
             *measured.remarks,
+            *remarks_on_contradicting(contradicting),
             *(() if start is None else start.remarks),
             *(() if matched is None else matched.remarks),
         ),

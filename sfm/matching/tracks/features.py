@@ -102,10 +102,8 @@ def sift_features(
         picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
         if hidden is not None:
-            column, row = (
-                np.rint(shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5).astype(int).T
-            )
-            points = [points[k] for k in np.flatnonzero(~hidden[shown][row, column]).tolist()]
+            at = shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5
+            points = [points[k] for k in np.flatnonzero(is_shown(hidden[shown], at)).tolist()]
         if len(points) >= max_features or shrink == 1:
             break
         shrink //= 2
@@ -125,6 +123,17 @@ def sift_features(
         np.radians([p.angle for p in points]),
         np.sqrt(descriptor / norm),
     )
+
+
+def is_shown(hidden: BoolArray, xy: FloatArray) -> BoolArray:
+    """Return which positions (px, (k, 2)) are on pixels that are not masked, (k,).
+
+    Args:
+        hidden: masked pixels, (H, W).
+        xy: positions in the photograph.
+    """
+    column, row = np.rint(xy).astype(np.int64).T
+    return np.asarray(~hidden[row, column])
 
 
 def shown_part(hidden: BoolArray | None, shape: tuple[int, ...]) -> tuple[slice, slice]:

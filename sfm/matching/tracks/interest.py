@@ -18,7 +18,7 @@ from sfm.display import counted
 from sfm.errors import GeometryError
 from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import grey_of, odd_window
-from sfm.matching.tracks.features import Features, shown_part, sift_features
+from sfm.matching.tracks.features import Features, is_shown, shown_part, sift_features
 
 DETECTORS = ("foerstner", "sift")
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75, and w >= 0.5 to 1.5 times its mean over the photograph.
@@ -286,6 +286,5 @@ def natural_points(
         shown = shown_part(hidden, photograph.shape)
         corners = np.array([shown[1].start, shown[0].start]) + foerstner_points(photograph[shown]).xy
     if hidden is not None:
-        column, row = np.rint(corners).astype(np.int64).T
-        corners = corners[~hidden[row, column]]
+        corners = corners[is_shown(hidden, corners)]
     return NaturalPoints(found.xy, found.scale, found.angle, found.descriptor, corners)

@@ -35,8 +35,9 @@ from sfm.survey.drafting.camera_groups import (
 from sfm.survey.drafting.camera_names import IN_ORDER
 from sfm.survey.drafting.camera_times import USUAL_S
 from sfm.survey.drafting.lens_models import with_lens_models
-from sfm.survey.drafting.ringed_dots import MIN_REPEATED, picture_of_rings
+from sfm.survey.drafting.ringed_dots import picture_of_rings
 from sfm.survey.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
+from sfm.survey.inputs.sources import TARGETS
 from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
@@ -307,10 +308,10 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
         lines += ["# No coded targets: points of natural texture take their place.", "[tie_points]"]
         return lines + (_lattice_lines(trial.lattice, pitch) if trial.lattice and not trial.ringed else [])
     lines += ["[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
-    if trial.fewest < MIN_REPEATED:
+    if trial.fewest < TARGETS.fewest:
         shows = counted(trial.fewest, "code")
         lines += [
-            f"# A photograph that was tried shows {shows}, and {MIN_REPEATED} orient it: texture helps.",
+            f"# A photograph that was tried shows {shows}, and {TARGETS.fewest} orient it: texture helps.",
             "[tie_points]",
         ]
     return lines

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from sfm.conventions import AnyArray
+from sfm.survey.inputs.sources import TARGETS
 from sfm.targets.codes.plate_search import has_interrupted_ring
 from sfm.targets.detect import Targets
 from sfm.targets.measure import shape_from_axes
@@ -16,7 +17,6 @@ from sfm.targets.outlines import scale_of
 
 CROP_PX, CROP_RADII = 160, 6.0  # side of the picture of a dot with its ring; half of it in radii of the dot
 SHOWN_ROWS, SHOWN_COLUMNS = 4, 6  # dots in a picture of unread rings
-MIN_REPEATED = 4  # codes that two photographs must have in common; four orient a photograph
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Ringed:
     @property
     def are_most(self) -> bool:
         """Whether most dots have rings, and they are enough for two families of codes."""
-        return len(self.crops) >= MIN_REPEATED and 2 * len(self.crops) > self.dots
+        return len(self.crops) >= TARGETS.fewest and 2 * len(self.crops) > self.dots
 
 
 def ringed_dots(name: str, grey: AnyArray, targets: Targets) -> Ringed:

@@ -20,8 +20,9 @@ from sfm.photographs.exif import read_metadata
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.runtime.progress import SILENT, Progress
-from sfm.survey.drafting.ringed_dots import MIN_REPEATED, Ringed, ringed_dots
+from sfm.survey.drafting.ringed_dots import Ringed, ringed_dots
 from sfm.survey.inputs.settings import TargetSettings
+from sfm.survey.inputs.sources import TARGETS
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.codes.boards import find_crossings, read_april_tags, reduce_photograph
@@ -156,13 +157,13 @@ def try_targets(
     plain = [files.measure(path, tagged or "none") for path in tried]  # with tags: not measured twice
     readers = list(map(_ring_reader, photographs, plain))
     counts = _repeated_rings(readers, RINGS)
-    if all(len(codes) < MIN_REPEATED for codes in counts.values()):
+    if all(len(codes) < TARGETS.fewest for codes in counts.values()):
         counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of other families
     progress.advance("rings")
     best, measured = max(counts, key=lambda family: len(counts[family])), plain
     plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
     ringed: tuple[Ringed, ...] = ()
-    if len(counts[best]) < MIN_REPEATED:
+    if len(counts[best]) < TARGETS.fewest:
         refused = {name for name, _ in unreadable}
         more = [
             paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED) if files.name(paths[k]) not in refused
@@ -173,7 +174,7 @@ def try_targets(
             measured = plain if tags == tagged else [files.measure(path, tags) for path in tried]
             counts[tags] = _repeated_codes([one.code for one in measured])
             best = max(counts, key=lambda family: len(counts[family]))
-        if plates or len(counts[best]) < MIN_REPEATED:  # else these are tags
+        if plates or len(counts[best]) < TARGETS.fewest:  # else these are tags
             ringed = tuple(map(ringed_dots, names, read_already.values(), plain))
             dots = None
             if not any(one.are_most for one in ringed):
@@ -186,14 +187,14 @@ def try_targets(
             else:
                 left_out = ((dots, "no photograph tried shows it with the first plate"),)
         progress.advance("plates of dots")
-        if not plates and len(counts[best]) < MIN_REPEATED:
+        if not plates and len(counts[best]) < TARGETS.fewest:
             rings = [read_resolved(photograph) for photograph in photographs]
             counts |= {family: _repeated_codes([one[family] for one in rings]) for family in CONCENTRIC}
             best = max(counts, key=lambda family: len(counts[family]))
-            if len(counts[best]) >= MIN_REPEATED:
+            if len(counts[best]) >= TARGETS.fewest:
                 measured = [files.measure(path, best) for path in tried]
         progress.advance("concentric tags")
-    coded = len(counts[best]) >= MIN_REPEATED and not plates
+    coded = len(counts[best]) >= TARGETS.fewest and not plates
     if coded and best in RING_NAMES:
         measured = [files.measure(path, best) for path in tried]
     return TargetTrial(
@@ -280,13 +281,13 @@ def _repeated_rings(readers: Sequence[RingReader], families: Mapping[str, int]) 
     for number, members in groupby(sorted(families, key=cells), key=cells):
         groups.append(list(members))
         most, unread = read(groups[-1], as_seen=False)
-        if most >= MIN_REPEATED:
+        if most >= TARGETS.fewest:
             likely.append(groups[-1])
             if number and most > unread:  # arcs have few numbers
                 break  # fewer rings are left for families of other numbers of cells
     for alike in likely or groups:
         most, unread = read(alike, as_seen=True)
-        if cells(alike[0]) and most >= max(MIN_REPEATED, unread + 1):
+        if cells(alike[0]) and most >= max(TARGETS.fewest, unread + 1):
             break
     return counts
 

@@ -41,6 +41,10 @@ class PhotographList:
     camera: IntArray  # index of the camera, (m,)
     folder: Path  # base folder of the names
 
+    def path_of(self) -> dict[str, Path]:
+        """Return the paths of the photographs, by their names."""
+        return dict(zip(self.names, self.paths, strict=True))
+
     def by_camera(self) -> tuple[tuple[str, ...], ...]:
         """Return the names of the photographs of each camera that has any."""
         return tuple(
@@ -141,6 +145,17 @@ class Measurements:
         if not has_file and reason.kind in ("photograph_with_few_points", "not_connected"):
             reason = remark("photographs_without_file", photographs=[image])
         return FailedImage(image, reason)
+
+
+def remarks_on_contradicting(left_out: Sequence[LeftOutPoint]) -> tuple[Remark, ...]:
+    """Return the one remark on image points that contradict one another, whatever found them.
+
+    Args:
+        left_out: image points that are not used, each with its reason.
+    """
+    kind = "image_points_contradicting"
+    names = [point.point for point in left_out if point.reason.kind == kind]
+    return (remark(kind, image_points=names),) if names else ()
 
 
 def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:

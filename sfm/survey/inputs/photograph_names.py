@@ -118,7 +118,7 @@ def _of_survey(table: Observations, survey: Survey, files: PhotographList) -> Ob
 
     @cache
     def is_of_survey(name: str) -> bool:
-        return name in known or not (table.of_control or not cameras_of_image(survey.cameras, name))
+        return name in known or (not table.of_control and bool(cameras_of_image(survey.cameras, name)))
 
     kept = np.array([is_of_survey(name) for name in table.image])
     if not kept.any():

@@ -91,7 +91,7 @@ def cover_photographs(
     fits = _fitting_rays(network, estimate)
     if not fits.any():
         return None
-    path_of = dict(zip(files.names, files.paths, strict=True))
+    path_of = files.path_of()
     paths = [path_of[name] for name in network.images]
     photographs = PhotographFiles(paths)
     surface = seen.select(fits)

@@ -114,7 +114,7 @@ def match_templates(
     on_surface, normal = planes_at(estimate, camera, i, xy, neighbours)
     normal = np.where(np.isfinite(normal), normal, estimate.rotation[i][:, 2])
 
-    parts = [scene.seen.select(NONE)]
+    grey, parts = grey_of(scene.grey[i].pixels), [scene.seen.select(NONE)]
     lost, alike = np.arange(len(xy), dtype=np.int64), NONE
     for side_px in (windows.side_px, 2 * windows.side_px - 1):
         if not len(lost):
@@ -129,7 +129,8 @@ def match_templates(
         for _ in range(2):  # the rays of the first time correct the places, so that all others find them
             matched = _matched(scene, i, xy, normal, candidates, replace(windows, side_px=side_px), jobs)
             candidates = matched
-        pixels = independent_pixels(grey_of(scene.grey[i].pixels), xy, side_px)
+        pixels = np.full(len(xy), np.nan)
+        pixels[lost] = independent_pixels(grey, xy[lost], side_px)
         rays, doubtful = _most_alike(matched, pixels, levels)
         parts.append(rays)
         alike = np.union1d(alike, doubtful)  # larger windows would only lose some of the places

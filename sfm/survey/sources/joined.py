@@ -114,7 +114,7 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
         next((part.files for part in parts if part.files is not None), None),
         next((part.photographs for part in parts if part.photographs is not None), None),
         next((part.naming for part in parts if part.naming.names), NO_NAMES),
-        (*(said for part in parts for said in part.remarks), *repeated.remarks, *unread),
+        (*(said for part in parts for said in part.remarks), *repeated.of_sources, *unread),
         (*(point for part in parts for point in part.left_out), *repeated.left_out),
         tuple(parts),
     )
@@ -161,15 +161,6 @@ class _Repeated:
         return tuple(
             LeftOutPoint(name, 2, remark("image_points_contradicting", image_points=name))
             for name in self.contradicting
-        )
-
-    @property
-    def remarks(self) -> tuple[Remark, ...]:
-        """Remarks on sources and image points that contradict one another."""
-        names = self.contradicting
-        return (
-            *self.of_sources,
-            *((remark("image_points_contradicting", image_points=names),) if names else ()),
         )
 
     def after(self, measured: Measurements) -> _Repeated:

@@ -158,7 +158,7 @@ def match_marks(
 def _paths_of(oriented: Oriented) -> dict[str, Path]:
     """Return the files of the photographs, by their names."""
     files = oriented.measured.files
-    return {} if files is None else dict(zip(files.names, files.paths, strict=True))
+    return {} if files is None else files.path_of()
 
 
 def _scene_of(oriented: Oriented) -> TemplateScene:

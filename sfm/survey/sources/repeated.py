@@ -33,19 +33,13 @@ class MergedImagePoints:
     dropped_rows: int  # number of image points that are left out
 
     def remarks(self, images: tuple[str, ...], points: tuple[str, ...]) -> tuple[Remark, ...]:
-        """Return the remarks on repeated image points."""
-        kinds = {
-            "image_points_averaged": self.averaged,
-            "image_points_contradicting": self.dropped,
-        }
-        same = [f"{points[j]} in {images[i]}" for i, j in self.same]
+        """Return the remarks on repeated image points that are used."""
+        same, averaged = (
+            [f"{points[j]} in {images[i]}" for i, j in pairs] for pairs in (self.same, self.averaged)
+        )
         return (
             *((remark("rows_identical", rows=same),) if same else ()),
-            *(
-                remark(kind, image_points=[f"{points[j]} in {images[i]}" for i, j in pairs])
-                for kind, pairs in kinds.items()
-                if pairs
-            ),
+            *((remark("image_points_averaged", image_points=averaged),) if averaged else ()),
         )
 
 
