@@ -33,10 +33,10 @@ DIGITS, MAX_DIGITS = 3, 12  # significant digits of a number; more distinguish i
 # Square of the largest over the smallest length that a survey may state: no number of a survey is larger.
 LARGEST_SAID = (1e12 / 1e-9) ** 2
 MIN_PROBABILITY = 1e-3  # smaller probabilities are written as "p < 0.001"
-# A result that shifts by fewer standard deviations stays within the limits that users expect: they contain
-# 99.7 % of normally distributed errors (Pukelsheim 1994, "The three sigma rule", The American Statistician
-# 48(2)).
+# Noise stays below this number of standard deviations in 99.7 % of all cases (Pukelsheim 1994, "The three
+# sigma rule", The American Statistician 48(2)); a result that shifts by the rest only is not wrong with it.
 EXPECTED_SIGMAS = 3.0
+HARMLESS_SIGMAS = WRONG_SIGMAS - EXPECTED_SIGMAS
 NOUNS = {  # subjects of remarks, by their names in the data
     # plates, by their codes
     "aprilgrid": "AprilGrid",
@@ -102,7 +102,7 @@ class Grade:
     number: str
     warning: float = -np.inf
     error: float = np.inf
-    also: Grade | None = None  # grade of another number; the more serious severity counts
+    also: Grade | None = None  # of another number, if there is one; the more serious severity counts
     at_most: Grade | None = None  # grade of another number; the less serious severity counts
 
     def severity_of(self, one: Remark) -> Severity:
@@ -110,7 +110,7 @@ class Grade:
         found = self.of(one.number(self.number))
         if self.at_most is not None:
             found = max(found, self.at_most.severity_of(one), key=SEVERITIES.index)
-        if self.also is not None:
+        if self.also is not None and self.also.number in one.numbers:
             found = min(found, self.also.severity_of(one), key=SEVERITIES.index)
         return found
 

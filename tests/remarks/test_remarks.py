@@ -99,7 +99,7 @@ def test_what_wrong_coordinates_pull_away_is_not_told_beside_them() -> None:
     for shift, severity, left in (
         (16.0, "error", ()),
         (4.0, "warning", ()),
-        (2.0, "note", (high, pulled[1])),
+        (1.9, "note", (high, pulled[1])),
     ):
         cause = remark("given_not_exact", of="control", sigma=(0.1, "mm"), shift=shift)
         assert cause.severity == severity
@@ -142,7 +142,7 @@ LIMITS: dict[
     "checks_differ": ("more", 0.0, 1.0),
     "rig_contradicted": ("share", 0.0, 0.5),
     "image_sigmas": ("factor", 0.0, 2.0),
-    "given_not_exact": ("shift", 3.0, 5.0),
+    "given_not_exact": ("shift", 2.0, 5.0),
     "given_scatter": ("share", 0.2, None),
     "photographs_missing": ("share", 0.0, 0.5),
     "c_far_from_given": ("share", 5e-4, None),
@@ -151,8 +151,8 @@ LIMITS: dict[
     "margin_not_calibrated": ("rms", 0.51, 1.0),
     "principal_point_far": ("share", 0.1, None),
     "pixels_distorted": ("share", 0.01, 0.05),
-    "windows_elsewhere": ("shift", 3.0, None),
-    "photographs_differ": ("shift", 3.0, None),
+    "windows_elsewhere": ("shift", 2.0, None),
+    "photographs_differ": ("shift", 2.0, None),
     "windows_disagree": ("share", 0.3, 0.6),
     "second_motion": ("share", 0.01, 0.05),
     "still_features": ("share", 0.05, None),
@@ -205,9 +205,13 @@ def test_alternatives_that_shift_coordinates_have_one_grade() -> None:
     for kind in SHIFTING:
         severity = [
             Remark(kind, numbers={"shift": Quantity(shift), "wrong": Quantity(rms)}).severity
-            for shift, rms in ((2.9, 1.0), (3.1, 1.0), (100.0, 4.9), (100.0, 5.1), (5.1, 5.1))
+            for shift, rms in ((1.9, 1.0), (2.1, 1.0), (100.0, 4.9), (100.0, 5.1), (5.1, 5.1))
         ]
         assert severity == ["note", "warning", "warning", "error", "error"], kind
+        slight = {"shift": Quantity(1.0), "wrong": Quantity(1.0)}
+        for otherwise, expected in ((1.9, "note"), (2.1, "warning"), (9.0, "warning")):
+            one = Remark(kind, numbers=slight | {"otherwise": Quantity(otherwise)})
+            assert one.severity == expected
 
 
 def test_every_kind_is_made_somewhere_and_only_kinds_are_made() -> None:
@@ -392,7 +396,7 @@ def test_a_cause_is_as_serious_as_what_it_explains() -> None:
     assert (cause.severity, strained.severity) == ("warning", "error")
     verdict = judge([strained, cause], HEADLINES)  # type: ignore[arg-type]
     assert verdict.level == "bad" and kinds_of(verdict.remarks) == ("other_camera",)
-    slight = Remark("other_camera", parts, numbers | {"shift": Quantity(2.0), "wrong": Quantity(2.0)})
+    slight = Remark("other_camera", parts, numbers | {"shift": Quantity(1.9), "wrong": Quantity(1.9)})
     assert kinds_of(judge([strained, slight], HEADLINES).remarks) == ("given_strained", "other_camera")  # type: ignore[arg-type]
 
 

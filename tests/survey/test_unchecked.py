@@ -9,6 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.camera import pixel_from_tangents
 from sfm.distributions import LEVEL
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings, remarks_on_unchecked
@@ -51,8 +52,8 @@ def test_the_scale_of_one_bar_is_unchecked() -> None:
 
 def test_only_given_points_in_space_check_the_handedness() -> None:
     network, truth = _scene("handedness")
-    seen, last = network.image_points, np.array(truth.cameras[0].size_px) - 1
-    turned_over = replace(seen, xy=seen.xy * (1, -1) + (0, last[1]))
+    seen, centre = network.image_points, pixel_from_tangents(truth.cameras[0], np.zeros((1, 2)))
+    turned_over = replace(seen, xy=centre + (seen.xy - centre) * (1, -1))  # y0 stays right
     mirrored = replace(network, image_points=turned_over)
     bars = (_bar(truth, 0, 9), _bar(truth, 1, 8))
     chosen = [0, 5, 9, 14, 20, 25]

@@ -11,7 +11,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -35,10 +35,12 @@ from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
 from sfm.judgement.hypotheses.refit import (
     Refit,
+    effects_of,
     log_likelihood_of,
     precision_factor,
     readjusted,
     refit,
+    shift_of_cameras,
     shifts_of,
     spread_of_photographs,
     unchecked_assumptions,
@@ -78,7 +80,19 @@ class Cause:
 
     alternative: Alternative
     refit: Refit
-    as_well: tuple[Alternative, ...]  # other causes that explain the image points almost as well
+    as_well: tuple[tuple[Alternative, Refit], ...]  # other causes that explain almost as much
+
+    @property
+    def otherwise(self) -> float | None:
+        """Largest shift by another cause that explains the image points almost as well; None if unknown."""
+        known = [found.shift for _, found in self.as_well if np.isfinite(found.shift)]
+        return max(known, default=None)
+
+    @property
+    def matters(self) -> bool:
+        """Whether it, or another that explains as much, shifts the result; an unknown shift (NaN) does."""
+        every = (self.refit, *(found for _, found in self.as_well))
+        return any(not found.shift < MIN_NAMED_SIGMAS for found in every)
 
     @property
     def evidence(self) -> float:
@@ -192,9 +206,7 @@ def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | 
     if held is None:
         return None
     cause = _best(held, beside=() if free is None else _with_free_shape(held, free))
-    if cause is None or (
-        cause.refit.shift < MIN_NAMED_SIGMAS and cause.alternative.kind != "shape_of_control"
-    ):
+    if cause is None or not (cause.matters or cause.alternative.kind == "shape_of_control"):
         return None
     return cause
 
@@ -209,7 +221,7 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
         without: name of what fixes all coordinates of the result, so that only those of `plain` shift.
     """
     one, found = cause.alternative, cause.refit
-    instead = tuple(dict.fromkeys(other.kind for other in cause.as_well))
+    instead = tuple(dict.fromkeys(other.kind for other, _ in cause.as_well))
     parts = one.family.parts(one, found.adjustment, found.beta, unit)
     of = "coordinates" if without is None else f"coordinates without {without}"
     if plain.datum == "control":
@@ -221,7 +233,7 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
         wrong = factor = precision_factor(plain)
     rms = None if of == "cameras" else found.rms
     size = {"shift": found.shift, "wrong": wrong, "rms": rms, "factor": factor}
-    return remark(one.kind, of=of, **size, instead=instead or None, **parts)
+    return remark(one.kind, of=of, **size, instead=instead or None, otherwise=cause.otherwise, **parts)
 
 
 def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
@@ -236,9 +248,7 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
         if found is None:
             break
         causes = _still_needed(plain, causes, found)
-    return tuple(
-        one for one in _with_joint_shifts(plain, causes) if not one.refit.shift < MIN_NAMED_SIGMAS
-    )  # an unknown shift (NaN) counts as large
+    return tuple(one for one in _with_joint_shifts(plain, causes) if one.matters)
 
 
 def _best(
@@ -272,40 +282,28 @@ def _best(
         if of_kind[cause[0]] <= MAX_TRIED:
             to_try.append(one)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
-    tried = [
-        (one, refit(plain, one, current, before, most=int(MAX_WORK / work)))
-        for one in reported("alternatives adjusted", to_try, len(to_try))
-    ]
-    holding = [
-        (
-            min(
-                one.deflated(found.gain, reduced.redundancy),
-                _beyond_spread(one, found, reduced.redundancy, before) if causes else np.inf,
-            )
-            - one.price,
-            one,
-            found,
-        )
-        for one, found in (*tried, *beside)
-        if found is not None
-    ]
-    most, best, adjusted = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
-    if best is None or adjusted is None or not most > np.log(1 / level):
+
+    def adjusted(some: Iterable[Alternative]) -> list[tuple[float, Alternative, Refit]]:
+        found = [(one, refit(plain, one, current, before, most=int(MAX_WORK / work))) for one in some]
+        return [(evidence(one, new), one, new) for one, new in found if new is not None]
+
+    def evidence(one: Alternative, found: Refit) -> float:
+        beyond = _beyond_spread(one, found, reduced.redundancy, before) if causes else np.inf
+        return min(one.deflated(found.gain, reduced.redundancy), beyond) - one.price
+
+    holding = adjusted(reported("alternatives adjusted", to_try, len(to_try)))
+    holding += [(evidence(one, found), one, found) for one, found in beside]
+    most, best, new = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
+    if best is None or new is None or not most > np.log(1 / level):
         return None
-    if not adjusted.finished:
-        adjusted = refit(plain, best, current, before) or adjusted
-    evidence_of = {id(one): evidence for evidence, one, _ in holding}
-    near = tuple(
-        one
-        for one in once.values()
-        if one.kind != best.kind
-        and (
-            most - evidence_of[id(one)] < MIN_LEAD
-            if id(one) in evidence_of
-            else abs(best.evidence - one.evidence) < MIN_LEAD
-        )
-    )
-    return Cause(best, adjusted, near)
+    if not new.finished:
+        new = refit(plain, best, current, before) or new
+    # a large error makes photographs differ, whatever caused it: that separates it from no other explanation
+    near, kinds = best.evidence_beside_spread - MIN_LEAD, {one.kind for _, one, _ in holding}
+    rivals = {one.kind: one for one in reversed(every) if one.evidence_beside_spread > near}
+    holding += adjusted([one for kind, one in rivals.items() if kind not in kinds])
+    as_well = [each for each in holding if each[1].kind != best.kind and most - each[0] < MIN_LEAD]
+    return Cause(best, new, tuple((one, found) for _, one, found in as_well))
 
 
 def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternative, Refit]]:
@@ -338,7 +336,7 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
         price=price,
         redundancy=held.redundancy,
     )
-    return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
+    return [(one, Refit(free, beta, gain, shift_of_cameras(held, held, free, {}), float("nan")))]
 
 
 def _beyond_spread(
@@ -381,13 +379,16 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
         return causes
     last, shifted = causes[-1].refit.adjustment, []
     columns, seen = columns_of(last), last.network.image_points
-    for cause in causes:
+    reduced = reduce_adjustment(last, columns)
+    every = [(cause.alternative, cause.refit.beta) for cause in causes]
+    for number, cause in enumerate(causes):
         one, beta = cause.alternative, cause.refit.beta
         with_effect = replace(seen, xy=seen.xy + one.columns(last, columns) @ beta)
         left = readjusted(plain, replace(plain.network, image_points=with_effect), last)
         shift = rms = float("nan")
         if left is not None:
-            shift, rms = shifts_of(plain, left, last, one, beta)
+            ordered = (*every[:number], *every[number + 1 :], every[number])
+            shift, rms = shifts_of(plain, left, last, one, beta, effects_of(last, reduced, columns, ordered))
         shifted.append(replace(cause, refit=replace(cause.refit, shift=shift, rms=rms)))
     return tuple(shifted)
 

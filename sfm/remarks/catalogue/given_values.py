@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sfm.conventions import SWELLING
-from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
+from sfm.remarks.kind import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
 
 DATUM = (
     Kind(
@@ -191,7 +191,7 @@ ROWS = (
     Kind(
         "given_not_exact",
         # The test is on the differences; a result that they hardly shift is not harmed.
-        Grade("shift", warning=EXPECTED_SIGMAS, error=WRONG_SIGMAS),
+        Grade("shift", warning=HARMLESS_SIGMAS, error=WRONG_SIGMAS),
         "Coordinates of {of:@}, held fixed, differ by {sigma} from the network of the image points, more "
         "than by chance. This shifts the result by up to {shift} of its standard deviations, which do "
         "not include it.",

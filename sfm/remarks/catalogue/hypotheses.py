@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sfm.remarks.kind import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind
+from sfm.remarks.kind import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 # sigma_px is a rough guess, so the global test alone says little. Of the planted faults of
 # tests/survey/faults.py, three of each kind, a coordinate was wrong by more than WRONG_SIGMAS in 7 of 95 with
@@ -110,9 +110,15 @@ ADJUSTMENT = (
 )
 # `shift`: standard deviations by which the alternative moves the coordinate that it moves most, or the
 # parameter of a camera. `wrong`: the same; 0 where the image points concerned are rejected anyway.
-SHIFT = Grade("shift", warning=EXPECTED_SIGMAS, also=Grade("wrong", warning=WRONG_SIGMAS, error=WRONG_SIGMAS))
+# `otherwise`: the largest shift by another cause that explains the image points as well.
+OTHERWISE = Grade("otherwise", warning=HARMLESS_SIGMAS)
+WRONG = Grade("wrong", warning=WRONG_SIGMAS, error=WRONG_SIGMAS, also=OTHERWISE)
+SHIFT = Grade("shift", warning=HARMLESS_SIGMAS, also=WRONG)
 SHIFTED = "{of:@} shift by up to {shift} standard deviations[[, {rms} RMS]]."
-INSTEAD = "[[ The image points do not separate this from: {instead}.]]"
+INSTEAD = (
+    "[[ The image points do not separate this from: {instead}.]]"
+    "[[ That shifts them by up to {otherwise} standard deviations.]]"
+)
 # Kinds that follow if a camera that changed, or a plate that slipped, bends the network.
 OF_GIVEN = ("given_contradicted", "given_strained", "plate_sizes_contradict", "shape_of_control")
 ROWS: tuple[Kind, ...] = (
@@ -230,7 +236,7 @@ ROWS: tuple[Kind, ...] = (
     ),
     Kind(
         "photographs_differ",
-        Grade("shift", warning=EXPECTED_SIGMAS),
+        Grade("shift", warning=HARMLESS_SIGMAS),
         "Up to {first} and from {next} on, the photographs give different points: {count:point} "
         "{count:differs|differ} by {times} times their standard deviations (RMS). Coordinates shift by up to "
         "{shift} standard deviations.",
@@ -240,7 +246,7 @@ ROWS: tuple[Kind, ...] = (
     ),
     Kind(
         "windows_elsewhere",
-        Grade("shift", warning=EXPECTED_SIGMAS),  # of these points alone
+        Grade("shift", warning=HARMLESS_SIGMAS),  # of these points alone
         "From {from} on, the windows of {points:point} show a different spot, up to {distance} away, "
         f"{{shift}} standard deviations: {{points}}.{INSTEAD}",
         "an edge in front of another surface, shine, shadows, or something that moved",
