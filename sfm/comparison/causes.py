@@ -151,7 +151,7 @@ def find_cause(
     if not changed:
         rows = [row for row in rows if row == Row(scale=True)]
     elif nothing.agreed:  # a majority agrees without any cause
-        rows = [row for row in rows if not (row.mirror or (deforms and (row.strain or row.bending)))]
+        rows = [row for row in rows if not row.mirror]
     best = nothing
     for row in rows:
         if row.names and best.agreed and best.stable.sum() == reference.sum():
@@ -160,6 +160,8 @@ def find_cause(
             fit = _fit(pairs, row, nothing, reference, cost)
             if fit is not None and fit.agreed and best.L + limit < fit.L:
                 best = fit
+    if deforms and nothing.agreed and (best.row.strain or best.row.bending):
+        return None  # the points that moved tell more; a scale would only hide some of them
     if best is not nothing:
         return _cause(best, pairs, best.L - nothing.L)
     if changed and not nothing.agreed and is_unrelated(pairs.a, pairs.b):

@@ -75,11 +75,12 @@ def find_optimum(
     if reject == "tau":
         optimum, weight = _snoop_all(run, optimum, weight, alpha)
     else:
-        robust, factor = _reweight(run, optimum, weight, huber_weights)
+        bends = _distorting_points(run, optimum, weight)
+        out = bends if reject == "tukey" else None  # even bounded, their influence may hide a good one
+        robust, factor = _reweight(run, optimum, weight, huber_weights, out=out)
         if _distorted_photographs(run, state, robust.state).any():
             robust, factor = optimum, weight
             if reject == "huber":
-                bends = _distorting_points(run, optimum, weight)
                 robust, factor = _reweight(run, optimum, weight, huber_weights, out=bends)
         if reject == "tukey":
             robust, factor = _reweight(run, robust, factor, tukey_weights)

@@ -234,7 +234,9 @@ def inflation(
     used = weight > 0
     w = weight[used]
     others = count - 2 * len(w)
-    psi2 = vPv - float((w * (1 - w)) @ residual_lengths(observations, residuals)[used] ** 2)
+    squares = residual_lengths(observations, residuals)[used] ** 2
+    # the other observations count with what v'Pv exceeds by, which is rounding where there are none
+    psi2 = float(w**2 @ squares) + max(vPv - float(w @ squares), 0.0)
     slope = np.concatenate([slopes[used].ravel(), np.ones(others)])
     mean = float(slope.mean())
     K = 1 + (count - redundancy) / count * float(slope.var()) / mean**2
