@@ -22,8 +22,8 @@ from sfm.judgement.hypotheses.hypotheses import (
     judge_alternatives,
     remark_of,
 )
-from sfm.judgement.hypotheses.refit import Effects, Refit, effects_of, log_likelihood_of, shifts_of
-from sfm.judgement.hypotheses.score import Gain, reduce_adjustment
+from sfm.judgement.hypotheses.refit import Refit, log_likelihood_of, shifts_of
+from sfm.judgement.hypotheses.score import Gain
 from sfm.network import ScaleBars
 from sfm.remarks.remark import Remark
 from sfm.similarity import fit_similarity
@@ -195,64 +195,29 @@ def test_the_likelihood_spreads_rejected_points_over_their_photograph(a: Adjustm
     assert log_likelihood_of(replace(a, rejected=out)) == pytest.approx(plain - 3 * np.log(2000 * 1500))
 
 
-def without_uncertainty(a: Adjustment, q: int) -> Effects:
-    return Effects(np.zeros((q, 1)), np.zeros((len(a.network.points), 3, 1)), {})
-
-
 def moved_points(a: Adjustment, points: FloatArray) -> Adjustment:
     return replace(a, estimate=replace(a.estimate, points=points))
 
 
 def test_shifts_are_in_standard_deviations_after_a_similarity(a: Adjustment) -> None:
     X, sigma = a.estimate.points, np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
-    one, beta, certain = alternative("c"), np.zeros(1), without_uncertainty(a, 1)
+    one, beta = alternative("c"), np.zeros(1)
     turned = 1.3 * X @ np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).T + (3.0, 2.0, 1.0)
-    assert shifts_of(a, a, moved_points(a, turned), one, beta, certain) == pytest.approx((0, 0), abs=1e-6)
+    assert shifts_of(a, a, moved_points(a, turned), one, beta) == pytest.approx((0, 0), abs=1e-6)
     # points that the similarity does not see: the shift of a moved point is its whole difference
     Y = X.copy()
     Y[4] += (0.0, 6 * sigma[4, 1], 0.0)
     still = alternative("moved", points=(4,))
-    largest, rms = shifts_of(a, a, moved_points(a, Y), still, np.zeros(3), without_uncertainty(a, 3))
+    largest, rms = shifts_of(a, a, moved_points(a, Y), still, np.zeros(3))
     assert (largest, rms) == pytest.approx((6.0, 6 / np.sqrt(3 * len(X))))
     # what the alternative takes out of the coordinates counts where it is more
-    away = np.array([0.0, 0.0, -9 * sigma[4, 2]])
-    largest, rms = shifts_of(a, a, moved_points(a, Y), still, away, without_uncertainty(a, 3))
+    largest, rms = shifts_of(a, a, moved_points(a, Y), still, np.array([0.0, 0.0, -9 * sigma[4, 2]]))
     assert (largest, rms) == pytest.approx((9.0, 9 / np.sqrt(3 * len(X))))
     # a point that is not known has no part
     Y[4] = np.nan
-    assert shifts_of(a, a, moved_points(a, Y), one, beta, certain) == pytest.approx((0, 0), abs=1e-6)
+    assert shifts_of(a, a, moved_points(a, Y), one, beta) == pytest.approx((0, 0), abs=1e-6)
     unknown = np.full_like(X, np.nan)
-    assert np.isnan(shifts_of(a, a, moved_points(a, unknown), one, beta, certain)).all()
-
-
-def test_an_uncertain_shift_is_as_large_as_its_mean_square(a: Adjustment) -> None:
-    X, sigma = a.estimate.points, np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
-    turn = np.zeros((*X.shape, 1))
-    turn[:, 0, 0], turn[:, 1, 0] = -X[:, 1], X[:, 0]  # a motion changes nothing
-    largest, rms = shifts_of(a, a, a, alternative("c"), np.zeros(1), Effects(np.ones((1, 1)), turn, {}))
-    assert (largest, rms) == pytest.approx((0.0, 0.0), abs=1e-6)
-    moved = alternative("moved", points=(4,))
-    uncertain = Effects(np.diag(3 * sigma[4]), np.zeros((*X.shape, 3)), {})
-    largest, rms = shifts_of(a, a, a, moved, 4 * sigma[4], uncertain)
-    assert (largest, rms) == pytest.approx((5.0, 5 / np.sqrt(len(X))))
-
-
-def test_parameters_that_nothing_determines_are_as_large_as_the_others(a: Adjustment) -> None:
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
-    one = alternative("moved", points=(4,), factor=(0, 0, 0, 1, 1, 1))
-    one = replace(one, gain=Gain(9.0, 3, np.ones(3)))
-    H = reduced.project(reduced.whiten(one.columns(a, columns)))[0]
-    far = effects_of(a, reduced, columns, ((one, np.full(3, 1e6)),))
-    np.testing.assert_allclose(far.parameters @ far.parameters.T, np.linalg.inv(H), rtol=1e-6)
-    everywhere = replace(one, factor=np.ones(6))  # the point itself, which the adjustment places anywhere
-    size = 0.02
-    open_ = effects_of(a, reduced, columns, ((everywhere, np.full(3, size)),))
-    expected = size**2 * np.eye(3)
-    np.testing.assert_allclose(open_.parameters @ open_.parameters.T, expected, atol=1e-6 * size**2)
-    np.testing.assert_allclose(open_.points[4] @ open_.points[4].T, expected, atol=1e-3 * size**2)
-    kept = effects_of(a, reduced, columns, ((everywhere, np.zeros(3)),))
-    assert not kept.parameters.any() and not kept.points.any()
+    assert np.isnan(shifts_of(a, a, moved_points(a, unknown), one, beta)).all()
 
 
 def test_a_deformation_counts_from_its_mean(a: Adjustment) -> None:

@@ -51,5 +51,5 @@ def test_two_cameras_under_one_name_are_no_good_survey(store: Path) -> None:
     """Coordinates are then off by 1.7 stated standard deviations (RMS) from those with two cameras."""
     found = one_camera(store)
     print(found.line())
-    assert found.level == "fair" and found.reason.startswith("The camera changes between photographs, ")
+    assert found.level == "fair" and found.reason.startswith("The camera changes between photographs")
     assert "Standard deviations are too small, by a factor of 1." in found.reason

@@ -35,12 +35,10 @@ from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import HELD, MOVED, Alternative, InteriorFamily, PointFamily
 from sfm.judgement.hypotheses.refit import (
     Refit,
-    effects_of,
     log_likelihood_of,
     precision_factor,
     readjusted,
     refit,
-    shift_of_cameras,
     shifts_of,
     spread_of_photographs,
     unchecked_assumptions,
@@ -336,7 +334,7 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
         price=price,
         redundancy=held.redundancy,
     )
-    return [(one, Refit(free, beta, gain, shift_of_cameras(held, held, free, {}), float("nan")))]
+    return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
 
 
 def _beyond_spread(
@@ -379,16 +377,13 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
         return causes
     last, shifted = causes[-1].refit.adjustment, []
     columns, seen = columns_of(last), last.network.image_points
-    reduced = reduce_adjustment(last, columns)
-    every = [(cause.alternative, cause.refit.beta) for cause in causes]
-    for number, cause in enumerate(causes):
+    for cause in causes:
         one, beta = cause.alternative, cause.refit.beta
         with_effect = replace(seen, xy=seen.xy + one.columns(last, columns) @ beta)
         left = readjusted(plain, replace(plain.network, image_points=with_effect), last)
         shift = rms = float("nan")
         if left is not None:
-            ordered = (*every[:number], *every[number + 1 :], every[number])
-            shift, rms = shifts_of(plain, left, last, one, beta, effects_of(last, reduced, columns, ordered))
+            shift, rms = shifts_of(plain, left, last, one, beta)
         shifted.append(replace(cause, refit=replace(cause.refit, shift=shift, rms=rms)))
     return tuple(shifted)
 

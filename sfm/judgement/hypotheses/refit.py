@@ -15,7 +15,7 @@ Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6.4.2.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,7 +49,6 @@ from sfm.judgement.hypotheses.score import (
     MIN_DETERMINED_SHARE,
     Reduced,
     directions_of,
-    free_interior,
     gain_of,
     least_share,
     reduce_adjustment,
@@ -122,8 +121,7 @@ def refit(
         beta = beta + step
     gained = log_likelihood_of(current) - log_likelihood_of(start)
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
-    open_ = effects_of(current, reduced, columns, tuple(zip(every, parts, strict=True)))
-    shift, rms = shifts_of(plain, start, current, one, parts[-1], open_)
+    shift, rms = shifts_of(plain, start, current, one, parts[-1])
     return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
 
 
@@ -190,58 +188,13 @@ def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:
     )
 
 
-@dataclass(frozen=True)
-class Effects:
-    """What one standard deviation of each independent combination of an alternative's parameters changes."""
-
-    parameters: FloatArray  # the combinations, (q, q)
-    points: FloatArray  # shifts of object points, (n, 3, q)
-    interior: dict[tuple[str, str], float]  # what all of them change each free interior parameter by, RMS
-
-
-def effects_of(
-    a: Adjustment, reduced: Reduced, columns: Columns, every: Sequence[tuple[Alternative, FloatArray]]
-) -> Effects:
-    """Return what the uncertainty of an alternative leaves open in the adjustment with it.
-
-    Its parameters that the image points do not determine are as large as those that they determine: normal,
-    with the mean square of the adjusted ones as variance. Left out, they would count as known to be zero.
-
-    Args:
-        a: adjustment with the alternatives.
-        reduced: its normal equations.
-        columns: derivatives of its image points.
-        every: the alternatives with their parameters, adjusted jointly; the uncertainty of the last counts.
-
-    Source: Robinson (1991), Statistical Science 6(1), 15-32 (prediction of random effects).
-    """
-    D = reduced.whiten(_side_by_side([one for one, _ in every], a, columns))
-    size = np.concatenate(
-        [np.full(len(beta), np.sqrt((beta**2).sum() / max(one.gain.rank, 1))) for one, beta in every]
-    )
-    H = reduced.project(D)[0]
-    Q = size[:, None] * np.linalg.inv(size[:, None] * H * size + np.eye(len(size))) * size
-    q = len(every[-1][1])
-    values, vectors = np.linalg.eigh(Q[-q:, -q:])
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    by_points, by_cameras, _ = reduced.absorb(D[:, :, -q:])
-    keys, units = free_interior(a)
-    spread = np.linalg.norm(by_cameras[6 * reduced.photographs :] @ root, axis=1) * units
-    return Effects(root, by_points @ root, dict(zip(keys, spread.tolist(), strict=True)))
-
-
 def shifts_of(
-    plain: Adjustment,
-    before: Adjustment,
-    other: Adjustment,
-    one: Alternative,
-    beta: FloatArray,
-    effects: Effects,
+    plain: Adjustment, before: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
 ) -> tuple[float, float]:
-    """Return the largest and the RMS error by an alternative, beside noise, in standard deviations.
+    """Return the largest and the RMS change of the result of a survey, in standard deviations.
 
-    The error is the change of coordinates after a similarity, root mean square over the uncertainty of the
-    parameters of the alternative. With control, coordinates are given, and the change is that of the cameras.
+    The change is that of coordinates after a similarity. With control, coordinates are given, and the change
+    is that of the cameras.
 
     Args:
         plain: adjustment that states the standard deviations.
@@ -249,10 +202,9 @@ def shifts_of(
         other: adjustment with the alternative.
         one: the alternative.
         beta: parameters of the alternative, (q,).
-        effects: what their uncertainty changes.
     """
     if plain.datum == "control":
-        return shift_of_cameras(plain, before, other, effects.interior), float("nan")
+        return _shift_of_cameras(plain, before, other), float("nan")
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
@@ -262,36 +214,19 @@ def shifts_of(
         moved = fit_similarity(Y[known & stays], X[known & stays]).apply(Y) - X
     except GeometryError:
         return float("nan"), float("nan")
-    combinations = [one.family.displaced(one, X, each) for each in effects.parameters.T]
-    squares = [
-        (change**2 + (uncertain**2).sum(axis=2))[known] / sigma[known] ** 2
-        for change, uncertain in (
-            (moved, without_motions(X, effects.points)),
-            (one.family.displaced(one, plain.estimate.points, beta), np.stack(combinations, axis=2)),
-        )
-    ]
-    largest = max(float(part.max(initial=0.0)) for part in squares)
-    return float(np.sqrt(largest)), float(np.sqrt(max(part.mean() for part in squares)))
+    change = moved[known] / sigma[known]
+    away = one.family.displaced(one, plain.estimate.points, beta)[known] / sigma[known]
+    largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
+    return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
 
 
-def shift_of_cameras(
-    plain: Adjustment, before: Adjustment, other: Adjustment, uncertain: Mapping[tuple[str, str], float]
-) -> float:
-    """Return the largest change of determined interior parameters, in standard deviations.
-
-    Args:
-        plain: adjustment that states the standard deviations.
-        before: adjustment without the alternative.
-        other: adjustment with the alternative.
-        uncertain: standard deviation of each parameter, by (camera or group, name), that the parameters of
-            the alternative cause; 0 where it is missing.
-    """
+def _shift_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> float:
+    """Return the largest change of determined interior parameters, in standard deviations."""
     largest = 0.0
     for k, (one, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
         sigma = plain.interior_sigma(k)
         known = np.isfinite(sigma) & (sigma > 0)
-        left = np.array([uncertain.get((one.owner_of(s), name), 0.0) for s, name in enumerate(one.names)])
-        change = np.hypot(changed.parameters - one.parameters, left)[known] / sigma[known]
+        change = np.abs((changed.parameters - one.parameters)[known] / sigma[known])
         largest = max(largest, float(change.max(initial=0.0)))
     return largest
 

@@ -259,29 +259,13 @@ def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, 
     return found
 
 
-def free_interior(a: Adjustment) -> tuple[list[tuple[str, str]], FloatArray]:
-    """Return the free interior parameters of normal equations, and the change of each for one unit, (i,).
-
-    Args:
-        a: adjustment.
-
-    Returns:
-        (camera or group, parameter name) of each, and its changes.
-    """
-    _, keys, units = interior_columns(a, _free_ones(a))
-    return keys, np.array(units)
-
-
-def _free_ones(a: Adjustment) -> list[tuple[int, int]]:
-    """Return (camera, parameter) of each free interior parameter of a camera that is used."""
-    used, cameras = np.unique(a.network.camera).tolist(), a.estimate.cameras
-    return [(index, int(s)) for index in used for s in np.flatnonzero(cameras[index].free)]
-
-
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the columns of free interior parameters, (k, 2, i), and weight and slope of given values."""
     network, cameras = a.network, a.estimate.cameras
-    columns, keys, units = interior_columns(a, _free_ones(a))
+    used = np.unique(network.camera).tolist()
+    columns, keys, units = interior_columns(
+        a, [(index, int(s)) for index in used for s in np.flatnonzero(cameras[index].free)]
+    )
     given = network.interior
     rows, per_unit, off = [], [], []
     for row, (index, s) in enumerate(zip(given.camera.tolist(), given.parameter.tolist(), strict=True)):
