@@ -87,7 +87,7 @@ def _principal_sigma_px(result: SurveyResult, number: int) -> float:
     """Return the larger standard deviation of the two principal point coordinates, px; 0 if held."""
     camera = result.adjustment.estimate.cameras[number]
     sigma = np.nan_to_num(result.adjustment.interior_sigma(number)[camera.parts[1]], nan=0.0)
-    return float(sigma.max() / (np.mean(camera.pixel_mm) if camera.in_mm else 1.0))
+    return float(sigma.max()) / (float(np.mean(camera.pixel_mm)) if camera.in_mm else 1.0)
 
 
 def _pixels(result: SurveyResult) -> tuple[Remark, ...]:

@@ -88,7 +88,9 @@ def resampled(store: Path, folder: Path) -> Outcome:
         move = np.array([[FACTOR, 0, (1 - FACTOR) * width / 2], [0, FACTOR, (1 - FACTOR) * height / 2]])
         larger = cv2.warpAffine(picture, move, (width, height), flags=cv2.INTER_CUBIC)
         cv2.imwrite(str(folder / path.name), larger, [cv2.IMWRITE_JPEG_QUALITY, 95])
-    return outcome("camcal 3 %", _survey("camcal"), folder, store, None, ("5 of 21 resampled",))
+    survey = _survey("camcal")
+    whole = _run(survey, source, store)
+    return outcome("camcal 3 %", survey, folder, store, whole, ("5 of 21 resampled",))
 
 
 def one_camera(store: Path) -> Outcome:

@@ -109,8 +109,8 @@ def test_other_principal_distances_are_found_along_bent_valleys(number: int) -> 
 )
 def test_valleys_are_followed_to_their_lowest_point(number: int) -> None:
     found = outcome_of(number)
-    assert found.level == "fair" and found.over_sigma < 2
-    assert "c_held_contradicted" not in found.kinds
+    assert found.over_sigma < 2 and "c_held_contradicted" not in found.kinds
+    assert found.level == ("bad" if number == 309 else "fair")  # its c is known to 40 % only
 
 
 def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:

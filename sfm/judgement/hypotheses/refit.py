@@ -142,7 +142,7 @@ def _stepped(
 
 
 def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjustment | None:
-    """Adjust other image points of a network as it was adjusted; None if the adjustment does not converge.
+    """Adjust other image points of a network as it was adjusted; None without a tested solution.
 
     Args:
         plain: adjustment of the network, with the datum, weights and level of rejection.
@@ -163,7 +163,7 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
         )
     except GeometryError:
         return None
-    if not found.converged:
+    if not found.converged or found.redundancy < 1:  # it may reject all but what it needs
         return None
     return replace(found, error_correlation=plain.error_correlation)  # the best known one
 
