@@ -28,6 +28,7 @@ def log_likelihood(
     *,
     redundancy: float | None = None,
     sigma_px: float | None = None,
+    share: FloatArray | float = 1.0,
 ) -> float:
     """Return ln of the likelihood of image points.
 
@@ -39,9 +40,11 @@ def log_likelihood(
             given, every coordinate of an image point that fits counts.
         sigma_px: known standard deviation of an image coordinate, px; estimated from the squares if not
             given, but not below rounding.
+        share: what each image point counts, see `Network.share`, (k,).
     """
-    misfits = float(np.log(areas[~fits]).sum())
-    count = 2 * float(fits.sum()) if redundancy is None else redundancy
+    of_each = np.broadcast_to(share, fits.shape)
+    misfits = float((of_each * np.log(areas))[~fits].sum())
+    count = 2 * float(of_each[fits].sum()) if redundancy is None else redundancy
     if count <= 0:
         return -misfits
     least = ROUNDING**2 * float(areas.max())

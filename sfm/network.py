@@ -61,6 +61,9 @@ class Source:
     has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
     is_matched: bool = False  # whether its image points are windows that were matched with one another
     points: str = "uncoded"  # what its points are that have no code
+    # factor by which errors in common multiply the variance of what its image points tell of unknowns that they
+    # share with other sources; as many image points have the weight of one with an error of its own
+    design_effect: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,11 @@ class Network:
         """Index of the source of each image point, (k,)."""
         source = self.image_points.source
         return np.zeros(len(self.image_points), dtype=np.int64) if source is None else source
+
+    @property
+    def share(self) -> FloatArray:
+        """What each image point counts beside those of other sources, 1 without errors in common, (k,)."""
+        return np.array([1 / source.design_effect for source in self.sources])[self.source]
 
     @property
     def may_correlate(self) -> BoolArray:

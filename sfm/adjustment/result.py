@@ -59,9 +59,11 @@ class ErrorCorrelation:
     covariance in one photograph is `common` exp(-d / length_px).
     """
 
-    alone: float  # variance of the independent part over the a posteriori variance
+    # variance of the independent part over the a posteriori variance of an observation of the same weight
+    alone: float
     common: float  # variance of the common part over sigma0_px^2, that of a usual image point
     length_px: float  # distance at which the covariance of the common part has fallen to 1/e
+    design_effect: float = 1.0  # by which the weights of these image points are divided, see `Source`
 
     def sigmas_px(self, sigma0_px: float) -> tuple[float, float]:
         """Return the standard deviations of the independent and the common part of an image coordinate, px.
@@ -69,7 +71,7 @@ class ErrorCorrelation:
         Args:
             sigma0_px: a posteriori standard deviation of a usual image coordinate, px.
         """
-        return self.alone**0.5 * sigma0_px, self.common**0.5 * sigma0_px
+        return (self.alone * self.design_effect) ** 0.5 * sigma0_px, self.common**0.5 * sigma0_px
 
 
 @dataclass(frozen=True)
@@ -247,11 +249,12 @@ class Adjustment:
     @property
     def image_sigma0(self) -> float:
         """Sigma0 from the image points alone, on which the stated precision of other kinds has no effect."""
-        used, r = ~self.rejected, float(np.nansum(self.redundancy_numbers))
+        used, share = ~self.rejected, self.network.share
+        r = float(np.nansum(share[:, None] * self.redundancy_numbers))
         if not r > 0:
             return self.sigma0
         v, P = self.residuals[used], np.linalg.inv(self.image_covariance[used])
-        vPv = float(self.weights[used] @ np.einsum("ka,kab,kb->k", v, P, v))
+        vPv = float((share * self.weights)[used] @ np.einsum("ka,kab,kb->k", v, P, v))
         return self.inflation * float(np.sqrt(vPv / r))
 
     @property

@@ -30,6 +30,7 @@ class Observations(NamedTuple):
     point: IntArray  # object point of each image point, (k,)
     xy: FloatArray  # measured pixel, px, (k, 2)
     whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
+    share: FloatArray  # factor on the weight of each image point, for the errors in common of its source, (k,)
     camera: IntArray  # camera of each photograph, (m,)
     pose: IntArray  # pose of each image point, that of its photograph or of its rig, (k,)
     pose_of: IntArray  # pose of each photograph, (m,)
@@ -117,7 +118,7 @@ def collinearity(
         workspace.Ju,
         workspace.Jp,
     )
-    root = np.sqrt(weight)
+    root = np.sqrt(weight * observations.share[o])
     f00, f10, f11 = (
         root * observations.whitening[o, 0],
         root * observations.whitening[o, 1],
@@ -213,7 +214,7 @@ def _residuals(observations: Observations, state: State, weight: FloatArray, v: 
                 return np.inf
             x = observations.whitening[o, 0] * workspace.r[0]
             y = observations.whitening[o, 1] * workspace.r[0] + observations.whitening[o, 2] * workspace.r[1]
-            total += weight[o] * (x * x + y * y)
+            total += weight[o] * observations.share[o] * (x * x + y * y)
     return total
 
 

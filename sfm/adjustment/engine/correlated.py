@@ -358,7 +358,7 @@ def linearise(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Lineari
     half = solve_lower(b.L, np.tile(np.eye(3), (n, 1, 1)))
     V_inverse = half.transpose(0, 2, 1) @ half
     F = np.zeros((k, 2, 2))
-    F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = (o.whitening * np.sqrt(weight)[:, None]).T
+    F[:, 0, 0], F[:, 1, 0], F[:, 1, 1] = (o.whitening * np.sqrt(weight * o.share)[:, None]).T
     return Linearised(
         layout,
         optimum.factor,

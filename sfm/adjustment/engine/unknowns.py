@@ -220,6 +220,7 @@ def unknowns_of(
         point=np.repeat(np.arange(n), np.diff(rays_from)),
         xy=np.take(k.xy, order, axis=0).astype(float, copy=False),
         whitening=whitening_of(covariance, order),
+        share=np.take(network.share, order),
         camera=np.ascontiguousarray(network.camera, dtype=np.int64),
         pose=pose_of[np.take(k.image, order)],
         pose_of=pose_of,

@@ -11,6 +11,11 @@ square for common errors. Object points, orientations and cameras absorb a part 
 Simulation shows how much remains: random fields of known correlation length pass through the linearised
 adjustment. A field moves precise and imprecise image points by the same number of px.
 
+**Several sources.** Thousands of image points with errors in common tell little more of orientations and
+cameras than a few. Beside a source with independent errors, they would outvote it. Their design effect is the
+variance of what they tell of these unknowns, over that of independent errors of the same size. Divided by it,
+their weights are those of as many independent observations as they are worth.
+
 **Projection uncertainty.** It states how well a calibrated camera determines where a direction appears in the
 photograph. Errors of the interior orientation move the image of a distant point. The part that equals a
 rotation of the camera does not count, because every use of the camera determines the rotation again. It is
@@ -21,7 +26,8 @@ Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlati
 Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4); variance components by quadratic forms and their
 expectations, Koch (1999), sec. 3.6; nested cells, Webster and Oliver (2007), Geostatistics for Environmental
 Scientists, sec. 6.3; random fields of a given covariance, Rahimi and Recht (2007), Adv. Neural Inf. Process.
-Syst. 20; law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
+Syst. 20; design effect, Kish (1965), Survey Sampling, sec. 8.2, and Rao and Scott (1984), Annals of Statistics
+12; law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
 """
 
 from __future__ import annotations
@@ -33,8 +39,8 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_matrix
 from scipy.spatial import ConvexHull, QhullError
 
-from sfm.adjustment.covariance import marginal_of, with_error_correlation
-from sfm.adjustment.engine.correlated import linearise
+from sfm.adjustment.covariance import Marginal, marginal_of, with_error_correlation
+from sfm.adjustment.engine.correlated import Linearised, linearise
 from sfm.adjustment.engine.unknowns import interior_names
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
@@ -174,11 +180,8 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
     Returns:
         The correlation; None if the errors of neighbours do not agree.
     """
-    m = marginal_of(adjustment, cross=False)
+    m, linear, used = _correlating(adjustment)
     o = m.layout.observations
-    weight = np.ascontiguousarray(adjustment.weights[m.layout.order])
-    linear = linearise(m.optimum, m.layout, weight)
-    used = (weight > 0) & adjustment.network.may_correlate[m.layout.order]
     size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
     cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
     v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]
@@ -204,10 +207,52 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
             expected = parts[0] * alone + parts[1] * common
         if misfit < least:
             best, least = (parts / adjustment.sigma0**2, length), misfit
-    if best is None or best[0][1] == 0:
+    effect = float(1 / o.share[used].min())
+    if best is None or (best[0][1] == 0 and effect == 1):
         return None
     (of_each, of_neighbours), length_px = best
-    return ErrorCorrelation(float(of_each), float(of_neighbours), float(length_px))
+    return ErrorCorrelation(float(of_each), float(of_neighbours), float(length_px), effect)
+
+
+def _correlating(adjustment: Adjustment) -> tuple[Marginal, Linearised, BoolArray]:
+    """Return the linearised adjustment, and which image points in its order a correlation is about, (k,)."""
+    m = marginal_of(adjustment, cross=False)
+    weight = np.ascontiguousarray(adjustment.weights[m.layout.order])
+    used = (weight > 0) & adjustment.network.may_correlate[m.layout.order]
+    return m, linearise(m.optimum, m.layout, weight), used
+
+
+@checked_arguments()
+def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0) -> float:
+    """Return the factor on the variance of what image points tell of photographs and cameras, at least 1.
+
+    It is due to the correlation of the errors of neighbours that the residuals show.
+
+    Args:
+        adjustment: finished adjustment with independent errors.
+        density: ratio of the number of image points with errors in common to that in the adjustment, which
+            may be a sample.
+
+    Source: Kish (1965), Survey Sampling, sec. 8.2; Rao and Scott (1984), Annals of Statistics 12, for the mean
+    of several directions.
+    """
+    found = estimate_error_correlation(adjustment)
+    if found is None:
+        return 1.0
+    m, linear, used = _correlating(adjustment)
+    o, rng = m.layout.observations, np.random.default_rng(0)
+
+    def of_shared(errors: FloatArray) -> float:
+        """Return the squares of whitened errors that photographs and cameras, not points, absorb."""
+        errors[~used] = 0.0
+        errors = errors.reshape(2 * len(used), -1)
+        moved = errors - linear.B @ (linear.V_inverse @ (linear.B.T @ errors))
+        return float((moved**2).sum() - (linear.residuals(errors) ** 2).sum())
+
+    alone = of_shared(rng.standard_normal((len(used), 2, DRAWS)))
+    relative = adjustment.usual_px * linear.whitening
+    common = of_shared(relative @ _fields(o.image, o.xy, found.length_px, rng))
+    return max(found.alone + found.common * density * common / alone, 1.0) if alone > 0 else 1.0
 
 
 @checked_arguments()

@@ -247,8 +247,9 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
 
 def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
     """Return the variance that remains in some photographs, (m,), relative to that of all photographs."""
-    v = reduced.v[some[reduced.image]]
-    expected = v.size * reduced.redundancy / reduced.count
+    rows = some[reduced.image]
+    v = reduced.v[rows]
+    expected = 2 * float(reduced.share[rows].sum()) * reduced.redundancy / reduced.count
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
 
 

@@ -185,6 +185,7 @@ def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:
         ~a.rejected,
         areas_of_photographs(a.network, a.estimate.cameras),
         redundancy=a.redundancy + freed if a.redundancy > 0 else 0,
+        share=a.network.share,
     )
 
 

@@ -58,14 +58,15 @@ class Reduced:
     photographs: int
     redundancy: int
     xy: FloatArray  # measured position of each image point, px, (k, 2)
+    share: FloatArray  # what each image point counts, see `Network.share`, (k,)
     may_correlate: BoolArray  # image points that the correlation is about, (k,)
     correlation: ErrorCorrelation | None  # correlation of the errors of neighbours
     sigma0_px: float  # a posteriori standard deviation of a usual image coordinate, px
 
     @property
-    def count(self) -> int:
-        """Number of accepted image coordinates."""
-        return 2 * len(self.used)
+    def count(self) -> float:
+        """Number of accepted image coordinates, of which those with errors in common count in part."""
+        return 2 * float(self.share.sum())
 
     def whiten(self, columns: FloatArray) -> FloatArray:
         """Return the whitened columns of accepted image points, from columns of all (k, 2, q)."""
@@ -194,7 +195,8 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     several = np.bincount(seen.point[usable], minlength=n) > 1
     usable &= (several | fixed.any(axis=1) | weight.any(axis=(1, 2)))[seen.point]
     used = np.flatnonzero(usable)
-    P = np.linalg.inv(a.image_covariance[used]) / a.sigma0**2
+    share = network.share[used]
+    P = np.linalg.inv(a.image_covariance[used]) * (share / a.sigma0**2)[:, None, None]
     F = np.swapaxes(np.linalg.cholesky(P), 1, 2)
     image, point = seen.image[used], seen.point[used]
     v = np.einsum("kab,kb->ka", F, a.residuals[used])
@@ -223,7 +225,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
         *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
-        *(seen.xy[used], network.may_correlate[used], a.error_correlation, a.sigma0_px),
+        *(seen.xy[used], share, network.may_correlate[used], a.error_correlation, a.sigma0_px),
     )
 
 

@@ -208,7 +208,8 @@ def log_likelihood_of_all(
     """
     areas = areas_of_photographs(network, estimate.cameras)
     squares = a.sigma0_px**2 * a.redundancy
-    return log_likelihood(squares, accepted, areas, redundancy=a.redundancy + freed)
+    redundancy = a.redundancy + freed
+    return log_likelihood(squares, accepted, areas, redundancy=redundancy, share=network.share)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import cast
 
 import numpy as np
 
+from sfm.adjustment.quality.correlations import design_effect_of_neighbours
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
@@ -328,7 +329,7 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
     """Return the network with the weights of its sources relative to one another, from their residuals.
 
     The median covariance does not change: sigma0 still shows how much worse the image points are than
-    expected. Of very many points only some take part.
+    expected. A source with errors in common gets its design effect. Of very many points only some take part.
     """
     seen = network.image_points
     step = np.ones(len(network.points), dtype=np.int64)
@@ -359,11 +360,21 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
 
         present, group = np.unique(part.source, return_inverse=True)
         names = tuple(network.sources[k].name for k in present)
-        _, found, converged = estimate_components(adjust_with, group, names)
+        balanced, found, converged = estimate_components(adjust_with, group, names)
         if not converged:
             return network
+        common = np.array([source.has_common_errors for source in network.sources])
+        effect = 1.0
+        if common.any() and not common.all():
+            some = common[part.source]
+            effect = design_effect_of_neighbours(balanced, density=common[network.source].sum() / some.sum())
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     factors = np.ones(len(network.sources))
     factors[present] = found
-    return with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
+    network = with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
+    sources = tuple(
+        replace(source, design_effect=effect) if source.has_common_errors else source
+        for source in network.sources
+    )
+    return replace(network, sources=sources)

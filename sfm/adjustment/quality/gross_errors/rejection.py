@@ -141,8 +141,18 @@ class Run:
         """
         return self._iterate(optimum.state, weight, "gauss-newton", near=True)
 
+    def count(self, used: BoolArray) -> float:
+        """Return the number of observations, of which image points with errors in common count in part.
+
+        Args:
+            used: image points that take part, (k,).
+        """
+        return 2 * float(self.problem.layout.observations.share[used].sum()) + count_of(self.problem.observed)
+
     def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
         """Return the number of observations and constraints minus unknowns.
+
+        Observations with errors in common, and points that only they determine, count in part.
 
         Args:
             optimum: optimum.
@@ -150,8 +160,11 @@ class Run:
         """
         held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
-        observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
-        return observations - self.problem.layout.count + held
+        layout, used = self.problem.layout, weight > 0
+        largest = np.zeros(len(layout.point_free))
+        np.maximum.at(largest, layout.observations.point[used], layout.observations.share[used])
+        in_part = np.where(largest > 0, 1 - largest, 0.0) @ layout.point_free.sum(axis=1)
+        return round(self.count(used) - layout.count + float(in_part) + held)
 
     def _iterate(self, state: State, weight: FloatArray, method: str, near: bool = False) -> Optimum:
         optimum = iterate(
@@ -369,7 +382,7 @@ def _reweight(
     ready = layout.active & ~behind_camera(layout.observations, optimum.state)
     if out is not None:
         ready &= ~out
-    count = 2 * int(ready.sum()) + count_of(run.problem.observed)
+    count = run.count(ready)
     freedom, vague = run.redundancy(optimum, ready.astype(float)) / max(count, 1), 0
     for _ in range(REWEIGHTINGS):
         v = residuals(layout.observations, optimum.state)

@@ -108,7 +108,8 @@ def sum_of_squares(
     """
     v = np.einsum("kab,kb->ka", whitening_matrix(observations.whitening[used]), residuals[used])
     of_each = np.einsum("kaa->k", complement[used])  # between 0 and 2 except for rounding
-    return float((v**2).sum()), float(np.clip(of_each, 0.0, 2.0).sum())
+    share = observations.share[used]
+    return float(share @ (v**2).sum(axis=1)), float(share @ np.clip(of_each, 0.0, 2.0))
 
 
 def would_pass(
@@ -150,7 +151,8 @@ def would_pass(
     inside = np.einsum("kab,kb->ka", cofactor, predicted)
     v = np.linalg.solve(F, inside[:, :, None])[:, :, 0]
     w = np.abs(standardised_residuals(v, cofactor, observations.whitening[rows])).max(axis=1)
-    sigma0 = np.sqrt((vPv + np.sum(predicted * inside, axis=1)) / (redundancy + 2))
+    share = observations.share[rows]
+    sigma0 = np.sqrt((vPv + share * np.sum(predicted * inside, axis=1)) / (redundancy + 2 * share))
     sigma0 = np.maximum(sigma0, rounding_of(observations))
     passes = np.zeros(len(used), dtype=bool)
     passes[rows] = w <= RETURN_FRACTION * tau_critical(alpha, redundancy + 2) * sigma0
@@ -306,6 +308,7 @@ def further_rays(
     further = np.zeros(len(used), dtype=bool)
     count = np.bincount(observations.image[used], minlength=len(least))
     F, B = whitening_matrix(observations.whitening), _by_points(observations, state, v, limiting)
+    B *= np.sqrt(observations.share)[:, None, None]
     sound = used & np.isfinite(v).all(axis=1) & np.isfinite(complement).all(axis=(1, 2))
     for j in np.unique(observations.point[out]).tolist():
         rows = np.arange(observations.start[j], observations.start[j + 1])
