@@ -131,7 +131,9 @@ def test_a_rejected_image_point_comes_back_where_it_would_pass_in_the_adjustment
 def test_a_ray_that_alone_places_its_point_is_tested_across_the_other(offset, passes):
     """Without it the point has no place along the other ray: its cofactor there is 1e16, and singular."""
     singular = 2.0**53 * np.array([[1.0, 2.0], [2.0, 4.0]])
-    observations = SimpleNamespace(whitening=np.tile([10.0, 0.0, 10.0], (3, 1)), xy=np.full((3, 2), 9.0))
+    observations = SimpleNamespace(
+        whitening=np.tile([10.0, 0.0, 10.0], (3, 1)), xy=np.full((3, 2), 9.0), share=np.ones(3)
+    )
     back = would_pass(
         *(observations, np.array([[0.0, 0.0]] * 2 + [offset]), np.stack([np.eye(2)] * 2 + [singular])),
         np.array([True, True, False]),
