@@ -121,7 +121,7 @@ class Adjustment:
     redundancy_numbers: FloatArray  # one per image coordinate, 0 to 1; NaN where rejected, (k, 2)
     sigma_px: float  # a priori standard deviation of unit weight, px
     sigma0: float  # a posteriori over a priori standard deviation of unit weight, including `inflation`
-    redundancy: int  # observations and constraints minus unknowns
+    redundancy: int  # observations and constraints minus unknowns, less the discount
     unknowns: int  # number of adjusted parameters
     observations: int  # number of scalar observations used: image coordinates and other kinds
     covariance: Covariance
@@ -145,6 +145,7 @@ class Adjustment:
     test_alpha: float = LEVEL
     false_alarm: float = FALSE_ALARM  # probability that the verdict calls a right result wrong
     start_sigma0: float = float("nan")  # sigma0 at the start values
+    discount: int = 0  # by how much errors in common lower the redundancy, see `Network.share`
     remarks: tuple[Remark, ...] = ()  # remarks on parts of the robust test that could not be completed
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation

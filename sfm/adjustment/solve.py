@@ -349,6 +349,7 @@ def _result(
         sigma_px=sigma_px,
         sigma0=sigma0,
         redundancy=redundancy,
+        discount=run.discount(weight > 0),
         unknowns=layout.count,
         unknown_counts=layout.counts,
         observations=observations,

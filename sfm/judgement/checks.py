@@ -148,7 +148,7 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
         interior,
         bars,
         further,
-        adjustment.redundancy - adjustment.observations + adjustment.unknowns,
+        adjustment.redundancy + adjustment.discount - adjustment.observations + adjustment.unknowns,
         adjustment.observations,
     )
 

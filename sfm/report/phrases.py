@@ -42,9 +42,11 @@ def describe_neighbours(a: Adjustment) -> str:
     if found is None:
         return ""
     alone, common = (significant(sigma) for sigma in found.sigmas_px(a.sigma0_px))
+    counted_as = f"; beside other sources {significant(found.design_effect)} of them have the weight of one"
     return (
         f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e within "
         f"{significant(found.length_px)} px; each also has {alone} px alone; standard deviations include both"
+        f"{counted_as if found.design_effect > 1 else ''}"
     )
 
 

@@ -231,10 +231,11 @@ def _reliability(f: Findings) -> Iterator[Part]:
         ("external reliability", significant(effect.median), or_unlimited(effect.largest), "sigmas"),
     )
     yield Table(columns("reliability", ">median", ">worst", "unit"), rows)
+    discount = f", {a.discount} less because of errors in common" if a.discount else ""
     yield Paragraph(
         f"The redundancy numbers add up to {fixed(s.redundancy_sum, 1)}, those of the image points alone to "
         f"{fixed(s.redundancy_of_image_points, 1)} (mean {fixed(r.mean, 3)}); the redundancy is "
-        f"{a.redundancy}."
+        f"{a.redundancy}{discount}."
     )
     yield Paragraph(
         "Minimal bias: the smallest gross error for which the tau test of an image coordinate exceeds its "

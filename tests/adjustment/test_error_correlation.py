@@ -11,7 +11,11 @@ from scipy.spatial.distance import cdist
 
 from sfm.adjustment.covariance import change_datum, marginal_of, with_error_correlation
 from sfm.adjustment.engine.correlated import correlated_sum
-from sfm.adjustment.quality.correlations import estimate_error_correlation, with_neighbours
+from sfm.adjustment.quality.correlations import (
+    design_effect_of_neighbours,
+    estimate_error_correlation,
+    with_neighbours,
+)
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
@@ -19,8 +23,9 @@ from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import MOVED, Alternative
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Estimate, Network, Source, rows_of
 from sfm.report.phrases import describe_neighbours, significant
+from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.inputs.sources import TEXTURE
 from sfm.survey.sources.source import Correspondences
@@ -28,6 +33,8 @@ from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
 SIGMA_PX = 0.1
+TARGETS = 60  # points of these tests that are targets; the others are texture
+PARTS = slice(0, TARGETS), slice(TARGETS, None)
 
 
 def in_common(network: Network, share: float, length_px: float, rng: np.random.Generator) -> FloatArray:
@@ -273,6 +280,64 @@ def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Esti
     effect = reduced.design_effect(D)
     assert effect > 1.4 * np.mean(gains) / D.shape[2]  # the mean alone says less
     assert np.var(gains) / (2 * np.mean(gains)) == pytest.approx(effect, rel=0.5)
+
+
+def of_two_sources(network: Network, common: FloatArray, rng: np.random.Generator) -> tuple[Network, Network]:
+    """Return a network of 60 precise targets and of texture with errors in common; the targets alone."""
+    seen = network.image_points
+    targets = seen.point < TARGETS
+    precise = SIGMA_PX / 3
+    covariance = np.where(targets[:, None, None], precise**2 * np.eye(2), seen.covariance)
+    xy = seen.xy + np.where(targets[:, None], precise * rng.standard_normal(seen.xy.shape), common)
+    seen = replace(seen, xy=xy, covariance=covariance, source=(~targets).astype(np.int64))
+    both = replace(network, image_points=seen, sources=(Source("targets"), TEXTURE))
+    alone = replace(both, image_points=seen.select(targets))
+    return both, replace(alone, points=alone.points[:TARGETS])
+
+
+def with_design_effect(network: Network, effect: float) -> Network:
+    targets, texture = network.sources
+    return replace(network, sources=(targets, replace(texture, design_effect=effect)))
+
+
+def off(a: Adjustment, truth: Estimate, points: slice) -> FloatArray:
+    """Return errors of coordinates in the datum of all points, over their standard deviations, (n, 3)."""
+    X, n = a.estimate.points, len(a.network.points)
+    moved = fit_similarity(X, truth.points[:n]).apply(X) - truth.points[:n]
+    return np.asarray((moved / np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2)))[points])
+
+
+def test_texture_with_errors_in_common_does_not_outvote_targets(scene: tuple[Network, Estimate]) -> None:
+    network, truth = scene
+    start = replace(truth, points=truth.points[:TARGETS])
+    c, over_sigma = [], []
+    for seed in range(6):
+        rng = seed_of(f"outvoted {seed}")
+        both, alone = of_two_sources(network, in_common(network, 0.7, 400.0, rng), rng)
+        plain = adjust(both, truth, reject="none")
+        effect = design_effect_of_neighbours(plain)
+        weighed = adjust(with_design_effect(both, effect), truth, reject="none")
+        assert effect > 5 and 0.7 < weighed.sigma0 < 1.4 and weighed.discount > 0
+        assert weighed.redundancy + weighed.discount == plain.redundancy
+        correlated = with_neighbours(weighed)
+        found = correlated.error_correlation
+        assert found is not None
+        assert found.sigmas_px(weighed.sigma0_px)[0] == pytest.approx(SIGMA_PX * 0.3**0.5, rel=0.3)
+        over_sigma.append([(off(correlated, truth, part) ** 2).mean() for part in PARTS])
+        targets = adjust(alone, start, reject="none")
+        c.append([one.estimate.cameras[0].parameters[0] for one in (targets, plain, weighed)])
+    of_targets, of_plain, of_weighed = np.sqrt(
+        ((np.array(c) - truth.cameras[0].parameters[0]) ** 2).mean(axis=0)
+    )
+    assert of_weighed < 0.7 * of_plain and of_weighed < 1.1 * of_targets
+    assert (np.abs(np.sqrt(np.mean(over_sigma, axis=0)) - 1) < 0.2).all()
+
+
+def test_sources_without_errors_in_common_keep_their_weights(scene: tuple[Network, Estimate]) -> None:
+    network, truth = scene
+    rng = seed_of("independent sources")
+    both, _ = of_two_sources(network, in_common(network, 0.0, 400.0, rng), rng)
+    assert design_effect_of_neighbours(adjust(both, truth, reject="none")) < 2
 
 
 def _gain(reduced: Reduced, D: FloatArray) -> float:

@@ -150,7 +150,13 @@ def _error_correlation(a: Adjustment) -> dict[str, float] | None:
     if a.error_correlation is None:
         return None
     alone, common = a.error_correlation.sigmas_px(a.sigma0_px)
-    return {"alone_px": alone, "common_px": common, "length_px": a.error_correlation.length_px}
+    found = a.error_correlation
+    return {
+        "alone_px": alone,
+        "common_px": common,
+        "length_px": found.length_px,
+        "design_effect": found.design_effect,
+    }
 
 
 def _statistics(findings: Findings) -> dict[str, Any]:

@@ -149,10 +149,22 @@ class Run:
         """
         return 2 * float(self.problem.layout.observations.share[used].sum()) + count_of(self.problem.observed)
 
-    def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
-        """Return the number of observations and constraints minus unknowns.
+    def discount(self, used: BoolArray) -> int:
+        """Return by how much errors in common lower the redundancy.
 
-        Observations with errors in common, and points that only they determine, count in part.
+        Observations with errors in common count in part, and so do points that only they determine.
+
+        Args:
+            used: image points that take part, (k,).
+        """
+        layout = self.problem.layout
+        o, largest = layout.observations, np.zeros(len(layout.point_free))
+        np.maximum.at(largest, o.point[used], o.share[used])
+        of_points = np.where(largest > 0, 1 - largest, 0.0) @ layout.point_free.sum(axis=1)
+        return round(2 * float((1 - o.share[used]).sum()) - float(of_points))
+
+    def redundancy(self, optimum: Optimum, weight: FloatArray) -> int:
+        """Return the number of observations and constraints minus unknowns, less the discount.
 
         Args:
             optimum: optimum.
@@ -160,11 +172,8 @@ class Run:
         """
         held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
-        layout, used = self.problem.layout, weight > 0
-        largest = np.zeros(len(layout.point_free))
-        np.maximum.at(largest, layout.observations.point[used], layout.observations.share[used])
-        in_part = np.where(largest > 0, 1 - largest, 0.0) @ layout.point_free.sum(axis=1)
-        return round(self.count(used) - layout.count + float(in_part) + held)
+        observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
+        return observations - self.problem.layout.count + held - self.discount(weight > 0)
 
     def _iterate(self, state: State, weight: FloatArray, method: str, near: bool = False) -> Optimum:
         optimum = iterate(
