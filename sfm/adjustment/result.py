@@ -209,7 +209,7 @@ class Adjustment:
     def has_scale(self) -> bool:
         """Whether lengths are in the object unit: from given values, or by placement on control."""
         given = self.datum == "control" or self.expected_defect < MOTIONS or len(self.network.scale_bars) > 0
-        return given or len(self.network.control) >= 2
+        return given or len(self.network.control.complete) >= 2
 
     @property
     def vPv(self) -> float:

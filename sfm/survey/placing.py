@@ -378,8 +378,8 @@ def place_on_frame(
         both = frame.oriented & estimate.oriented
         source, target = estimate.position[both], frame.position[both]
     scaled = is_scaled(network, estimate)
-    keep = scaled or len(network.control) == MIN_CONTROL - 1
-    scale = object_scale(network, estimate) if len(network.control) and not scaled else 1.0
+    keep = scaled or len(network.control.complete) == MIN_CONTROL - 1
+    scale = object_scale(network, estimate) if len(network.control.complete) and not scaled else 1.0
     try:
         return fit_similarity(source, target, scale=scale if keep else None).apply_estimate(estimate)
     except GeometryError:  # too few, or on a line: the adjustment has kept their values

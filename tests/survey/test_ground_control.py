@@ -193,6 +193,15 @@ def test_a_control_point_with_one_ray_is_named_once(tmp_path: Path, checked: boo
     assert not len(result.check_points) or checked
 
 
+@pytest.mark.parametrize("flat", [2, 3])
+def test_points_without_heights_give_a_free_network_no_scale(tmp_path: Path, flat: int) -> None:
+    lines = [line.split() for line in lines_of(("north", "south", "east")[:flat])]
+    text = "\n".join(["WGS84 UTM 33N", *(" ".join([*one[:2], "NaN", *one[3:]]) for one in lines)])
+    result = run_survey(read_survey(survey_with(tmp_path / "list", "gcp_list.txt", text)))
+    (said,) = (one for one in result.verdict.remarks if one.kind == "scale_undefined")
+    assert not result.has_scale and said.number("control") == 0
+
+
 @pytest.mark.parametrize("control", [1, 2])
 def test_too_little_control_for_a_scale_is_stated(tmp_path: Path, control: int) -> None:
     check = json.dumps(["north", "south", "east", "west", "checked", "flat"][control - 1 :])

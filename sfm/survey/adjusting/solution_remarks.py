@@ -128,7 +128,7 @@ def handedness_unchecked(network: Network, *, checked: bool) -> tuple[Remark, ..
 def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
     """Return the remark on a scale that only survey observations give, with low precision."""
     network = a.network
-    given = a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2
+    given = a.datum == "control" or len(network.scale_bars) or len(network.control.complete) >= 2
     if given or mounts_give_scale(network, a.estimate) or not network.observations or not a.has_scale:
         return ()
     sigma = scale_sigma(network, a.estimate)
@@ -139,7 +139,7 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
 def scale_alone(a: Adjustment) -> tuple[Remark, ...]:
     """Return the note on a scale that rests on one mount or one table; bars and control have theirs."""
     network, mounts = a.network, a.estimate.mounts
-    if a.datum == "control" or len(network.scale_bars) or len(network.control) >= 2:
+    if a.datum == "control" or len(network.scale_bars) or len(network.control.complete) >= 2:
         return ()
     sources = []
     for kind in network.observations:
@@ -174,7 +174,7 @@ def datum_remarks(
     if bars:
         remarks.append(remark("names_missing", of="bars", names=bars))
     if not has_scale:
-        seen = None if survey.control is None else len(network.control)
+        seen = None if survey.control is None else len(network.control.complete)
         remarks.append(remark("scale_undefined", unit=survey.unit, control=seen, needed=2))
     return tuple(remarks)
 
