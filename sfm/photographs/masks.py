@@ -45,6 +45,19 @@ class Masks:
                     return self.folder / mask
         return None
 
+    def beside(self, names: Sequence[str]) -> frozenset[Path]:
+        """Return the masks that cannot be meant as photographs: those that have the name of one and a suffix.
+
+        Args:
+            names: names of the photographs, among which masks in their folder may be.
+        """
+        masks = {name: self.path_of(name) for name in names}
+        return frozenset(
+            mask.resolve()
+            for name, mask in masks.items()
+            if mask is not None and mask.name == PurePosixPath(name).name + SUFFIX
+        )
+
     def visible(self, name: str, xy: FloatArray, size_px: tuple[int, int]) -> BoolArray:
         """Return which positions in a photograph are not masked, (k,).
 
@@ -145,7 +158,10 @@ class Masks:
             if mask is None:
                 continue
             if mask.resolve() in photographs:
-                raise SurveyFileError(f"{mask}: is a photograph, needed the mask of {name}")
+                raise SurveyFileError(
+                    f"{mask}: is a photograph, needed the mask of {name}; name it {name}{SUFFIX}, or leave "
+                    "its folder out of images"
+                )
             if mask in owner:
                 raise SurveyFileError(f"{mask}: the mask would be that of {owner[mask]} and of {name}")
             owner[mask] = name

@@ -13,7 +13,9 @@ from sfm.errors import SurveyFileError
 from sfm.photographs.masks import Masks
 from sfm.pipeline import run_survey
 from sfm.survey.drafting.draft import draft_survey
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.inputs.survey_file import read_survey_file
 from tests.survey.test_sources import CORNERS, write, write_given
 
 BLACK = slice(0, 220)  # columns of the masked part, px
@@ -64,6 +66,24 @@ def test_masks_of_another_size_or_other_photographs_are_refused(
     path.write_text(path.read_text("utf-8").replace('masks = "masks"', 'masks = "."'), "utf-8")
     with pytest.raises(SurveyFileError, match=r"photo 1.png: is a photograph, needed the mask of photo 1"):
         run_survey(read_survey(path))
+
+
+def test_masks_may_lie_beside_png_photographs(tmp_path: Path) -> None:
+    path = masked(tmp_path)
+    apart = find_photographs(read_survey(path))
+    for mask in (tmp_path / "masks").iterdir():
+        mask.rename(tmp_path / mask.name)
+    with pytest.raises(SurveyFileError):
+        run_survey(read_survey(path))
+    path.write_text(path.read_text("utf-8").replace('masks = "masks"', 'masks = "."'), "utf-8")
+    survey = read_survey(path)
+    assert find_photographs(survey).names == apart.names == find_photographs(read_survey_file(path)).names
+    Masks(survey.masks).refuse_wrong(apart.path_of())
+    (tmp_path / "photo 6.png.png").unlink()
+    with pytest.raises(
+        SurveyFileError, match=r"photo 6.png: is a photograph, .*; name it photo 6.png.png, or"
+    ):
+        run_survey(survey)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.network import Network
 from sfm.photographs.exif import Metadata, read_metadata
+from sfm.photographs.masks import Masks
 from sfm.remarks.remark import Remark, remark
 from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import refuse_ungrouped
@@ -159,7 +160,7 @@ def remarks_on_contradicting(left_out: Sequence[LeftOutPoint]) -> tuple[Remark, 
 
 
 def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> PhotographList:
-    """Return the photographs that match the globs of the cameras.
+    """Return the photographs that match the globs of the cameras, without the masks of others beside them.
 
     Args:
         survey: a survey with photographs, or its file.
@@ -209,6 +210,8 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
                     "characters; rename the file"
                 )
         owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
+    masks = Masks(survey.masks).beside([name for name, _, _ in owner])
+    owner = [one for one in owner if one[1].resolve() not in masks]
     seen: dict[str, int] = {}
     for name, _, index in owner:
         if name in seen:

@@ -326,7 +326,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         observations=_given_image_points(file, control),
         marks=file.marks,
         diameters=read(read_diameters, file.targets.diameters),
-        masks=None if file.head.masks is None else file.beside(file.head.masks),
+        masks=file.masks,
         start_orientations=read(read_exterior, file.approximate.images),
         start_points=read(read_points, file.approximate.points),
         start_cameras=read(read_start_cameras, file.approximate.cameras),

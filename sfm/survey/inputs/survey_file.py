@@ -127,6 +127,11 @@ class SurveyFile(Section):
         """Whether the survey may name files outside its folder."""
         return self._allow_outside
 
+    @property
+    def masks(self) -> Path | None:
+        """Folder of the masks; None without any."""
+        return None if self.head.masks is None else self.beside(self.head.masks)
+
     def beside(self, name: str) -> Path:
         """Return the path of a file from its name relative to the survey file.
 

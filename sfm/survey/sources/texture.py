@@ -42,10 +42,8 @@ def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
 def _count(
     survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
 ) -> tuple[dict[str, int], bool]:
-    folder = survey.head.masks
-    masks = Masks(None if folder is None else survey.beside(folder))
     settings = survey.tie_points or TiePointSettings()
-    natural, stored = natural_points_of(path, image, settings, masks, store)
+    natural, stored = natural_points_of(path, image, settings, Masks(survey.masks), store)
     return {"features": len(natural)}, stored
 
 
