@@ -98,6 +98,15 @@ def test_a_mark_and_a_start_value_name_photographs_too(tmp_path: Path) -> None:
         name_photographs(survey, find_photographs(survey))
 
 
+def test_moments_of_a_rig_name_photographs_too(tmp_path: Path) -> None:
+    survey = replace(survey_of(tmp_path, ["a.png"]), moments={"a.png": "1", "./D.png": "1", "two/b.png": "2"})
+    named = name_photographs(survey, find_photographs(survey)).survey
+    assert named.moments == {"one/a.png": "1", "D.png": "1", "two/b.png": "2"}
+    survey = replace(survey, moments={"a.png": "1", "one/a.png": "2"})
+    with pytest.raises(SurveyFileError, match=r"'one/a.png' has the moments '1' and '2', needed one"):
+        name_photographs(survey, find_photographs(survey))
+
+
 @pytest.mark.parametrize(
     ("image", "x", "message"),
     [

@@ -62,13 +62,13 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
     """Return a survey with the names that the files of its photographs have.
 
     Args:
-        survey: its tables of image points, named points and orientations name photographs.
+        survey: its tables of image points, orientations and moments, and its named points, name photographs.
         files: all its photographs.
 
     Raises:
-        SurveyFileError: no photograph of a table is one of the survey, a table of orientations names one
-            twice, or that of a named point is neither here nor a file of an earlier epoch, or does not show
-            its place.
+        SurveyFileError: no photograph of a table is one of the survey, a table of orientations or moments
+            names one twice, or that of a named point is neither here nor a file of an earlier epoch, or does
+            not show its place.
         PhotographError: a photograph of an earlier epoch cannot be read.
     """
     name_of = _names_by_text(files, survey.folder)
@@ -87,6 +87,7 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
         observations=tables or survey.observations,
         exterior=_renamed(survey.exterior, name_of),
         start_orientations=_renamed(survey.start_orientations, name_of),
+        moments=_moments_renamed(survey, name_of),
     )
     if not without_file:
         return NamedPhotographs(survey)
@@ -136,6 +137,19 @@ def _renamed(given: T | None, name_of: Callable[[str], str]) -> T | None:
     names = tuple(map(name_of, given.names))
     given.table.refuse_duplicates(names, ("image",))
     return replace(given, names=names)
+
+
+def _moments_renamed(survey: Survey, name_of: Callable[[str], str]) -> dict[str, str]:
+    """Return the moments of photographs by the names of their files."""
+    moments: dict[str, str] = {}
+    for text, moment in survey.moments.items():
+        name = name_of(text)
+        before = moments.setdefault(name, moment)
+        if before != moment:
+            raise SurveyFileError(
+                f"{survey.source}: photograph '{name}' has the moments '{before}' and '{moment}', needed one"
+            )
+    return moments
 
 
 def _names_by_text(files: PhotographList, folder: Path) -> Callable[[str], str]:
