@@ -33,7 +33,8 @@ MAX_SIDE_PX = 2400  # longer photographs are drawn smaller
 THUMBNAIL_SIDE_PX = 720
 JPEG_QUALITY = 82
 ARROW_PX = 22.0  # length in the picture of a residual that equals the RMS
-MAX_NAMED_POINTS = 300  # image points of a photograph; beyond this they are drawn as dots without names
+# image points of a photograph; beyond this they are drawn as dots, and only names that last are written
+MAX_NAMED_POINTS = 300
 CROWDED_ARROW_PX = 8.0  # the same length in crowded photographs, to keep the vectors apart
 DOT_PX = 2  # radius of such a dot
 LABEL_SIZE = 0.5  # of OpenCV's Hershey font
@@ -169,9 +170,11 @@ def draw_photograph(
         ends = seen + factor / scale * adjustment.residuals[rows]
         finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
         _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
-    if not crowded:
-        for name, xy, one in zip(names, seen, colour, strict=True):
-            _label(picture, name, xy, scale, one)
+    # a crowd is of natural texture, whose numbers mean nothing; what has a name is still found by it
+    labelled = network.named[network.image_points.point[rows]] if crowded else np.ones(len(rows), dtype=bool)
+    if labelled.sum() <= MAX_NAMED_POINTS:
+        for k in np.flatnonzero(labelled).tolist():
+            _label(picture, names[k], seen[k], scale, colour[k])
     return picture
 
 
