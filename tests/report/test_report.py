@@ -25,10 +25,11 @@ from sfm.display import bound, counted
 from sfm.errors import OutputError
 from sfm.files.open_folders import refuse_foreign_folder
 from sfm.judgement.bundle_statistics import geometry_of
-from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.network import Network, ObjectPoints, ScaleBars, Source
 from sfm.remarks.remark import kinds_of, remark
 from sfm.remarks.verdict import lines_of
 from sfm.report import survey_report
+from sfm.report.figures import overlays
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
 from sfm.report.output import plot_data, write_result
@@ -555,6 +556,27 @@ def test_overlay_shows_targets_where_they_are(result: SurveyResult) -> None:
                 patch = picture[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
                 seen += bool((np.abs(patch - USED).sum(axis=1) < 150).any())
     assert seen > 0.7 * 4 * len(photograph.xy)  # names and vectors cover some
+
+
+@pytest.mark.parametrize("most", [300, 3])
+def test_in_a_crowd_the_names_that_last_are_written(
+    result: SurveyResult, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    written: list[str] = []
+    monkeypatch.setattr(overlays, "_label", lambda picture, name, *_: written.append(name))
+    monkeypatch.setattr(overlays, "MAX_NAMED_POINTS", most)
+    photograph, network = result.photographs[0], result.adjustment.network
+    seen = network.image_points
+    mixed = replace(
+        network,
+        image_points=replace(seen, source=seen.point % 2),
+        sources=(Source("targets"), Source("texture", names_last=False)),
+    )
+    crowd = replace(photograph, xy=np.tile(photograph.xy, (300, 1)))
+    draw_photograph(crowd, mixed, None)
+    here = seen.point[seen.image == network.images.index(photograph.image)]
+    named = [network.points[j] for j in here.tolist() if j % 2 == 0]
+    assert len(named) > 3 and written == (named if most == 300 else [])
 
 
 def test_overlays_have_different_names() -> None:
