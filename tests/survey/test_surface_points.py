@@ -6,6 +6,7 @@ import weakref
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -75,8 +76,31 @@ def covered(folder: Path, more: str = HELD) -> Surface:
     return found
 
 
-def test_tie_points_stay_where_windows_are_fewer(tmp_path: Path) -> None:
-    assert cover_photographs(*prepared(tmp_path, "window_px = 61\n")) is None
+@pytest.mark.parametrize("copies", [1, 4])
+def test_tie_points_stay_where_windows_are_fewer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copies: int
+) -> None:
+    """Tie points of the same pixels count once: 35 are more than 30 windows, 140 are no more than 40."""
+    survey, measured, start = prepared(tmp_path, HELD)
+    network, estimate = measured.network, start.estimate
+    n = len(network.points)
+    beside = [replace(network.image_points, point=network.image_points.point + n * k) for k in range(copies)]
+    points = tuple(f"{name} {k}" for k in range(copies) for name in network.points)
+    network = replace(network, points=points, image_points=ImagePoints.joined(beside))
+    measured = replace(measured, network=network, min_rays=np.full(n * copies, 3))
+    start = replace(start, estimate=replace(estimate, points=np.tile(estimate.points, (copies, 1))))
+
+    def first(windows: int) -> Surface | None:
+        def some(*args: Any, **rest: Any) -> CoveringPoints:
+            found = covering_points.find_covering_points(*args, **rest)
+            kept = np.arange(len(found.points)) < windows
+            return surface_points._some_points(found, kept, np.ones(len(found.image_points), dtype=bool))
+
+        monkeypatch.setattr(surface_points, "find_covering_points", some)
+        return cover_photographs(survey, measured, start)
+
+    assert first(30) is None
+    assert first(40) is not None
 
 
 @pytest.mark.parametrize(

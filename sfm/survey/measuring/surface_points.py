@@ -18,7 +18,13 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.matching.lsm.coverage import CoveredPixels, Windows, first_alike, project_points
+from sfm.matching.lsm.coverage import (
+    CoveredPixels,
+    Windows,
+    first_alike,
+    points_apart,
+    project_points,
+)
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import Estimate, ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
@@ -79,9 +85,9 @@ def cover_photographs(
         jobs: number of photographs processed in parallel.
 
     Returns:
-        The network. None if the windows give fewer rays than the tie points, for example if the surface is
-        nowhere plane over them, or if no tie point fits the orientation. Points are named t00001, t00002 ...
-        in the order in which they are found, which may differ in the next run.
+        The network. None if the windows give fewer rays than the tie points that share no pixels, for example
+        if the surface is nowhere plane over them, or if no tie point fits the orientation. Points are named
+        t00001, t00002 ... in the order in which they are found, which may differ in the next run.
     """
     network, estimate, files = measured.network, start.estimate, measured.files
     settings = survey.texture
@@ -108,7 +114,9 @@ def cover_photographs(
         threads=jobs,
     )
     found = without_far_points(_visible(hidden, found), estimate)
-    if len(found.image_points) < fits.sum():
+    # the tie points of dense texture measure the same pixels many times, and tell no more by that
+    apart = points_apart(seen, fits, settings.window_px, n_points=len(network.points))
+    if len(found.image_points) < (fits & apart[seen.point]).sum():
         return None
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
     order = np.argsort(found.image_points.point, kind="stable")
