@@ -47,7 +47,7 @@ from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import Measured, MeasuredStore
-from sfm.survey.sources.joined import sources_of
+from sfm.survey.sources.joined import measure_photograph_once
 from sfm.survey.unfinished import UnfinishedSurvey, UnfinishedSurveyError
 
 LOCK = ".lock"  # of the batch
@@ -146,10 +146,7 @@ def measure_one(survey: SurveyFile, image: str, path: Path, *, send: Send) -> Me
 
 def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
     """Measure a photograph for each source of the survey, and store what is found."""
-    counts, stored = dict[str, int](), True
-    for _, source in sources_of(survey):
-        of_source, was_stored = source.count(survey, image, path, store)
-        counts, stored = counts | of_source, stored and was_stored
+    counts, stored = measure_photograph_once(survey, image, path, store)
     return PhotographNote(image, counts, stored=stored)
 
 

@@ -3,14 +3,18 @@
 The mask of `a/b.jpg` is the picture `a/b.jpg.png` in the folder of masks, of the size of the photograph, or
 `b.jpg.png` there. That of `c.png` may be `c.png` too. COLMAP and OpenSfM name masks so. A photograph without
 a mask is used whole.
+
+A survey asks for a mask in several stages. One bit a pixel, compressed, keeps it from being decoded in each.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from threading import Lock
 
 import numpy as np
 
@@ -18,10 +22,11 @@ from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
 from sfm.photographs.exif import read_metadata
-from sfm.photographs.reading import read_photograph
+from sfm.photographs.reading import read_mask
 
 SUFFIX = ".png"
 MASKS = "masks"  # folder in which masks are searched
+HELD_BYTES = 50_000_000  # of decoded masks; one of 24 megapixels with smooth outlines takes 30 kB
 
 
 @dataclass(frozen=True)
@@ -112,9 +117,10 @@ class Masks:
         path = self.path_of(name)
         if path is None:
             return None
-        mask = read_photograph(path)
-        _refuse_size(path, (mask.shape[1], mask.shape[0]), size_px)
-        return np.asarray(mask == 0)
+        height, width, bits = _HELD.mask(path, size_px)
+        _refuse_size(path, (width, height), size_px)
+        packed = np.frombuffer(zlib.decompress(bits), np.uint8)
+        return np.unpackbits(packed, count=height * width).reshape(height, width).astype(bool)
 
     def cover(self, name: str, photograph: AnyArray) -> AnyArray:
         """Return the photograph with the median of its visible pixels where it is masked, (H, W).
@@ -172,6 +178,41 @@ class Masks:
             raise SurveyFileError(
                 f"{self.folder}: no mask of a photograph; that of {first} would be {first}{SUFFIX}"
             )
+
+
+class _HeldMasks:
+    """Masks that were decoded, as height, width, and compressed bits that are 1 where the mask is black."""
+
+    def __init__(self) -> None:
+        self._of_file: dict[tuple[Path, int, int], tuple[int, int, bytes]] = {}
+        self._lock = Lock()
+
+    def mask(self, path: Path, size_px: tuple[int, int]) -> tuple[int, int, bytes]:
+        """Return the mask in a file, which is read again if the file has changed.
+
+        Raises:
+            SurveyFileError: it is read, and has another size than its photograph.
+            PhotographError: it cannot be read.
+        """
+        try:
+            state = path.stat()
+        except OSError as error:
+            raise PhotographError(f"{path.name}: {error.strerror}") from error
+        key = path, state.st_mtime_ns, state.st_size
+        with self._lock:
+            found = self._of_file.get(key)
+        if found is None:
+            _refuse_size(path, read_metadata(path).size_px, size_px)  # before so many pixels are decoded
+            mask = read_mask(path)
+            found = *mask.shape, zlib.compress(np.packbits(mask == 0).tobytes(), 1)
+            with self._lock:
+                self._of_file[key] = found
+                while sum(len(bits) for _, _, bits in self._of_file.values()) > HELD_BYTES:
+                    del self._of_file[next(iter(self._of_file))]
+        return found
+
+
+_HELD = _HeldMasks()
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> tuple[Masks, str]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import overload
 
@@ -22,6 +24,23 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".
 CHANNELS = ("luminance", "red", "green", "blue")
 # IEC 61966-2-1 (sRGB): linear below this signal, a power law above it.
 SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
+
+
+# What was decoded, by file and channel, while this thread works on one photograph; None at other times.
+_decoded: ContextVar[dict[tuple[Path, str], AnyArray] | None] = ContextVar("decoded", default=None)
+
+
+@contextmanager
+def decoding_once() -> Iterator[None]:
+    """Decode every file once, however often this thread reads it inside; at the end all pixels are freed.
+
+    All who read a file receive the same array, which they leave as it is.
+    """
+    before = _decoded.set({})
+    try:
+        yield
+    finally:
+        _decoded.reset(before)
 
 
 @checked_arguments()
@@ -50,11 +69,40 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
     path = Path(path)
     if channel not in CHANNELS:
         raise PhotographError(f"{path.name}: channel {channel!r}, expected one of {', '.join(CHANNELS)}")
+    decoded = _decoded.get()
+    if decoded is None:
+        return _decode(path, channel)
+    if (path, channel) not in decoded:
+        decoded[path, channel] = _decode(path, channel)
+    return decoded[path, channel]
+
+
+def read_mask(path: Path) -> AnyArray:
+    """Read a picture whose header states the size of a photograph; masks compress better than photographs.
+
+    Args:
+        path: a file whose size is known to be that of its photograph.
+
+    Returns:
+        Intensities, (H, W), uint8 or uint16.
+
+    Raises:
+        PhotographError: as `read_photograph`.
+    """
+    return _decode(path, "luminance", may_be_plain=True)
+
+
+def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray:
+    """Return the pixels of a file, as `read_photograph` does.
+
+    may_be_plain: few bytes may stand for many pixels.
+    """
     data = read_bytes(path)
     refuse_truncated(path, data)
     with opened_header(path, io.BytesIO(data)) as header:
         size = header.size
-    refuse_bomb(path, size, data)
+    if not may_be_plain:
+        refuse_bomb(path, size, data)
     colour = cv2.IMREAD_GRAYSCALE if channel == "luminance" else cv2.IMREAD_COLOR
     try:
         image = cv2.imdecode(

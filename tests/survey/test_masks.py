@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.errors import SurveyFileError
+from sfm.conventions import AnyArray
+from sfm.errors import PhotographError, SurveyFileError
 from sfm.photographs.masks import Masks
+from sfm.photographs.reading import read_mask, read_photograph
 from sfm.pipeline import run_survey
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import find_photographs
@@ -24,7 +26,9 @@ BLACK = slice(0, 220)  # columns of the masked part, px
 def masked(folder: Path, count: int = 6) -> Path:
     """Write the survey of targets, texture and given points, and masks of some of its photographs."""
     write_given(folder / "corners.csv", CORNERS)
-    path = write(folder, '[tie_points]\n[[observations]]\nfile = "corners.csv"\nsigma_px = 0.2\n')
+    path = write(
+        folder, '[tie_points]\nwindow_px = 15\n[[observations]]\nfile = "corners.csv"\nsigma_px = 0.2\n'
+    )
     path.write_text(path.read_text("utf-8").replace("[survey]\n", '[survey]\nmasks = "masks"\n'), "utf-8")
     (folder / "masks").mkdir()
     mask = np.full((480, 640), 255, np.uint8)
@@ -45,6 +49,34 @@ def test_nothing_is_measured_under_black(tmp_path: Path) -> None:
         assert (seen.xy[(network.source == source) & of_last, 0] < BLACK.stop - 1).any()
     whole = run_survey(replace(survey, masks=None)).adjustment.network.image_points
     assert len(seen) < len(whole)
+
+
+def test_a_mask_is_decoded_once_in_a_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Targets, tie points, given image points and windows all ask for it; it is read again if it changes."""
+    read: list[str] = []
+
+    def counted(path: Path) -> AnyArray:
+        read.append(path.name)
+        return read_mask(path)
+
+    monkeypatch.setattr("sfm.photographs.masks.read_mask", counted)
+    path = masked(tmp_path, count=2)
+    run_survey(read_survey(path))
+    assert sorted(read) == ["photo 1.png.png", "photo 2.png.png"]
+    masks, mask = Masks(tmp_path / "masks"), np.zeros((480, 640), np.uint8)
+    cv2.imwrite(str(tmp_path / "masks" / "photo 1.png.png"), mask)
+    black = masks.black("photo 1.png", (640, 480))
+    assert black is not None and black.all() and len(read) == 3
+
+
+def test_a_mask_of_24_million_pixels_may_have_few_bytes(tmp_path: Path) -> None:
+    mask = np.zeros((4000, 6000), np.uint8)
+    mask[1000:3000, 2000:4000] = 255
+    cv2.imwrite(str(tmp_path / "a.jpg.png"), mask)
+    with pytest.raises(PhotographError, match="is not a photograph"):
+        read_photograph(tmp_path / "a.jpg.png")
+    black = Masks(tmp_path).black("a.jpg", (6000, 4000))
+    assert black is not None and (black == (mask == 0)).all()
 
 
 def test_masks_of_another_size_or_other_photographs_are_refused(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+import weakref
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,17 +18,22 @@ from sfm.api import read_result, write_result
 from sfm.camera import project
 from sfm.conventions import AnyArray
 from sfm.network import ImagePoints, Source
+from sfm.photographs import reading
 from sfm.pipeline import run_survey
 from sfm.rendering.render import render_photographs
 from sfm.rendering.scene import Optics, join_marks, rectangles
 from sfm.result import SurveyResult
+from sfm.runtime.progress import SILENT, StageClock
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs import sources
-from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.measurements import Measurements, find_photographs
 from sfm.survey.inputs.sources import Declared, declared
 from sfm.survey.inputs.survey import Survey, read_survey
+from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.sources.joined import _measure_each, measure_sources
 from sfm.survey.sources.repeated import OfOneSource, without_repeated
 from sfm.survey.sources.source import SurveySource, complete_as_measured
+from sfm.survey.target_network import measure_targets
 from tests.places import ROOT
 from tests.surveys import SURVEY, camera, code_centres, plates, stations, survey_of
 from tests.synthetic import make_network, seed_of
@@ -55,13 +61,13 @@ def pictures() -> tuple[AnyArray, ...]:
     return tuple(found)
 
 
-def write(folder: Path, more: str = "") -> Path:
+def write(folder: Path, more: str = "", codes: str = "ring14") -> Path:
     """Write photographs and their survey file, with further tables; return the file."""
     rng = seed_of("sources")
     for number, picture in enumerate(pictures(), 1):
         noisy = np.rint(picture + NOISE * rng.standard_normal(picture.shape))
         cv2.imwrite(str(folder / f"photo {number}.png"), np.clip(noisy, 0, 255).astype(np.uint8))
-    text = SURVEY.format(name="sources", backend="none")
+    text = SURVEY.format(name="sources", backend="none").replace("ring14", codes)
     path = folder / "survey.toml"
     path.write_text(text + more, "utf-8")
     return path
@@ -89,12 +95,44 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert len(network.points) > 3 * len(named)
     assert both.verdict.level != "bad" and len(network.images) == 6
     assert 0.6 < error_of_codes(both) < 1.4
-    assert both.adjustment.error_correlation is not None
     assert (network.may_correlate == (network.source == 1)).all()
     tables = dict(both.settings)
     assert "targets" in tables and "tie_points" in tables
     (first, *_) = both.photographs
     assert len(first.xy) > len(alone.photographs[0].xy)
+
+
+def test_photographs_are_decoded_as_often_as_for_one_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All sources measure a photograph while it is in memory, which has one at a time."""
+    decode, read, alive = reading._decode, list[str](), list[weakref.ref[AnyArray]]()
+    most = 0
+
+    def counted(path: Path, channel: str, **rest: bool) -> AnyArray:
+        nonlocal most
+        picture = decode(path, channel, **rest)
+        read.append(path.name)
+        alive.append(weakref.ref(picture))
+        most = max(most, sum(one() is not None for one in alive))
+        return picture
+
+    def decoded(codes: str) -> list[str]:
+        read.clear()
+        survey = read_survey(write(tmp_path, "[tie_points]\n", codes))
+        measure_sources(survey, find_photographs(survey), jobs=1, store=None, clock=StageClock(SILENT))
+        return sorted(read)
+
+    monkeypatch.setattr(reading, "_decode", counted)
+    assert decoded("ring14") == decoded("none")
+    survey, store = read_survey(write(tmp_path, "[tie_points]\n")), MeasuredStore(None)
+    files = find_photographs(survey)
+    read.clear()
+    most = 0
+    _measure_each(survey, files, jobs=1, store=store, progress=SILENT)
+    assert read == list(files.names) and most == 1
+    measure_targets(survey, files, store=store)
+    assert len(read) == 6 and store.folder is None
 
 
 CORNERS = {"corner a": (-90.0, -60.0, 0.0), "corner b": (90.0, 70.0, 0.0), "u001": (-80.0, 80.0, 0.0)}

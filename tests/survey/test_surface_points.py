@@ -99,8 +99,10 @@ def test_tie_points_stay_where_windows_are_fewer(
         monkeypatch.setattr(surface_points, "find_covering_points", some)
         return cover_photographs(survey, measured, start)
 
-    assert first(30) is None
-    assert first(40) is not None
+    few, many = first(30), first(40)
+    assert few is not None and many is not None
+    assert few.network.points == points[:n]
+    assert many.network.points[0] == "t00001"
 
 
 @pytest.mark.parametrize(

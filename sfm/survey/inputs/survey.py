@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -226,9 +226,7 @@ class Survey:
         Raises:
             SurveyFileError: the code table is unreadable.
         """
-        if self.plates:
-            return plate_group(self.targets, self.plates)
-        return survey_family(self.targets, self.codes)
+        return survey_family(self.targets, self.codes, self.plates)
 
     @cached_property
     def given_mounts(self) -> MountObservations:
@@ -415,16 +413,21 @@ def _calibrated_as_named(camera: CameraSettings, file: SurveyFile) -> CameraSett
     )
 
 
-def survey_family(targets: TargetSettings, codes: str) -> TargetFamily | None:
+def survey_family(
+    targets: TargetSettings, codes: str, plates: Sequence[PlateSettings] = ()
+) -> TargetFamily | None:
     """Return the codes of a survey, with its stated radii of rings; None without codes.
 
     Args:
         targets: settings of the targets.
         codes: name of the family, or path of the table.
+        plates: further plates beside that of the targets.
 
     Raises:
         SurveyFileError: the code table is unreadable.
     """
+    if plates:
+        return plate_group(targets, plates)
     plate = plate_family(targets)
     if plate is not None:
         return plate

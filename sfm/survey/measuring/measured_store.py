@@ -48,9 +48,9 @@ TEXTURE = Kind(NaturalPoints, ("sfm.photographs.reading", "sfm.matching.tracks.i
 
 @dataclass(frozen=True)
 class MeasuredStore:
-    """A folder of measurements, which belongs to the user alone."""
+    """Measurements of this run, and a folder of those of earlier ones, which belongs to the user alone."""
 
-    folder: Path
+    folder: Path | None  # None: measurements are held for this run alone
     held: dict[str, tuple[Measured, bool]] = field(default_factory=dict)
     """measurements of this run by their keys, each with whether it was read from the folder"""
 
@@ -65,8 +65,10 @@ class MeasuredStore:
 
     def load(self, key: str, kind: Kind[M]) -> M | None:
         """Return the measurements under a key; None if they are missing or incomplete."""
+        if self.folder is None:
+            return None
         try:
-            path = self._path(key)
+            path = self._path(self.folder, key)
             if path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
             found = _unpacked(path.read_bytes(), kind)
@@ -77,21 +79,25 @@ class MeasuredStore:
 
     def save(self, key: str, measured: Measured) -> None:
         """Store measurements completely or not at all; without room on the disk they are not stored."""
+        if self.folder is None:
+            return
         data = io.BytesIO()
         np.savez(data, allow_pickle=False, **{f.name: getattr(measured, f.name) for f in fields(measured)})
         if data.tell() > MAX_ENTRY_BYTES:  # `load` would not read it
             return
         with suppress(OSError, OutputError):
             make_user_folder(self.folder)
-            with whole_file(self._path(key), replaces=True) as part:
+            with whole_file(self._path(self.folder, key), replaces=True) as part:
                 part.write_bytes(data.getbuffer())
 
     def remove_old(self) -> None:
         """Remove entries not used for months, and half-written files of a killed run."""
-        remove_unused(self.folder)
+        if self.folder is not None:
+            remove_unused(self.folder)
 
-    def _path(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}.npz"
+    @staticmethod
+    def _path(folder: Path, key: str) -> Path:
+        return folder / key[:2] / f"{key}.npz"
 
 
 def measured_once(

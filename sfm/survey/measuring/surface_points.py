@@ -85,9 +85,10 @@ def cover_photographs(
         jobs: number of photographs processed in parallel.
 
     Returns:
-        The network. None if the windows give fewer rays than the tie points that share no pixels, for example
-        if the surface is nowhere plane over them, or if no tie point fits the orientation. Points are named
-        t00001, t00002 ... in the order in which they are found, which may differ in the next run.
+        The network; None if no tie point fits the orientation. Points are named t00001, t00002 ... in the
+        order in which they are found, which may differ in the next run. If the windows give fewer rays than
+        the tie points that share no pixels, for example if the surface is nowhere plane over them, these are
+        the points.
     """
     network, estimate, files = measured.network, start.estimate, measured.files
     settings = survey.texture
@@ -114,10 +115,9 @@ def cover_photographs(
         threads=jobs,
     )
     found = without_far_points(_visible(hidden, found), estimate)
-    # the tie points of dense texture measure the same pixels many times, and tell no more by that
     apart = points_apart(seen, fits, settings.window_px, n_points=len(network.points))
     if len(found.image_points) < (fits & apart[seen.point]).sum():
-        return None
+        return _tie_points(survey, measured, estimate, apart)
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
     order = np.argsort(found.image_points.point, kind="stable")
     covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
@@ -135,6 +135,21 @@ def cover_photographs(
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
     return Surface(
         covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(found)
+    )
+
+
+def _tie_points(survey: Survey, measured: Measurements, estimate: Estimate, kept: BoolArray) -> Surface:
+    """Return the network of some of the tie points, (n,)."""
+    network = measured.network
+    seen = network.image_points.select(kept[network.image_points.point])
+    number = np.cumsum(kept) - 1
+    points = tuple(name for name, keep in zip(network.points, kept, strict=True) if keep)
+    seen = replace(seen, point=number[seen.point])
+    return Surface(
+        network_of(survey, network.images, network.camera, points, seen),
+        replace(estimate, points=estimate.points[kept]),
+        measured.overlays,
+        (),
     )
 
 

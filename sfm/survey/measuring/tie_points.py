@@ -10,13 +10,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
-from hashlib import sha256
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
@@ -30,6 +29,7 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
+from sfm.survey.inputs.checks.copies import MIN_COMMON
 from sfm.survey.inputs.measurements import Measurements, PhotographList
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.start import network_of
@@ -85,7 +85,7 @@ def tie_photographs(
     found, failed = each_photograph(
         files,
         lambda path: _read(path, name_of[path], settings, masks, store),
-        picture=lambda one: one[1],
+        picture=lambda one: one[1].xy.tobytes() if len(one[1]) >= MIN_COMMON else b"",
         jobs=jobs,
         progress=progress,
     )
@@ -97,7 +97,7 @@ def tie_photographs(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([files.paths[k] for k in read])
-    natural = [found[k][2] for k in read]
+    natural = [found[k][1] for k in read]
     neighbours = (
         neighbours_by_position(metadata, PARTNERS),
         neighbours_in_sequence(names, metadata, PARTNERS),
@@ -148,7 +148,7 @@ def tie_photographs(
         files.names,
         needed_rays(network),
         failed,
-        tuple(replace(one, stored=found[k][3]) for k, one in zip(read, drawn, strict=True)),
+        tuple(replace(one, stored=found[k][2]) for k, one in zip(read, drawn, strict=True)),
         files,
         remarks=_remarks_on_pairs(len(matches), neighbours) + _remarks_on_still(tied.still, names),
     )
@@ -212,14 +212,9 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
 
 def _read(
     path: Path, name: str, settings: TiePointSettings, masks: Masks, store: MeasuredStore | None
-) -> tuple[Metadata, bytes, NaturalPoints, bool]:
-    photograph = read_photograph(path)
-    digest = sha256(photograph.tobytes()).digest()
-    return (
-        read_metadata(path),
-        digest,
-        *natural_points_of(path, name, settings, masks, store, photograph=photograph),
-    )
+) -> tuple[Metadata, NaturalPoints, bool]:
+    natural, stored = natural_points_of(path, name, settings, masks, store)  # first: as for targets
+    return read_metadata(path), natural, stored
 
 
 def natural_points_of(
@@ -228,8 +223,6 @@ def natural_points_of(
     settings: TiePointSettings,
     masks: Masks,
     store: MeasuredStore | None = None,
-    *,
-    photograph: AnyArray | None = None,
 ) -> tuple[NaturalPoints, bool]:
     """Return the natural points of one photograph, and whether they were read from the store.
 
@@ -239,7 +232,6 @@ def natural_points_of(
         settings: detector and number of features.
         masks: what is black in that of the photograph has no points.
         store: is searched first, and stores new features.
-        photograph: pixels of the photograph, (H, W), if already read.
 
     Raises:
         PhotographError: the photograph or its mask cannot be read.
@@ -251,7 +243,7 @@ def natural_points_of(
         stated += content_hash(mask)
 
     def measured() -> NaturalPoints:
-        pixels = read_photograph(path) if photograph is None else photograph
+        pixels = read_photograph(path)
         noise = estimate_noise(grey_of(pixels)) / full_scale(pixels)
         return natural_points(
             pixels,

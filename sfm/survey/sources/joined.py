@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from importlib import import_module
+from pathlib import Path
 from typing import cast
 
 import numpy as np
@@ -22,10 +23,11 @@ from sfm.errors import GeometryError
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars, without_given
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.photographs.reading import decoding_once
 from sfm.reduced_network import reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark
 from sfm.result import LeftOutPoint, PhotographTargets
-from sfm.runtime.progress import StageClock
+from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.sources import Declared, declared
@@ -34,6 +36,7 @@ from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.measuring.surface_points import RAYS_OF_NOISE, with_weights
+from sfm.survey.measuring.targets import each_photograph
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.repeated import without_repeated
 from sfm.survey.sources.source import Correspondences, SurveySource
@@ -62,10 +65,56 @@ def measure_sources(
     """
     measured = {}
     sources = sources_of(survey)
-    for row, source in sorted(sources, key=lambda one: not one[0].is_listed):  # faults of files show first
+    listed_first = sorted(sources, key=lambda one: not one[0].is_listed)  # faults of files show first
+    several = sum(source.measure_one is not None for _, source in sources) > 1
+    for row, source in listed_first:
+        if several and source.measure_one is not None:
+            several, store = False, store or MeasuredStore(None)
+            with clock.stage("photographs", len(files)):
+                _measure_each(survey, files, jobs=jobs, store=store, progress=clock.progress)
         with clock.stage(row.stage, len(files)) if row.stage else nullcontext():
             measured[row] = source.measure(survey, files, jobs=jobs, store=store, progress=clock.progress)
     return _joined_measurements(survey, [measured[row] for row, _ in sources])
+
+
+def _measure_each(
+    survey: Survey, files: PhotographList, *, jobs: int, store: MeasuredStore, progress: Progress
+) -> None:
+    """Measure each photograph for all sources while it is in memory; the store holds what they find."""
+    names = dict(zip(files.paths, files.names, strict=True))
+    each_photograph(
+        files,
+        lambda path: measure_photograph_once(survey, names[path], path, store),
+        jobs=jobs,
+        progress=progress,
+    )
+
+
+def measure_photograph_once(
+    survey: Survey | SurveyFile, image: str, path: Path, store: MeasuredStore
+) -> tuple[dict[str, int], bool]:
+    """Measure a photograph for each source of a survey, and decode it and its mask once.
+
+    Args:
+        survey: settings of the survey, or its file.
+        image: name of the photograph.
+        path: its file.
+        store: stores what is found.
+
+    Returns:
+        Counts of what was measured by name, and whether all of it was read from the store.
+
+    Raises:
+        PhotographError: the photograph or its mask cannot be read.
+        SurveyFileError: the mask has another size than the photograph.
+    """
+    counts, stored = dict[str, int](), True
+    with decoding_once():
+        for _, source in sources_of(survey):
+            if source.measure_one is not None:
+                of_source, was_stored = source.measure_one(survey, image, path, store)
+                counts, stored = counts | of_source, stored and was_stored
+    return counts, stored
 
 
 def complete_sources(oriented: Oriented, *, jobs: int = 1) -> Correspondences:

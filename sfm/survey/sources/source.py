@@ -81,10 +81,22 @@ def _no_settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
     return ()
 
 
-def _no_count(
-    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
-) -> tuple[dict[str, int], bool]:
-    return {}, True
+class MeasureOne(Protocol):
+    """Measures what a photograph shows by itself, and stores it.
+
+    Args:
+        survey: settings of the survey, or its file.
+        image: name of the photograph.
+        path: its file.
+        store: stores the measurement, and is searched first.
+
+    Returns:
+        Counts of what was measured by name, and whether they were read from the store.
+    """
+
+    def __call__(  # noqa: D102
+        self, survey: Survey | SurveyFile, image: str, path: Path, store: MeasuredStore
+    ) -> tuple[dict[str, int], bool]: ...
 
 
 @dataclass(frozen=True)
@@ -95,8 +107,7 @@ class SurveySource:
     complete: Complete
     # (table of the survey file, its settings)
     settings: Callable[[Survey], tuple[tuple[str, Section], ...]] = _no_settings
-    # measures and stores a photograph; returns counts by name, and whether they were read from the store
-    count: Callable[[SurveyFile, str, Path, MeasuredStore | None], tuple[dict[str, int], bool]] = _no_count
+    measure_one: MeasureOne | None = None  # None: nothing is measured in a photograph by itself
 
 
 def complete_as_measured(

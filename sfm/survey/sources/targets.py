@@ -14,10 +14,13 @@ from sfm.survey.sources.target_matching import match_targets_of
 from sfm.survey.target_network import measure_targets
 
 
-def _count(
-    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
+def _measure_one(
+    survey: Survey | SurveyFile, image: str, path: Path, store: MeasuredStore
 ) -> tuple[dict[str, int], bool]:
-    family = survey_family(survey.targets, survey.codes)
+    if isinstance(survey, Survey):  # which has read the table of its codes
+        family = survey.family
+    else:
+        family = survey_family(survey.targets, survey.codes, survey.plates)
     targets, stored = measure_photograph(path, survey.targets, family, store)
     return {"targets": len(targets), "rejected": len(targets.rejected_xy)}, stored
 
@@ -27,4 +30,4 @@ def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
     return (("targets", survey.targets), *plates)
 
 
-SOURCE = SurveySource(measure_targets, match_targets_of, _settings, _count)
+SOURCE = SurveySource(measure_targets, match_targets_of, _settings, _measure_one)

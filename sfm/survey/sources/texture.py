@@ -7,7 +7,7 @@ from pathlib import Path
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.masks import Masks
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.settings import Section, TiePointSettings
+from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -39,12 +39,11 @@ def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
     return (("tie_points", survey.texture),)
 
 
-def _count(
-    survey: SurveyFile, image: str, path: Path, store: MeasuredStore | None
+def _measure_one(
+    survey: Survey | SurveyFile, image: str, path: Path, store: MeasuredStore
 ) -> tuple[dict[str, int], bool]:
-    settings = survey.tie_points or TiePointSettings()
-    natural, stored = natural_points_of(path, image, settings, Masks(survey.masks), store)
+    natural, stored = natural_points_of(path, image, survey.texture, Masks(survey.masks), store)
     return {"features": len(natural)}, stored
 
 
-SOURCE = SurveySource(tie_photographs, _cover, _settings, _count)
+SOURCE = SurveySource(tie_photographs, _cover, _settings, _measure_one)
