@@ -242,22 +242,26 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
 
 
 def common_shape(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
-    """Return the weighted median deviation of sound outlines in each sector, radii, (RAYS,); 0 if few.
+    """Return the median deviation of sound outlines in each sector, radii, (RAYS,); 0 if they are few.
 
     A photograph of texture shows more blobs than targets, each too small and faint to tell the shape of an
-    outline. Without weights they would make theirs the usual one, and all targets would seem damaged.
+    outline. They would make theirs the usual one, and all targets would seem damaged. The median bears
+    others up to half of all: where more than half tell next to nothing, it is weighted.
 
     Source: Kish (1965), Survey Sampling (number of equal weights that tell as much).
     """
     common = np.zeros(h.shape[1])
-    w = np.where(sound[:, None], weight, 0.0)
-    total, squares = w.sum(axis=0), (w**2).sum(axis=0)
-    for j in np.flatnonzero(total**2 >= MIN_POPULATION * squares):
-        if total[j] > 0:
-            order = np.argsort(h[:, j], kind="stable")
-            sums = np.cumsum(w[order, j])
-            low, high = np.searchsorted(sums, total[j] / 2 * (1 + np.array([-1e-12, 1e-12])))
-            common[j] = (h[order[low], j] + h[order[min(high, len(order) - 1)], j]) / 2
+    for j in range(h.shape[1]):
+        seen = np.flatnonzero(sound & (weight[:, j] > 0))
+        w = weight[seen, j]
+        number = w.sum() ** 2 / max((w**2).sum(), 1e-300)
+        if number >= len(seen) / 2:
+            w, number = np.ones(len(seen)), len(seen)
+        if number >= MIN_POPULATION:
+            order = np.argsort(h[seen, j], kind="stable")
+            sums = np.cumsum(w[order]) / w.sum()
+            low, high = np.searchsorted(sums, [0.5 - 1e-12, 0.5 + 1e-12])
+            common[j] = np.mean(h[seen[order[[low, high]]], j])
     return common
 
 
