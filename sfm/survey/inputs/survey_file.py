@@ -102,11 +102,6 @@ class SurveyFile(Section):
         return self._path.parent
 
     @property
-    def masks(self) -> Path | None:
-        """Folder of the masks."""
-        return None if self.head.masks is None else self.beside(self.head.masks)
-
-    @property
     def texture(self) -> TiePointSettings:
         """Settings of natural texture; those of a survey that states none if it has none."""
         stated = self.tie_points

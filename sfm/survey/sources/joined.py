@@ -397,8 +397,9 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
         part, start = reduce_network(without_given(network), estimate, images, points, rays)
 
         def adjust_with(factor: FloatArray) -> Adjustment:
+            nonlocal start
             # rejection with weights that are far off would lose the image points of the less precise source
-            return adjust(
+            found = adjust(
                 part,
                 start,
                 sigma_px=settings.sigma_px,
@@ -406,10 +407,12 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
                 false_alarm=settings.false_alarm,
                 reject="huber",
             )
+            start = found.estimate
+            return found
 
         present, group = np.unique(part.source, return_inverse=True)
         names = tuple(network.sources[k].name for k in present)
-        balanced, found, converged = estimate_components(adjust_with, group, names)
+        balanced, of_groups, converged = estimate_components(adjust_with, group, names)
         if not converged:
             return network
         common = np.array([source.has_common_errors for source in network.sources])
@@ -420,7 +423,7 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     factors = np.ones(len(network.sources))
-    factors[present] = found
+    factors[present] = of_groups
     network = with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
     sources = tuple(
         replace(source, design_effect=effect) if source.has_common_errors else source
