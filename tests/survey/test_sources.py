@@ -96,6 +96,11 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert both.verdict.level != "bad" and len(network.images) == 6
     assert 0.6 < error_of_codes(both) < 1.4
     assert (network.may_correlate == (network.source == 1)).all()
+    seen, texture = network.image_points, network.source == 1
+    for i in range(6):  # windows are beside the rings of targets
+        rows, near = (np.flatnonzero((seen.image == i) & of) for of in (texture, ~texture))
+        between = seen.xy[rows][:, None] - seen.xy[near][None]
+        assert np.abs(between).max(axis=2).min() > 12
     tables = dict(both.settings)
     assert "targets" in tables and "tie_points" in tables
     (first, *_) = both.photographs

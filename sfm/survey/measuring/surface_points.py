@@ -34,12 +34,14 @@ from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.result import PhotographTargets
 from sfm.similarity import fit_similarity
-from sfm.survey.inputs.measurements import Measurements
+from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
 from sfm.survey.inputs.settings import AdjustSettings, TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
+from sfm.targets.codes.plates import TargetFamily
+from sfm.targets.codes.rings import CodeFamily
 
 # Windows that are tried; the first of those with about the best precision is taken. Noise that is correlated
 # over several pixels hides the texture of small windows. Where texture is weak, the four parameters of an
@@ -74,7 +76,12 @@ class Surface:
 
 
 def cover_photographs(
-    survey: Survey, measured: Measurements, start: Orientation, *, jobs: int = 1
+    survey: Survey,
+    measured: Measurements,
+    start: Orientation,
+    *,
+    targets: MeasuredPhotographs | None = None,
+    jobs: int = 1,
 ) -> Surface | None:
     """Return the network of a textured survey with points wherever its photographs have texture.
 
@@ -82,6 +89,7 @@ def cover_photographs(
         survey: may state the window; states the sigma of an image coordinate.
         measured: the tie points.
         start: orientation of the photographs.
+        targets: those of the photographs; what coded ones cover is measured already.
         jobs: number of photographs processed in parallel.
 
     Returns:
@@ -103,6 +111,8 @@ def cover_photographs(
     photographs = PhotographFiles(paths)
     surface = seen.select(fits)
     hidden = masked_pixels(Masks(survey.masks), network, estimate)
+    if targets is not None:
+        hidden = _with_targets(hidden, targets, survey.family, network, estimate)
     windows = _best_windows(photographs, network, estimate, surface, settings, jobs, hidden)
     found = find_covering_points(
         photographs,
@@ -229,6 +239,29 @@ def masked_pixels(masks: Masks, network: Network, estimate: Estimate) -> Covered
     sizes = [estimate.cameras[lens].size_px for lens in network.camera]
     black = (masks.black(name, size) for name, size in zip(network.images, sizes, strict=True))
     return CoveredPixels([size[::-1] for size in sizes], black)
+
+
+def _with_targets(
+    hidden: CoveredPixels | None,
+    photographs: MeasuredPhotographs,
+    family: TargetFamily | None,
+    network: Network,
+    estimate: Estimate,
+) -> CoveredPixels:
+    """Return the masked pixels and those of coded targets.
+
+    Their pixels would take part twice. On blank paper with one straight edge, only noise holds a window along
+    the edge. Windows at targets of a rendered sheet were three to seven times as far from it as others.
+    """
+    if hidden is None:
+        hidden = CoveredPixels([estimate.cameras[lens].size_px[::-1] for lens in network.camera])
+    reach = family.outer if isinstance(family, CodeFamily) else 1.0  # of a target, in radii of its dot
+    found = dict(zip(photographs.names, photographs.targets, strict=True))
+    for i, name in enumerate(network.images):
+        if name in found:
+            coded = found[name].select(found[name].code >= 0)
+            hidden.cover(np.full(len(coded), i), coded.xy, 2 * reach * coded.semi_axes[:, 0])
+    return hidden
 
 
 def _visible(hidden: CoveredPixels | None, found: CoveringPoints) -> CoveringPoints:

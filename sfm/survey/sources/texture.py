@@ -21,7 +21,9 @@ def _cover(
     oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
 ) -> Correspondences:
     """Return the windows that cover the photographs, or the tie points if these have more rays."""
-    surface = cover_photographs(oriented.survey, measured, start, jobs=jobs)
+    surface = cover_photographs(
+        oriented.survey, measured, start, targets=oriented.measured.photographs, jobs=jobs
+    )
     if surface is None:
         return complete_as_measured(oriented, measured, start)
     return Correspondences(
