@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ from sfm.judgement.hypotheses.hypotheses import (
 )
 from sfm.judgement.hypotheses.refit import Refit, log_likelihood_of, shifts_of
 from sfm.judgement.hypotheses.score import Gain
-from sfm.network import ScaleBars
+from sfm.network import ObjectPoints, ScaleBars, without_given
 from sfm.remarks.remark import Remark
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
@@ -319,3 +321,24 @@ def test_of_very_many_photographs_nothing_is_tested(a: Adjustment, monkeypatch: 
     assert one.kind == "photographs_untested" and one.names("photographs") == a.network.images
     monkeypatch.setattr(hypotheses, "free_network", None)  # is not asked for
     assert contradicted_parameters(a) == ()
+
+
+def test_each_camera_of_two_photographs_is_named() -> None:
+    network = SimpleNamespace(images=tuple("abcde"), camera=np.array([0, 0, 0, 1, 1]))
+    cameras = tuple(SimpleNamespace(shared_name=name) for name in ("A", "B"))
+    final: Any = SimpleNamespace(network=network, estimate=SimpleNamespace(cameras=cameras))
+    (said,) = hypotheses._calibrated_from_few(final)
+    assert said.names("camera") == ("B",) and said.names("photographs") == ("d", "e")
+
+
+@pytest.mark.parametrize(("given", "tested"), [(3, 0), (4, 1), (7, 1)])
+def test_four_given_points_have_a_shape_that_the_image_points_test(given: int, tested: int) -> None:
+    network, truth = make_network(seed_of("shape"), images=6, points=14, free=("c",))
+    control = ObjectPoints(np.arange(given), truth.points[:given], np.tile(1e-8 * np.eye(3), (given, 1, 1)))
+    network = replace(network, control=control)
+    held = adjust(network, truth, datum=Datum("control"), reject="none")
+    free = adjust(without_given(network), truth, datum=Datum("free"), reject="none")
+    found = hypotheses._with_free_shape(held, free)
+    assert len(found) == tested
+    for one, refitted in found:
+        assert one.points.tolist() == list(range(given)) and refitted.beta.shape == (3 * given,)

@@ -7,12 +7,14 @@ import pickle
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import sfm
+from sfm.adjustment.quality.consistency import Consistency
 from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.quality.statistics import (
     global_test,
@@ -26,6 +28,7 @@ from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError, SurveyFileError
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import statistics_of
+from sfm.judgement.checks import standard_deviations
 from sfm.judgement.verdict import judge_adjustment, judge_survey
 from sfm.network import Estimate, Network
 from sfm.pipeline import run_survey
@@ -252,3 +255,26 @@ def test_an_effect_below_what_users_expect_is_a_row_of_the_table(made: tuple[Net
         slight = [one for one in verdict.tests if one.kind == "slight_effect"]
         assert [one.number("shift") for one in slight] == ([] if kinds else [shift])
         assert all("a different camera" in one.tested[1] for one in slight)
+
+
+def test_no_test_of_points_is_a_row_where_none_was_tested() -> None:
+    for tested, kinds in ((0, ()), (5, ("points_tested", "doubtful_tested"))):
+        assert kinds_of(verdicts.consistency_remarks(Consistency((), None, tested=tested), 3)) == kinds
+
+
+def test_as_many_mirrored_photographs_as_others_decide_nothing() -> None:
+    """Two mirrored alone and two together, beside 7 or 30 others: a sign test of all of them."""
+    alone, together = remark("photograph_mirrored"), remark("photograph_of_mirror_image", photographs="cd")
+    failed = [SimpleNamespace(image=k, reason=alone) for k in "ab"]
+    failed += [SimpleNamespace(image=k, reason=together) for k in "cd"]
+    for right, decided in ((7, ()), (30, ("most photographs",))):
+        network = SimpleNamespace(images=("x",) * right, named=np.zeros(0, dtype=bool))
+        adjustment = SimpleNamespace(network=network, false_alarm=FALSE_ALARM)
+        result: Any = SimpleNamespace(failed=failed, adjustment=adjustment, stage_remarks=())
+        *single, both = verdicts._mirrored(result)
+        assert [one.names("photograph") for one in single] == [("a",), ("b",)]
+        assert both.names("decided_by") == decided
+
+
+def test_standard_deviations_of_negative_variances_are_unknown() -> None:
+    np.testing.assert_array_equal(standard_deviations(np.diag([4.0, 0.0, -1.0])), [2.0, 0.0, np.nan])
