@@ -212,18 +212,23 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
         owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
     masks = Masks(survey.masks).beside([name for name, _, _ in owner])
     owner = [one for one in owner if one[1].resolve() not in masks]
+    names, paths, cameras = zip(*owner, strict=True)
+    _refuse_two_cameras(survey, names, cameras)
+    refuse_many(survey.source, names)
+    refuse_ungrouped(survey.cameras, names, cameras, survey.source)
+    return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
+
+
+def _refuse_two_cameras(survey: Survey | SurveyFile, names: Sequence[str], cameras: Sequence[int]) -> None:
+    """Raise SurveyFileError if a photograph matches the globs of two cameras."""
     seen: dict[str, int] = {}
-    for name, _, index in owner:
+    for name, index in zip(names, cameras, strict=True):
         if name in seen:
             first, second = survey.cameras[seen[name]].name, survey.cameras[index].name
             raise SurveyFileError(
                 f"{survey.source}: photograph '{name}' matches the globs of cameras {first} and {second}"
             )
         seen[name] = index
-    names, paths, cameras = zip(*owner, strict=True)
-    refuse_many(survey.source, names)
-    refuse_ungrouped(survey.cameras, names, cameras, survey.source)
-    return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
 
 
 def refuse_many(where: str, images: Sequence[str]) -> None:

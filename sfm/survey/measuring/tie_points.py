@@ -85,7 +85,7 @@ def tie_photographs(
     found, failed = each_photograph(
         files,
         lambda path: _read(path, name_of[path], settings, masks, store),
-        picture=lambda one: one[1].xy.tobytes() if len(one[1]) >= MIN_COMMON else b"",
+        picture=_picture,
         jobs=jobs,
         progress=progress,
     )
@@ -215,6 +215,12 @@ def _read(
 ) -> tuple[Metadata, NaturalPoints, bool]:
     natural, stored = natural_points_of(path, name, settings, masks, store)  # first: as for targets
     return read_metadata(path), natural, stored
+
+
+def _picture(read: tuple[Metadata, NaturalPoints, bool]) -> bytes:
+    """Return the places of the features, by which a copy is recognised; nothing of few."""
+    natural = read[1]
+    return natural.xy.tobytes() if len(natural) >= MIN_COMMON else b""
 
 
 def natural_points_of(
