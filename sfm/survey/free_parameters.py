@@ -2,16 +2,13 @@
 
 A lens that is held at nominal values bends the network. Parameters that a network does not determine cost
 precision and may lead to a false minimum. Candidates are c, x0, y0, K1 and K2, and on calibration plates also
-P1, P2 and b1, which otherwise bias c and the principal point. The worst determined parameter is held, one
-after the other, until the network determines all the others better than they are known of any camera. An
-object that turns about one axis determines c or the principal point, not both. Then the principal point is
-held, which is known of any camera: where the survey has it, else in the middle, not where the orientation has
-moved it. Then the test of held parameters frees others that the image points demand. Three photographs fit
-many values of c, each with another shape of the object. For three photographs c is therefore an observation,
-with the precision of a focal length from EXIF data.
+P1, P2 and b1, which otherwise bias c and the principal point. The worst determined parameter
+is held, one after the other, until the network determines all the others better than they are known of any
+camera. Then the test of held parameters frees others that the image points demand. Three photographs fit many
+values of c, each with another shape of the object. For three photographs c is therefore an observation, with
+the precision of a focal length from EXIF data.
 
-Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 7.3.2 (self-calibration);
-Armstrong, Zisserman and Hartley (1996), Self-calibration from image triplets, ECCV (turns about one axis).
+Source: Luhmann et al., Close-Range Photogrammetry and 3D Imaging (2020), sec. 7.3.2 (self-calibration).
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import KNOWN_WITHOUT, Camera, camera_from_values, corner_shift
+from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
@@ -31,7 +28,7 @@ from sfm.network import Estimate, Network, without_given
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.calibration import plate_family
-from sfm.survey.inputs.cameras import known_values, split_cameras
+from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
@@ -48,7 +45,6 @@ FIRST_HELD = ("K2", "k2", "y0", "x0", "cy", "cx")
 OF_PLATES = (Role.DECENTRING, Role.AFFINITY)  # roles of further candidates on calibration plates
 
 Chosen = list[set[str] | None]  # free parameters of each camera; None where the survey states them
-Values = dict[tuple[int, str], float]  # values of parameters, by camera and name
 
 
 @dataclass(frozen=True)
@@ -89,18 +85,14 @@ def choose_free_parameters(
         network, estimate, everything, min_points=MIN_IMAGE_POINTS,
         min_rays=np.full(len(network.points), MIN_RAYS),
     )  # fmt: skip
-    settings, middle = survey.cameras, _principal_points(survey, estimate)
+    settings = survey.cameras
     if images.sum() < (1 if datum == "control" else MIN_PHOTOGRAPHS):
         names = [one if one is None else set() for one in names]
     else:
         part, start = reduce_network(network, estimate, images, points, everything)
-        alone: _Determined | None = None
-
-        def determined(part: Network, start: Estimate, datum: str) -> _Determined:
-            return _determined_parameters(part, start, names, datum, alarm, middle=middle, extend=extend)
-
+        alone = None
         if images.sum() >= MIN_DETERMINING_C:  # control may be wrong, and hide what the image points demand
-            alone = determined(without_given(part), start, "free")
+            alone = _determined_parameters(without_given(part), start, names, "free", alarm, extend=extend)
         elif datum != "control":
             seen = set(silent) & set(part.camera.tolist())
             settings = tuple(
@@ -109,17 +101,15 @@ def choose_free_parameters(
             )
             of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
             part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
-            alone = determined(part, start, "free")
-        if alone is None or (datum == "control" and not _has_each_c(start, names, alone.names)):
-            with_control = determined(part, start, datum)
-            if alone is None or _has_each_c(start, names, with_control.names):
+            alone = _determined_parameters(part, start, names, "free", alarm, extend=extend)
+        if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
+            with_control = _determined_parameters(part, start, names, datum, alarm, extend=extend)
+            if alone is None or _has_each_c(start, names, with_control):
                 alone = with_control
         names = [
             chosen if chosen is None else chosen - set(dict(one.weighted))
-            for one, chosen in zip(settings, alone.names, strict=True)
+            for one, chosen in zip(settings, alone, strict=True)
         ]
-        if extend:  # the oriented photographs fit the values that the orientation found
-            estimate = _with_values(estimate, alone.held_at)
     cameras = tuple(
         one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
         for one, chosen in zip(settings, names, strict=True)
@@ -163,52 +153,35 @@ def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
     return all(name in (free or ()) for name, may, free in each if name in (may or ()))
 
 
-@dataclass(frozen=True)
-class _Determined:
-    """The candidates that a network determines."""
-
-    names: Chosen
-    held_at: Values  # of principal points that are held
-    adjusted: Adjustment | None = None  # with these parameters; None if it fails
-
-
 def _determined_parameters(
-    part: Network,
-    start: Estimate,
-    names: Chosen,
-    datum: str,
-    false_alarm: float,
-    *,
-    middle: Values,
-    extend: bool,
-) -> _Determined:
+    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float, *, extend: bool
+) -> Chosen:
     """Return the candidates that a network determines, and other parameters that its image points demand."""
-    found = _hold_undetermined(part, start, names, datum, false_alarm, middle)
-    index = {camera.name: a for a, camera in enumerate(start.cameras) if found.names[a]}
+    names, adjusted = _hold_undetermined(part, start, names, datum, false_alarm)
+    index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
-        demanded = () if found.adjusted is None else contradicted_parameters(found.adjusted)
-        wider = list(found.names)
+        demanded = () if adjusted is None else contradicted_parameters(adjusted)
+        wider = list(names)
         for camera, parameter in demanded:
             if camera in index:
                 wider[index[camera]] = (wider[index[camera]] or set()) | {parameter}
-        if found.adjusted is None or wider == found.names:
+        if adjusted is None or wider == names:
             break
-        tried = _hold_undetermined(part, found.adjusted.estimate, wider, datum, false_alarm, middle)
-        if tried.adjusted is None or tried.names == found.names:
+        tried, adjusted = _hold_undetermined(part, adjusted.estimate, wider, datum, false_alarm)
+        if adjusted is None or tried == names:
             break
-        found = replace(tried, held_at=found.held_at | tried.held_at)
-    return found
+        names = tried
+    return names
 
 
 def _hold_undetermined(
-    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float, middle: Values
-) -> _Determined:
-    """Hold the worst parameters one by one until all others are determined.
+    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float
+) -> tuple[Chosen, Adjustment | None]:
+    """Hold the worst parameters one by one until all others are determined; also the last adjustment.
 
     Observed parameters are never held: they take part with the precision of their values.
     """
     observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
-    held_at: Values = {}
     while any(names):
         adjusted = _adjust_or_none(part, _with_free(start, names), datum, false_alarm)
         worst, reach = None, KNOWN_WITHOUT
@@ -220,59 +193,11 @@ def _hold_undetermined(
                 if now > reach:
                     worst, reach = (a, name), now
         if worst is None:
-            return _Determined(names, held_at, adjusted)
-        a, name = worst
-        if _plays(
-            start.cameras[a], name, Role.FOCAL
-        ):  # sought without each coordinate of the principal point
-            of_c = {}
-            for one in (names[a] or set()) & {other for b, other in middle if b == a}:
-                moved = _with_values(start, {(a, one): middle[a, one]})
-                found = _adjust_or_none(part, _with_free(moved, _without(names, a, one)), datum, false_alarm)
-                if found is not None:
-                    of_c[one] = _corner_shift(found, a, name)
-            best = min(of_c, key=lambda one: (of_c[one], one), default=name)
-            if of_c.get(best, np.inf) <= KNOWN_WITHOUT:
-                name = best
-        if (a, name) in middle:  # the orientation may have moved it along with c
-            held_at[a, name] = middle[a, name]
-            start = _with_values(start, held_at)
-        names = _without(names, a, name)
-    return _Determined(names, held_at)
-
-
-def _without(names: Chosen, a: int, name: str) -> Chosen:
-    """Return the free parameters without one of a camera."""
-    return [one if b != a or one is None else one - {name} for b, one in enumerate(names)]
-
-
-def _plays(camera: Camera, name: str, *roles: Role) -> bool:
-    return bool(camera.plays(*roles)[camera.names.index(name)])
-
-
-def _principal_points(survey: Survey, estimate: Estimate) -> Values:
-    """Return the principal points of cameras as the survey states them, else in the middle."""
-    values: Values = {}
-    for a, (one, camera) in enumerate(zip(survey.cameras, estimate.cameras, strict=True)):
-        width, height = camera.pixel_mm.tolist()
-        known = tuple(known_values(one, survey.start_cameras).items())
-        c_mm = camera.c_px * float(np.mean(camera.pixel_mm))
-        first = camera_from_values(
-            camera.name, camera.model, camera.size_px, (width, height), c_mm=c_mm, values=known
-        )
-        for s in np.flatnonzero(camera.plays(Role.X0, Role.Y0)).tolist():
-            values[a, camera.names[s]] = float(first.parameters[s])
-    return values
-
-
-def _with_values(estimate: Estimate, values: Values) -> Estimate:
-    """Return the estimate with other values of some parameters of its cameras."""
-    cameras = list(estimate.cameras)
-    for (a, name), value in values.items():
-        p = cameras[a].parameters.copy()
-        p[cameras[a].names.index(name)] = value
-        cameras[a] = cameras[a].with_parameters(p)
-    return replace(estimate, cameras=tuple(cameras))
+            return names, adjusted
+        names = [
+            None if one is None else one - {worst[1]} if a == worst[0] else one for a, one in enumerate(names)
+        ]
+    return names, None
 
 
 def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: float) -> Adjustment | None:

@@ -115,44 +115,6 @@ def test_what_a_network_does_not_determine_is_held() -> None:
     assert not {"c", "x0", "y0"} & set(chosen(network, truth).cameras[0].free)
 
 
-def turntable(rng: np.random.Generator, count: int) -> tuple[Network, Estimate]:
-    """Return photographs of a cube that turns about one axis before a camera that stands still."""
-    network, truth = make_network(rng, images=count, points=60)
-    p = truth.cameras[0].parameters.copy()
-    p[1:] = 0.0  # distortion would show its centre
-    truth = replace(truth, cameras=(truth.cameras[0].with_parameters(p),))
-    station, tilt = np.array([0.0, -3.5, 2.2]), np.arctan2(3.5, 2.2)
-    angle = 2 * np.pi * np.arange(count) / count
-    about = np.array([[[np.cos(t), -np.sin(t), 0], [np.sin(t), np.cos(t), 0], [0, 0, 1]] for t in angle])
-    position, rotation = about @ station, about @ _turned(tilt, 0.0)
-    seen = network.image_points
-    i, j = (one.ravel() for one in np.meshgrid(np.arange(count), np.arange(60), indexing="ij"))
-    xy = np.concatenate(
-        [project(truth.cameras[0], position[k], rotation[k], truth.points) for k in range(count)]
-    )
-    xy += 0.02 * rng.standard_normal(xy.shape)
-    keep = np.isfinite(xy).all(axis=1) & ((xy >= 0) & (xy < truth.cameras[0].size_px)).all(axis=1)
-    covariance = np.tile(0.02**2 * np.eye(2), (int(keep.sum()), 1, 1))
-    points = ImagePoints(i[keep], j[keep], xy[keep], covariance)
-    assert len(points) > len(seen) / 2
-    return replace(network, image_points=points), replace(truth, position=position, rotation=rotation)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_c_of_an_object_on_a_turntable_is_found_with_the_principal_point_in_the_middle(seed: int) -> None:
-    """Both together move along a valley: c is held only where it is not determined without y0 either."""
-    network, truth = turntable(seed_of(f"one axis {seed}"), 16)
-    start = nominal(network, truth)
-    p = start.cameras[0].parameters.copy()
-    p[:3] = 10.9, 0.0, 0.3  # where an orientation ended
-    drifted = replace(start, cameras=(start.cameras[0].with_parameters(p),))
-    found = choose_free_parameters(survey_with(), network, drifted)
-    assert "c" in found.cameras[0].free and "y0" not in found.cameras[0].free
-    assert found.estimate.cameras[0].value("y0") == 0.0
-    a = adjust(network, found.estimate, datum=Datum("free"))
-    assert a.estimate.cameras[0].value("c") == pytest.approx(truth.cameras[0].value("c"), rel=2e-3)
-
-
 @pytest.mark.parametrize("images", [1, 2])
 def test_two_photographs_hold_the_camera_and_say_so(images: int) -> None:
     network, truth = make_network(seed_of("two photographs"), images=2, points=40)

@@ -108,7 +108,9 @@ def start_cameras(
         pixel, focal = one.pixel_mm, one.c_mm
         if one.sensor_mm is not None:
             pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
-        known = known_values(one, given)
+        known = dict(from_balanced(one.balanced)) if one.balanced else {}
+        known |= {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
+        known |= dict(one.start) | approximate_values(one, one.name, given)
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in photographs if metadata[k].pixel_mm), None)
         if focal is None:
@@ -169,13 +171,6 @@ def _refuse_implausible_view(
         f"{view:.3g} degrees, expected {MIN_VIEW_DEG:g} to {MAX_VIEW_DEG:g}; "
         f"{' or '.join(likely) or 'a length in another unit than mm'}?"
     )
-
-
-def known_values(settings: CameraSettings, given: StartCameras | None) -> dict[str, float]:
-    """Return the values of a camera's parameters that the survey states or approximates, by parameter."""
-    known = dict(from_balanced(settings.balanced)) if settings.balanced else {}
-    known |= {**dict(settings.fixed), **{name: value for name, (value, _) in settings.weighted}}
-    return known | dict(settings.start) | approximate_values(settings, settings.name, given)
 
 
 def approximate_values(settings: CameraSettings, name: str, given: StartCameras | None) -> dict[str, float]:
