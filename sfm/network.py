@@ -61,8 +61,8 @@ class Source:
     has_common_errors: bool = False  # whether the errors of neighbours in a photograph have a common part
     is_matched: bool = False  # whether its image points are windows that were matched with one another
     points: str = "uncoded"  # what its points are that have no code
-    # factor by which errors in common multiply the variance of what its image points tell of unknowns that they
-    # share with other sources; as many image points have the weight of one with an error of its own
+    # factor by which errors in common multiply the variance of what its image points tell of unknowns that
+    # they share with other sources; as many image points have the weight of one with an error of its own
     design_effect: float = 1.0
 
 

@@ -172,7 +172,9 @@ def write_content(folder: Path, content: Content) -> None:
         "sigma0": None if content.sigma0 is None else or_none(content.sigma0),
         "sigma0_px": None if content.sigma0_px is None else or_none(content.sigma0_px),
         "verdict": None if result.verdict is None else result.verdict.entry,
-        "sources": [{"name": one.name, "names_last": one.names_last} for one in network.sources],
+        "sources": [
+            {name: getattr(one, name) for name in _SourceEntry.model_fields} for one in network.sources
+        ],
         "cameras": [
             {
                 "name": camera.name,
@@ -335,11 +337,18 @@ class _VerdictEntry(Json):
 class _SourceEntry(Json):
     name: Text
     names_last: bool
+    has_common_errors: bool = False
+    design_effect: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
 
     @property
     def content(self) -> Source:
         """The source; what only its measurement needs is not in the summary."""
-        return Source(self.name, self.names_last)
+        return Source(
+            self.name,
+            self.names_last,
+            has_common_errors=self.has_common_errors,
+            design_effect=self.design_effect,
+        )
 
 
 class _Summary(Json):

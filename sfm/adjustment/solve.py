@@ -296,9 +296,20 @@ def _result(
     undetermined = undetermined_of(optimum, layout, network, estimate, weight, allowed_motions=allowed)
     redundancy = run.redundancy(optimum, weight)
     observations = 2 * int((weight > 0).sum()) + count_of(run.problem.observed)
+    v = residuals(layout.observations, optimum.state)
+    discount = run.undiscounted(optimum, weight) - redundancy
+    numbers = standardised = residual_weight = np.full((len(weight), 2), np.nan)
+    complement = None
+    if Q is not None and Q.has_cross:
+        complement = hat_complement(optimum, layout, Q, weight)
+        # it can overflow for image points of a photograph that nothing determines
+        complement[~np.isfinite(complement).all(axis=(1, 2))] = np.nan
+        numbers = numbers_of(complement, layout.observations.whitening)
+        numbers[weight == 0] = np.nan
+        of_each = round(float(np.nansum((1 - layout.observations.share)[:, None] * numbers)))
+        redundancy, discount = redundancy + discount - of_each, of_each
     if sigma0 is None:
         sigma0 = float(np.sqrt(optimum.vPv / redundancy)) if redundancy > 0 else float("nan")
-    v = residuals(layout.observations, optimum.state)
     factor = 1.0
     if slopes is not None and redundancy > 0:
         factor = inflation(
@@ -309,7 +320,6 @@ def _result(
     k, n, m = len(weight), len(network.points), len(network.images)
     back = np.empty(k, dtype=np.int64)  # position of each image point of the network in the layout
     back[layout.order] = np.arange(k)
-    numbers = standardised = residual_weight = np.full((k, 2), np.nan)
     if Q is None:
         empty = np.full((n, 3, 3), np.nan)
         interior = tuple(np.full((len(free), len(free)), np.nan) for free in layout.interior_free)
@@ -319,12 +329,7 @@ def _result(
     else:
         result = marginal_covariance(optimum, layout, Q, sigma0**2)
         result = without_held(result, layout, optimum)
-    if Q is not None and Q.has_cross:
-        complement = hat_complement(optimum, layout, Q, weight)
-        # it can overflow for image points of a photograph that nothing determines
-        complement[~np.isfinite(complement).all(axis=(1, 2))] = np.nan
-        numbers = numbers_of(complement, layout.observations.whitening)
-        numbers[weight == 0] = np.nan
+    if complement is not None:
         numbers = np.take(numbers, back, axis=0)
         residual_weight = residual_weights(complement, layout.observations.whitening)
         residual_weight[weight == 0] = np.nan
@@ -349,7 +354,7 @@ def _result(
         sigma_px=sigma_px,
         sigma0=sigma0,
         redundancy=redundancy,
-        discount=run.discount(weight > 0),
+        discount=discount,
         unknowns=layout.count,
         unknown_counts=layout.counts,
         observations=observations,

@@ -247,7 +247,7 @@ def sigma0_remarks(sigma0: Sigma0, adjustment: Adjustment) -> tuple[Remark, ...]
     The remark states errors that neighbours share.
     """
     parts, shared = {}, adjustment.error_correlation
-    if shared is not None and shared.common > shared.alone:
+    if shared is not None and shared.common > shared.alone * shared.design_effect:
         parts["common"] = (shared.sigmas_px(adjustment.sigma0_px)[1], "px")
         parts["length"] = (shared.length_px, "px")
     stated = (sigma0.stated_px, "px")

@@ -27,7 +27,9 @@ from sfm.network import Estimate, Network, Source, rows_of
 from sfm.report.phrases import describe_neighbours, significant
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.choices import solve_survey
+from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.sources import TEXTURE
+from sfm.survey.sources import joined
 from sfm.survey.sources.source import Correspondences
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -331,6 +333,43 @@ def test_texture_with_errors_in_common_does_not_outvote_targets(scene: tuple[Net
     )
     assert of_weighed < 0.7 * of_plain and of_weighed < 1.1 * of_targets
     assert (np.abs(np.sqrt(np.mean(over_sigma, axis=0)) - 1) < 0.2).all()
+
+
+@pytest.mark.parametrize("reject", ["tau", "huber", "tukey"])
+def test_sigma0_counts_image_points_with_errors_in_common_in_part(
+    scene: tuple[Network, Estimate], reject: str
+) -> None:
+    """With an effect of 400 and 4 targets in 3 photographs a redundancy by counts was negative."""
+    network, truth = scene
+    rng = seed_of("counted in part")
+    both, _ = of_two_sources(network, in_common(network, 0.0, 400.0, rng), rng)
+    seen = both.image_points
+    few = replace(both, image_points=seen.select((seen.source == 1) | ((seen.point < 4) & (seen.image < 3))))
+    for some, effect in ((both, 50.0), (few, 400.0)):
+        a = adjust(with_design_effect(some, effect), truth, reject=reject)
+        plain = adjust(some, truth, reject=reject)
+        assert a.redundancy > 0 and a.sigma0 == pytest.approx(a.image_sigma0, rel=0.1)
+        assert a.sigma0 == pytest.approx(plain.sigma0, rel=0.25)
+        assert a.inflation == pytest.approx(plain.inflation, rel=0.15)
+        assert a.redundancy + a.discount == plain.redundancy + plain.discount
+
+
+def test_texture_that_fits_nothing_has_no_design_effect(scene: tuple[Network, Estimate]) -> None:
+    network, truth = scene
+    rng = seed_of("fits nothing")
+    both, _ = of_two_sources(network, in_common(network, 0.5, 400.0, rng), rng)
+    seen = both.image_points
+    xy = seen.xy.copy()
+    xy[seen.source == 1] = rng.permutation(xy[seen.source == 1])
+    wrong = replace(both, image_points=replace(seen, xy=xy))
+    start = replace(
+        truth, points=np.where(np.arange(len(truth.points))[:, None] < TARGETS, truth.points, np.nan)
+    )
+    needed = np.full(len(wrong.points), 3)
+    found = joined._balanced(wrong, start, needed, AdjustSettings())
+    assert [source.design_effect for source in found.sources] == [1.0, 1.0]
+    solved = solve_survey(survey_of(wrong, truth), Correspondences(wrong, start, needed)).adjustment
+    assert solved.sigma0 == pytest.approx(1.0, rel=0.2) and set(solved.network.source) == {0}
 
 
 def test_sources_without_errors_in_common_keep_their_weights(scene: tuple[Network, Estimate]) -> None:

@@ -246,7 +246,6 @@ def test_an_object_on_a_turntable_is_oriented_without_its_background(tmp_path: P
         (tmp_path / "survey.toml").write_text(masks, encoding="utf-8")
     found = outcome_of(tmp_path, scene)
     assert found.oriented == 24 and found.over_sigma < WRONG
-    assert found.level in ("good", "fair") and "c_held_elsewhere" not in found.kinds
     assert ("still_features" in found.kinds) != masked
 
 

@@ -172,6 +172,7 @@ class CorrelatedPart:
     which: BoolArray  # image points with correlated errors, (k,)
     middle: FloatArray  # S'(R - I) S of the scores S, (reduced + d, reduced + d)
     points: FloatArray  # covariance of each object point, (n, 3, 3)
+    limiting: FloatArray  # the same with photographs and cameras held fixed, (n, 3, 3)
 
     def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
         """Return the addition to the joint cofactor of reduced unknowns and points, (u + 3 p, u + 3 p)."""
@@ -214,6 +215,7 @@ class CorrelatedPart:
         return replace(
             covariance,
             points=covariance.points + variance * self.points,
+            points_limiting=covariance.points_limiting + variance * self.limiting,
             exterior=covariance.exterior + T @ exterior @ np.swapaxes(T, 1, 2),
             rigs=covariance.rigs + J @ D[np.ix_(columns, columns)] @ J.T,
             interior=tuple(
@@ -237,7 +239,7 @@ def correlated_part(
     linear, r = influence.linear, len(influence.unknowns)
     relative = usual_px * linear.whitening
     o, n = linear.layout.observations, len(linear.layout.point_free)
-    middle, added = np.zeros((r, r)), np.zeros((n, 3, 3))
+    middle, added, limiting = np.zeros((r, r)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     for one in _photographs(o.image, o.xy, relative, correlation, which):
         rows = one.rows
         columns, S = influence.scores_of(rows)
@@ -246,15 +248,15 @@ def correlated_part(
         j, by_ray = o.point[rows], linear.by_ray[rows].transpose(0, 2, 1)
         right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
         half = by_ray @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
-        np.add.at(
-            added, j, half + half.transpose(0, 2, 1) + by_ray @ one.variances() @ by_ray.transpose(0, 2, 1)
-        )
+        alone = by_ray @ one.variances() @ by_ray.transpose(0, 2, 1)
+        np.add.at(limiting, j, alone)
+        np.add.at(added, j, half + half.transpose(0, 2, 1) + alone)
     D = influence.unknowns.T @ middle @ influence.unknowns
     for first in range(0, n, POINTS_AT_ONCE):
         C = influence.of_points(np.arange(3 * first, min(3 * (first + POINTS_AT_ONCE), 3 * n)))
         through = np.einsum("rpa,rpb->pab", C.reshape(r, -1, 3), (D @ C).reshape(r, -1, 3))
         added[first : first + POINTS_AT_ONCE] += through
-    return CorrelatedPart(influence, correlation, relative, which, middle, added)
+    return CorrelatedPart(influence, correlation, relative, which, middle, added, limiting)
 
 
 def correlated_sum(

@@ -26,8 +26,8 @@ Source: Luhmann et al., Close-Range Photogrammetry (2020), sec. 7.3.2 (correlati
 Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4); variance components by quadratic forms and their
 expectations, Koch (1999), sec. 3.6; nested cells, Webster and Oliver (2007), Geostatistics for Environmental
 Scientists, sec. 6.3; random fields of a given covariance, Rahimi and Recht (2007), Adv. Neural Inf. Process.
-Syst. 20; design effect, Kish (1965), Survey Sampling, sec. 8.2, and Rao and Scott (1984), Annals of Statistics
-12; law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
+Syst. 20; design effect, Kish (1965), Survey Sampling, sec. 8.2, and Rao and Scott (1984), Ann. Statist. 12;
+law of propagation of variances; Kogan, mrcal, "Projection uncertainty".
 """
 
 from __future__ import annotations
@@ -181,6 +181,8 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
         The correlation; None if the errors of neighbours do not agree.
     """
     m, linear, used = _correlating(adjustment)
+    if not used.any():
+        return None
     o = m.layout.observations
     size = max(max(camera.size_px) for camera in adjustment.estimate.cameras)
     cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
@@ -233,8 +235,8 @@ def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0)
         density: ratio of the number of image points with errors in common to that in the adjustment, which
             may be a sample.
 
-    Source: Kish (1965), Survey Sampling, sec. 8.2; Rao and Scott (1984), Annals of Statistics 12, for the mean
-    of several directions.
+    Source: Kish (1965), Survey Sampling, sec. 8.2; Rao and Scott (1984), Ann. Statist. 12, for the mean of
+    several directions.
     """
     found = estimate_error_correlation(adjustment)
     if found is None:

@@ -69,7 +69,7 @@ def _figures(findings: Findings) -> dict[str, Any]:
         },
         "points": {"total": len(result.code), "coded": coded, "uncoded": len(result.code) - coded},
         "sources": [
-            values_of(source, "name names_last")
+            values_of(source, "name names_last has_common_errors design_effect")
             | {
                 "image_points": int((a.network.source == k).sum()),
                 "rejected": int(a.rejected[a.network.source == k].sum()),

@@ -419,6 +419,8 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
         effect = 1.0
         if common.any() and not common.all():
             some = common[part.source]
+            if not some.any():  # no natural point fits the orientation by the others
+                return network
             effect = design_effect_of_neighbours(balanced, density=common[network.source].sum() / some.sum())
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network

@@ -150,7 +150,7 @@ class Run:
         return 2 * float(self.problem.layout.observations.share[used].sum()) + count_of(self.problem.observed)
 
     def discount(self, used: BoolArray) -> int:
-        """Return by how much errors in common lower the redundancy.
+        """Return by how much errors in common lower the redundancy, before redundancy numbers are known.
 
         Observations with errors in common count in part, and so do points that only they determine.
 
@@ -170,10 +170,20 @@ class Run:
             optimum: optimum.
             weight: factor on the weight of each image point, (k,).
         """
+        every = self.undiscounted(optimum, weight)
+        return every - min(self.discount(weight > 0), max(every - 1, 0))
+
+    def undiscounted(self, optimum: Optimum, weight: FloatArray) -> int:
+        """Return the number of observations and constraints minus unknowns.
+
+        Args:
+            optimum: optimum.
+            weight: factor on the weight of each image point, (k,).
+        """
         held = len(optimum.motions.inverse)
         held += int(optimum.equations.blocks.held.sum())
         observations = 2 * int((weight > 0).sum()) + count_of(self.problem.observed)
-        return observations - self.problem.layout.count + held - self.discount(weight > 0)
+        return observations - self.problem.layout.count + held
 
     def _iterate(self, state: State, weight: FloatArray, method: str, near: bool = False) -> Optimum:
         optimum = iterate(

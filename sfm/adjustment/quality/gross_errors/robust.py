@@ -234,15 +234,16 @@ def inflation(
     Source: Huber and Ronchetti (2009), Robust Statistics, sec. 7.6, here for vectors in the plane.
     """
     used = weight > 0
-    w = weight[used]
+    w, share = weight[used], observations.share[used]
     others = count - 2 * len(w)
-    squares = residual_lengths(observations, residuals)[used] ** 2
+    counted = 2 * float(share.sum()) + others
+    squares = share * residual_lengths(observations, residuals)[used] ** 2
     # the other observations count with what v'Pv exceeds by, which is rounding where there are none
     psi2 = float(w**2 @ squares) + max(vPv - float(w @ squares), 0.0)
-    slope = np.concatenate([slopes[used].ravel(), np.ones(others)])
-    mean = float(slope.mean())
-    K = 1 + (count - redundancy) / count * float(slope.var()) / mean**2
-    mean_weight = (2 * float(w.sum()) + others) / count
+    mean = (float(share @ slopes[used].sum(axis=1)) + others) / counted
+    spread = (float(share @ ((slopes[used] - mean) ** 2).sum(axis=1)) + others * (1 - mean) ** 2) / counted
+    K = 1 + (counted - redundancy) / counted * spread / mean**2
+    mean_weight = (2 * float(share @ w) + others) / counted
     return float(np.sqrt(psi2 / vPv * mean_weight) * K / mean)
 
 
