@@ -370,3 +370,21 @@ def test_centres_give_the_datum_where_the_control_is_not_used() -> None:
     assert "given_mirrored" in kinds_of(remarks_on_given(result))
     assert result.adjustment.datum == "control" and len(result.adjustment.network.exterior) == 8
     assert np.abs(result.adjustment.estimate.position - truth.position).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("doubtful", "rescale", "stated", "factor"),
+    [((1,), True, 1.0, 9.0), ((), True, 1.0, 1.0), ((1,), False, 1.0, 1.0), ((1,), True, 0.0, 0.0)],
+)
+def test_only_doubtful_points_with_stated_precision_are_weighted(
+    doubtful: tuple[int, ...], rescale: bool, stated: float, factor: float
+) -> None:
+    points = SimpleNamespace(stated=stated * np.ones(3))
+    points.select = lambda kept: points
+    points.with_stated = lambda covariance: SimpleNamespace(stated=covariance)
+    judgement = SimpleNamespace(doubtful=doubtful, wrong=())
+    placed: Any = SimpleNamespace(
+        points=points, judgement=judgement, model=SimpleNamespace(factor=lambda: (3.0, 1))
+    )
+    group = given_groups.Group("control", np.arange(3), ("a", "b", "c"), placed)
+    np.testing.assert_array_equal(group.taking_part(rescale=rescale).stated, factor * np.ones(3))

@@ -278,3 +278,10 @@ def test_as_many_mirrored_photographs_as_others_decide_nothing() -> None:
 
 def test_standard_deviations_of_negative_variances_are_unknown() -> None:
     np.testing.assert_array_equal(standard_deviations(np.diag([4.0, 0.0, -1.0])), [2.0, 0.0, np.nan])
+
+
+def test_undetermined_unknowns_are_named(made: tuple[Network, Estimate]) -> None:
+    a = sfm.adjust(*made)
+    (said,) = verdicts.convergence_remarks(replace(a, undetermined=("c of camera A", "point 7")))
+    assert said.kind == "rank_defect" and said.names("undetermined") == ("c of camera A", "point 7")
+    assert verdicts.convergence_remarks(a) == ()
