@@ -96,6 +96,9 @@ def test_the_remark_on_a_camera(a: Adjustment) -> None:
     )
     assert one.names("photographs") == ("image 5", "image 6")
     assert one.names("instead") == ("object_deformed", "points_moved")
+    assert one.number("otherwise") == 4.0
+    unknown = remark(a, alternative("c"), [5.0], alternative("point", "each"))
+    assert unknown.names("instead") == ("camera_varies",) and "otherwise" not in unknown.numbers
     assert (one.number("shift"), one.number("rms")) == (4.0, 2.0)
     assert one.number("change") == pytest.approx(100 * 5.0 / 1000) and "away" not in one.numbers
     others = remark(a, alternative("centre", factor=(1, 1, 1, 1, 0, 0)), [5.0, 3.0, -4.0, 1.0])

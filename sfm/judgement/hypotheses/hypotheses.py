@@ -82,15 +82,18 @@ class Cause:
 
     @property
     def otherwise(self) -> float | None:
-        """Largest shift by another cause that explains the image points almost as well; None if unknown."""
-        known = [found.shift for _, found in self.as_well if np.isfinite(found.shift)]
-        return max(known, default=None)
+        """Largest shift by another cause that explains the image points almost as well; None if unknown.
+
+        That of a camera for each photograph is not known: what its many parameters leave open is much larger
+        than what they shift.
+        """
+        known = [found.shift for one, found in self.as_well if one.pattern != "each"]
+        return max((shift for shift in known if np.isfinite(shift)), default=None)
 
     @property
     def matters(self) -> bool:
         """Whether it, or another that explains as much, shifts the result; an unknown shift (NaN) does."""
-        every = (self.refit, *(found for _, found in self.as_well))
-        return any(not found.shift < MIN_NAMED_SIGMAS for found in every)
+        return not max(self.refit.shift, self.otherwise or 0.0) < MIN_NAMED_SIGMAS
 
     @property
     def evidence(self) -> float:
