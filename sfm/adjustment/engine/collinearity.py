@@ -30,9 +30,7 @@ class Observations(NamedTuple):
     point: IntArray  # object point of each image point, (k,)
     xy: FloatArray  # measured pixel, px, (k, 2)
     whitening: FloatArray  # a, b, c of F = (a 0; b c) with F'F = inverse covariance, 1/px, (k, 3)
-    share: (
-        FloatArray  # factor on the weight of each image point, for the errors in common of its source, (k,)
-    )
+    share: FloatArray  # factor on the weight of each image point by its source, (k,)
     camera: IntArray  # camera of each photograph, (m,)
     pose: IntArray  # pose of each image point, that of its photograph or of its rig, (k,)
     pose_of: IntArray  # pose of each photograph, (m,)

@@ -180,7 +180,13 @@ def estimate_error_correlation(adjustment: Adjustment) -> ErrorCorrelation | Non
     Returns:
         The correlation; None if the errors of neighbours do not agree.
     """
-    m, linear, used = _correlating(adjustment)
+    return _correlation_of(adjustment, *_correlating(adjustment))
+
+
+def _correlation_of(
+    adjustment: Adjustment, m: Marginal, linear: Linearised, used: BoolArray
+) -> ErrorCorrelation | None:
+    """Return the correlation that fits the residuals best, see `estimate_error_correlation`."""
     if not used.any():
         return None
     o = m.layout.observations
@@ -238,10 +244,10 @@ def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0)
     Source: Kish (1965), Survey Sampling, sec. 8.2; Rao and Scott (1984), Ann. Statist. 12, for the mean of
     several directions.
     """
-    found = estimate_error_correlation(adjustment)
+    m, linear, used = _correlating(adjustment)
+    found = _correlation_of(adjustment, m, linear, used)
     if found is None:
         return 1.0
-    m, linear, used = _correlating(adjustment)
     o, rng = m.layout.observations, np.random.default_rng(0)
 
     def of_shared(errors: FloatArray) -> float:

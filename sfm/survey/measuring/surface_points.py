@@ -127,7 +127,7 @@ def cover_photographs(
     found = without_far_points(_visible(hidden, found), estimate)
     apart = points_apart(seen, fits, settings.window_px, n_points=len(network.points))
     if len(found.image_points) < (fits & apart[seen.point]).sum():
-        return _tie_points(survey, measured, estimate, apart)
+        return _tie_points(measured, estimate, apart)
     points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
     order = np.argsort(found.image_points.point, kind="stable")
     covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
@@ -148,19 +148,11 @@ def cover_photographs(
     )
 
 
-def _tie_points(survey: Survey, measured: Measurements, estimate: Estimate, kept: BoolArray) -> Surface:
+def _tie_points(measured: Measurements, estimate: Estimate, kept: BoolArray) -> Surface:
     """Return the network of some of the tie points, (n,)."""
     network = measured.network
-    seen = network.image_points.select(kept[network.image_points.point])
-    number = np.cumsum(kept) - 1
-    points = tuple(name for name, keep in zip(network.points, kept, strict=True) if keep)
-    seen = replace(seen, point=number[seen.point])
-    return Surface(
-        network_of(survey, network.images, network.camera, points, seen),
-        replace(estimate, points=estimate.points[kept]),
-        measured.overlays,
-        (),
-    )
+    images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(network.image_points), dtype=bool)
+    return Surface(*reduce_network(network, estimate, images, kept, rays), measured.overlays, ())
 
 
 def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
