@@ -131,11 +131,11 @@ def test_what_a_photograph_alone_may_hide_is_priced_by_its_image_points() -> Non
 def test_weak_networks_say_what_they_cannot_test_and_strong_ones_nothing() -> None:
     assert unchecked_assumptions(adjusted(points=80, images=16)) == ()
     weak = unchecked_assumptions(adjusted(points=12, images=5))
-    assert {"camera_weakly_tested", "shape_weakly_tested"} <= set(kinds_of(weak))
+    assert {"constant cameras", "constant object"} <= {one.tested[0] for one in weak}
     for one in weak:
         assert one.severity == "note" and one.number("sigmas") > 5
     few = unchecked_assumptions(adjusted(points=9, images=3))
-    assert "shape_weakly_tested" not in kinds_of(few)  # of three photographs none is a part
+    assert all(one.tested[0] != "constant object" for one in few)  # of three photographs none is a part
 
 
 def test_distortion_bends_what_is_photographed_from_one_side() -> None:

@@ -50,7 +50,7 @@ WRONG = 5.0  # standard deviations, of the worst coordinate
 DETECTABLE = 17.07  # noncentrality that one test at the level 0.001 finds with 80 %; Baarda (1968)
 SURE_LEVEL, SURE_POWER = 1e-6, 0.999
 UNCHECKED = {
-    *("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested"),
+    *("constancy_weakly_tested", "held_weakly_tested"),
     "calibrated_from_few",
     *("assumptions_untested", "photographs_untested"),
 }

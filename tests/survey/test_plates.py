@@ -216,7 +216,7 @@ def test_of_given_points_the_camera_shifts() -> None:
     for sigma in (0.0, 1e-4):
         judged = judge_alternatives(adjusted(8, sigma=sigma, other=1.01))
         assert judged.causes and all(one.names("of") == ("cameras",) for one in judged.causes)
-        weak = ("camera_weakly_tested", "shape_weakly_tested", "held_weakly_tested")
+        weak = ("constancy_weakly_tested", "held_weakly_tested")
         assert not of_kind(judged.unchecked, *weak)
 
 

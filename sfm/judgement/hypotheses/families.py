@@ -136,7 +136,7 @@ class Family(ABC):
     """A set of columns that may be freed."""
 
     name: str
-    unchecked: ClassVar[str] = ""  # remark if errors of the assumption would stay unnoticed; "": none
+    constant: ClassVar[str] = ""  # what it doubts, named where a change would stay unnoticed; "": nothing
 
     @abstractmethod
     def kind(self, pattern: str) -> str:
@@ -193,7 +193,7 @@ class CameraFamily(OfPhotographs):
     """Another camera in some photographs."""
 
     of_camera = True
-    unchecked = "camera_weakly_tested"
+    constant = "constant cameras"
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""
@@ -251,7 +251,7 @@ class RowsFamily(CameraFamily):
     s_x y is b2, and s_y y is c together with an equal and opposite b1.
     """
 
-    unchecked = ""
+    constant = ""
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""
@@ -280,7 +280,7 @@ class ObjectFamily(OfPhotographs):
     """Another shape of the object in some photographs."""
 
     of_camera = False
-    unchecked = "shape_weakly_tested"
+    constant = "constant object"
 
     def kind(self, pattern: str) -> str:
         """Return the kind of remark for an alternative of this family."""

@@ -66,7 +66,7 @@ MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations ar
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 OF_FREE_POINTS = (  # tests that do not apply to given points
     *("assumptions_tested", "assumptions_untested", "photographs_untested"),
-    *("camera_weakly_tested", "held_weakly_tested", "shape_weakly_tested"),
+    *("constancy_weakly_tested", "held_weakly_tested"),
 )
 # Shift of coordinates, in standard deviations, below which a cause does not matter.
 MIN_NAMED_SIGMAS = 1.0

@@ -319,7 +319,7 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
             camera = a.estimate.cameras[index]
             held[camera.owner_of(s)][camera.names[s]] = reach
         else:
-            found[one.family.unchecked] = max(reach, found.get(one.family.unchecked, 0.0))
+            found[one.family.constant] = max(reach, found.get(one.family.constant, 0.0))
     return (
         *untested,
         *(
@@ -332,7 +332,10 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
             )
             for camera, some in held.items()
         ),
-        *(remark(kind, sigmas=reach, without=without) for kind, reach in found.items()),
+        *(
+            remark("constancy_weakly_tested", of=constant, sigmas=reach, without=without)
+            for constant, reach in found.items()
+        ),
     )
 
 

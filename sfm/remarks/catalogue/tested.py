@@ -64,12 +64,7 @@ ROWS = (
         "not tested[[: the test needs {needed:photograph}]]",
     ),
     Tested("cameras_untested", "constant cameras", "{cameras:camera}", "not tested: too many cameras"),
-    Tested(
-        "camera_weakly_tested", "constant cameras", "all photographs", UNDETECTED.format(what="a change ")
-    ),
-    Tested(
-        "shape_weakly_tested", "constant object", "all photographs", UNDETECTED.format(what="a deformation ")
-    ),
+    Tested("constancy_weakly_tested", "{of:@}", "all photographs", UNDETECTED.format(what="a change ")),
     Tested(
         "held_weakly_tested",
         "held parameters",
