@@ -37,7 +37,8 @@ from sfm.adjustment.quality.correlations import estimate_error_correlation
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
-from sfm.network import Estimate, Network, without_given
+from sfm.estimate import Estimate
+from sfm.network import Network, without_given
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.reduced_network import reduce_network

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 
 NOISE_PX = 0.1
 SIZE_PX = (2000, 1500)

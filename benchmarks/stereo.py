@@ -24,8 +24,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, project
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.distortion.models import MODELS
+from sfm.estimate import Estimate, Mounts
 from sfm.judgement.calibrated_cameras import rigs_of
-from sfm.network import Estimate, ImagePoints, Mounts, Network
+from sfm.network import ImagePoints, Network
 
 MOMENTS, NOISE_PX, PITCH = 14, 0.03, 30.0
 ROWS, COLUMNS, BASE = 6, 9, 100.0

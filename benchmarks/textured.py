@@ -25,7 +25,8 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey

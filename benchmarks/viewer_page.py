@@ -25,7 +25,8 @@ from playwright.sync_api import sync_playwright
 from scipy.spatial import cKDTree
 
 from sfm.camera import camera_from_values
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.report.view_page import write_view
 from sfm.report.viewer.embedded import scene_of_stored
 from sfm.solution import Solution

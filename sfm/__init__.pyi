@@ -15,8 +15,8 @@ from sfm.camera import Camera as Camera
 from sfm.camera import camera_from_values as camera_from_values
 from sfm.camera import project as project
 from sfm.errors import KolinearError as KolinearError
+from sfm.estimate import Estimate as Estimate
 from sfm.geometry.shapes.fit import fit_shape as fit_shape
-from sfm.network import Estimate as Estimate
 from sfm.network import Network as Network
 from sfm.network import empty_estimate as empty_estimate
 from sfm.orientation.incremental.sequence import orient as orient

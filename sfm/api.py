@@ -19,11 +19,12 @@ from sfm.adjustment.solve import adjust as adjust_network
 from sfm.arguments import checked_arguments
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.errors import BackendError, GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.inspection.features_file import read_features_file
 from sfm.inspection.measure import Measurement, measure_result
 from sfm.judgement.verdict import judge_adjustment
 from sfm.kernels.threads import cores
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.pipeline import run_survey as run_stages
 from sfm.remarks.remark import Remark, remark
 from sfm.result import SurveyResult

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
-from sfm.network import Estimate, Network, values_of
+from sfm.estimate import Estimate, values_of
+from sfm.network import Network
 from sfm.observations.pose import ExteriorObservations
 from sfm.solution import CONTROL_COVARIANCE
 

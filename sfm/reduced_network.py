@@ -14,7 +14,8 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import Network, ObjectPoints
 from sfm.observations.kind import Kind
 
 CORRELATION_LIMIT = 0.999999  # above it a covariance matrix is singular in floating point

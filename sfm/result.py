@@ -18,7 +18,8 @@ from sfm.comparison.solutions import BaselineComparison
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import Remark
 from sfm.remarks.verdict import NOT_JUDGED, Verdict
 from sfm.solution import NO_SCALE, OrientedImage, Point, PointTable, SeenTargets, Solution

@@ -20,7 +20,7 @@ from sfm.arguments import checked_arguments
 from sfm.conventions import FloatArray, skew
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate
+from sfm.estimate import Estimate
 
 PARAMETERS = 7
 MIN_DEPTH_RATIO = 0.05  # ratio of an extent to the longest one below which points have no depth

@@ -6,6 +6,7 @@ shapes, measurement, epochs and file formats accept it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -19,13 +20,17 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.display import counted, html_table, text_table
 from sfm.errors import BackendError, GeometryError
-from sfm.files.covariance_file import points_kept_together
-from sfm.network import Estimate, Network, index_of
+from sfm.estimate import Estimate
+from sfm.network import Network, index_of
 from sfm.remarks.verdict import Verdict
 
 if TYPE_CHECKING:
     import pandas
 
+MAX_POINTS = 1000  # of a stored matrix, which then takes 36 MB
+MAX_WORK = 5_000_000  # points times points of the sample: the time of their matrix grows with this product
+SEED = 1
+UNCODED = re.compile(r"u\d+")  # new names in every run of points without a name
 SHOWN = 10  # points in a printed table
 HEADER = ("point", "X", "Y", "Z", "sX", "sY", "sZ", "rays")
 NO_SCALE = "network units"
@@ -271,6 +276,24 @@ class Solution:
 
     def _repr_html_(self) -> str:
         return html_table(f"Result {self.name}", ("", ""), self._rows())
+
+
+def points_kept_together(names: tuple[str, ...]) -> IntArray:
+    """Return the points whose joint covariance is stored, in rising order: all, or a sample of over 1000.
+
+    Points with real names come first, since other results have them too. The others are drawn at random, so
+    that they are distributed like all points.
+
+    Args:
+        names: names of all points.
+    """
+    n = len(names)
+    if n <= MAX_POINTS:
+        return np.arange(n)
+    named = np.array([UNCODED.fullmatch(name) is None for name in names])
+    order = np.random.default_rng(SEED).permutation(n)
+    order = np.concatenate([order[named[order]], order[~named[order]]])
+    return np.sort(order[: min(MAX_POINTS, MAX_WORK // n)])
 
 
 def mount_blocks(covariance: FloatArray, first: int) -> FloatArray:

@@ -23,6 +23,7 @@ from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
 from sfm.conventions import AnyArray, rotation_from_angles
 from sfm.errors import KolinearError
+from sfm.estimate import Estimate
 from sfm.geometry.tolerance import Mesh
 from sfm.kernels.sampling import resample
 from sfm.kernels.threads import cores
@@ -33,7 +34,7 @@ from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.feature_tracks import link_features
 from sfm.matching.tracks.interest import foerstner_points, natural_points
-from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.network import ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.planning.designer import gains

@@ -12,7 +12,8 @@ import numpy as np
 
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 
 SIZE_PX = (1536, 1024)
 PIXEL_MM = (0.0156, 0.0156)  # a sensor of 24 mm

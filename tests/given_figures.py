@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from sfm.conventions import FloatArray, IntArray
+from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import Reference
 from sfm.judgement.given.points import GivenPoints, PlacedPoints, judge_points
-from sfm.network import Estimate, ObjectPoints
+from sfm.network import ObjectPoints
 from sfm.similarity import Similarity
 from tests.synthetic import make_network, seed_of
 

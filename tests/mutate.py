@@ -59,9 +59,8 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
             ("score", ("alternatives", "hypotheses")),
         )
     },
-    "sfm/remarks/kind.py": ("tests/remarks",),
-    "sfm/remarks/verdict.py": ("tests/remarks",),
     "sfm/remarks/remark.py": ("tests/remarks",),
+    "sfm/remarks/verdict.py": ("tests/remarks",),
     "sfm/adjustment/quality/statistics.py": (
         "tests/adjustment/test_statistical_tests.py",
         "tests/adjustment/test_statistics.py",

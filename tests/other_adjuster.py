@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 
 
 @dataclass(frozen=True)

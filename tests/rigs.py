@@ -6,7 +6,8 @@ import numpy as np
 
 from sfm.camera import project
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Mounts, Network
+from sfm.estimate import Estimate, Mounts
+from sfm.network import ImagePoints, Network
 from tests.synthetic import SIZE_PX, make_network
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.catalogue import given_values
 from sfm.remarks.remark import Remark
 from sfm.rendering.render import render_photographs

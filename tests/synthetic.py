@@ -15,7 +15,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.distortion.models import COLMAP, MODELS
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.solution import Solution
 
 SIZE_PX = (2000, 1500)

@@ -21,6 +21,7 @@ LAYERS = (
             "sfm.likelihood",
             "sfm.camera",
             "sfm.distortion",
+            "sfm.estimate",
             "sfm.network",
             "sfm.observations",
             "sfm.reduced_network",

@@ -14,15 +14,8 @@ import sfm
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError, KolinearError
-from sfm.network import (
-    Estimate,
-    ExteriorObservations,
-    ImagePoints,
-    Network,
-    ObjectPoints,
-    ScaleBars,
-    sum_rows,
-)
+from sfm.estimate import Estimate
+from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars, sum_rows
 from sfm.observations import HeightDifferences
 from sfm.reduced_network import reduce_network, select_determined
 from tests.synthetic import make_network, seed_of

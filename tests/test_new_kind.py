@@ -13,7 +13,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import FloatArray
-from sfm.network import values_of
+from sfm.estimate import values_of
 from sfm.observations.point_pairs import PointPairs
 from sfm.observations.tables import TABLES
 from sfm.pipeline import run_survey

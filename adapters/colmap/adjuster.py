@@ -27,8 +27,9 @@ from sfm.camera import Camera
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import BackendError, MissingLibraryError, one_line
+from sfm.estimate import Estimate
 from sfm.files.plain_text import as_plain
-from sfm.network import Estimate, Network
+from sfm.network import Network
 
 NEEDED_VERSION = (4, 2)
 # From the default trust region radius of 1e4 Ceres converges slowly: 46 steps on 400 photographs, 6 with 1e8.

@@ -26,7 +26,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import BackendError
-from sfm.network import Estimate, Mounts, Network, rows_of
+from sfm.estimate import Estimate, Mounts
+from sfm.network import Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours

@@ -18,7 +18,8 @@ from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_from_rig, camera_of, colmap_parameters
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import Estimate, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import Network, rows_of
 from sfm.similarity import Similarity
 
 

@@ -25,8 +25,9 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.errors import OutputError
+from sfm.estimate import Estimate
 from sfm.files.csv_tables import MAX_ROWS
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import ImagePoints, Network
 
 CAMERA_VALUES = 9
 MODELS = ("opencv", "radial")  # permitted camera models

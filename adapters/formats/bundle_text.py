@@ -41,8 +41,9 @@ from sfm.conventions import (
     rotation_from_angles,
 )
 from sfm.errors import OutputError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files.plain_text import shorten
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.network import ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
 OF_SIGMAS = "re"  # end of the name of their file in the thesis

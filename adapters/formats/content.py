@@ -16,10 +16,10 @@ import numpy as np
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import OutputError
-from sfm.files.covariance_file import UNCODED
-from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, InteriorObservations, Network, ObjectPoints
 from sfm.reduced_network import reduce_network
-from sfm.solution import NO_SCALE, Solution
+from sfm.solution import NO_SCALE, UNCODED, Solution
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ and cYZ
 

@@ -17,10 +17,11 @@ from pydantic import Field
 
 from adapters.formats.content import PAIRS
 from sfm.conventions import BoolArray, FloatArray
+from sfm.estimate import Estimate
 from sfm.files.csv_tables import read_header, read_table
 from sfm.files.plain_text import Content, csv_text, read_json
 from sfm.files.result_tables import CONTROL_POINTS, GIVEN
-from sfm.network import Estimate, ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observation_residuals import given_residuals, given_rows
 from sfm.solution import CONTROL_COVARIANCE
 

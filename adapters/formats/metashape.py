@@ -33,8 +33,9 @@ from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
 from sfm.errors import OutputError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files.plain_text import MAX_PIXEL_MM, shorten
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, rows_of
+from sfm.network import ImagePoints, Network, ObjectPoints, rows_of
 from sfm.similarity import Similarity
 
 HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus Kolinear's, px

@@ -43,10 +43,10 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.display import counted
 from sfm.errors import OutputError, SurveyFileError
-from sfm.files.covariance_file import UNCODED
+from sfm.estimate import Estimate
 from sfm.files.plain_text import MAX_SIDE_PX, shorten
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
-from sfm.solution import Solution
+from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.solution import UNCODED, Solution
 
 MODELS = ("brown", "brown_dbat")  # permitted camera models; they differ in what is minimised
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus Kolinear's, px

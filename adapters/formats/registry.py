@@ -44,10 +44,11 @@ from sfm.camera import Camera
 from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files.csv_tables import write_ply
 from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.whole_files import whole_file, whole_folder
-from sfm.network import Estimate, Network, empty_estimate
+from sfm.network import Network, empty_estimate
 from sfm.solution import Solution
 
 Reader = Callable[[Path], tuple[Network, Estimate]]

@@ -23,6 +23,7 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import (
     read_covariance,
@@ -35,7 +36,7 @@ from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
 from sfm.files.plain_text import Name, Pixel, Side, Text, as_plain, or_none, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
-from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, Source
+from sfm.network import ImagePoints, InteriorObservations, Network, Source
 from sfm.reduced_network import CORRELATION_LIMIT
 from sfm.remarks.remark import Quantity, Remark
 from sfm.remarks.verdict import Verdict

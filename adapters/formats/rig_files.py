@@ -43,8 +43,9 @@ from adapters.formats.content import Content
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import METRES, FloatArray, rotation_from_vector, skew
 from sfm.errors import OutputError
+from sfm.estimate import Mounts
 from sfm.files.open_folders import disk_errors
-from sfm.network import Mounts, Network
+from sfm.network import Network
 
 GRID = 9  # grid points along each side of a photograph
 

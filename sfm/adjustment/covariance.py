@@ -41,8 +41,9 @@ from sfm.arguments import checked_arguments
 from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.kernels.threads import own_threads
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.observations.pose import exterior_jacobian
 
 # Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.

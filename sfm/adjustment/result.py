@@ -12,7 +12,8 @@ import numpy as np
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, html_table, text_table
 from sfm.distributions import FALSE_ALARM, LEVEL, Levels
-from sfm.network import Estimate, Network, values_of
+from sfm.estimate import Estimate, values_of
+from sfm.network import Network
 from sfm.observations.kind import Group
 from sfm.remarks.remark import Remark
 from sfm.remarks.verdict import Verdict

@@ -53,8 +53,9 @@ from sfm.display import counted
 from sfm.distortion.models import MODELS, Role
 from sfm.distributions import FALSE_ALARM, Levels, level_of_single, normal_sf
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.kernels.threads import own_threads
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.reduced_network import check_network, check_number
 from sfm.remarks.remark import Remark, remark
 

@@ -21,8 +21,9 @@ from sfm.conventions import BoolArray, FloatArray
 from sfm.display import counted
 from sfm.distortion.models import CONVERTIBLE, MAX_PARAMETERS, MODELS, Model, Role, observe
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.kernels.compiling import compiled
-from sfm.network import Estimate, Network, rows_of
+from sfm.network import Network, rows_of
 
 PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts of a camera without distortion
 GRID_STEPS = 32  # fit points along the longer side: four per period of a misfit that varies as r^9 at most

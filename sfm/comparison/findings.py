@@ -9,10 +9,9 @@ import numpy as np
 from sfm.comparison.causes import Cause
 from sfm.comparison.significance import ResultComparison
 from sfm.conventions import FloatArray
-from sfm.files.covariance_file import MAX_POINTS
-from sfm.remarks.kind import WRONG_SIGMAS
-from sfm.remarks.remark import Remark, remark
+from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
 from sfm.remarks.verdict import Level, Verdict, judge
+from sfm.solution import MAX_POINTS
 
 HEADLINES: Mapping[Level, str] = {
     "good": "The points do not differ significantly.",

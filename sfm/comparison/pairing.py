@@ -16,10 +16,9 @@ from scipy.spatial import cKDTree
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.files.covariance_file import MAX_POINTS, UNCODED
 from sfm.network import rows_of
 from sfm.similarity import Similarity, extended_axes, fit_similarity, mean_distance
-from sfm.solution import Solution
+from sfm.solution import MAX_POINTS, UNCODED, Solution
 
 ROUNDING = 1e-9  # of the extent of the object: largest error of double precision and of written digits
 MAX_HELD_VARIANCE = 1e-12  # of the mean variance; a coordinate with less is held fixed

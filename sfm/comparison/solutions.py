@@ -22,7 +22,8 @@ from sfm.comparison.pairing import rounding_of
 from sfm.conventions import FloatArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.similarity import Similarity, fit_similarity

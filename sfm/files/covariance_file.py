@@ -18,11 +18,10 @@ Source: NumPy, Enhancement Proposal 1 (a simple file format for NumPy arrays).
 
 from __future__ import annotations
 
-import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -31,38 +30,14 @@ from sfm.display import counted
 from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
-
-if TYPE_CHECKING:
-    from sfm.solution import Solution
+from sfm.solution import MAX_POINTS, Solution
 
 NAME = "point_covariance.npy"
 ARRAYS = "covariances.npz"
 MAX_BYTES = 2**31  # of the unpacked arrays
 POINTS_NAME = "point_covariance_points.csv"
-MAX_POINTS = 1000  # of a stored matrix, which then takes 36 MB
-MAX_WORK = 5_000_000  # points times points of the sample: the time of their matrix grows with this product
-SEED = 1
-UNCODED = re.compile(r"u\d+")  # new names in every run of points without a name
 HEADER_BYTES = 128  # of a one-dimensional array
 SAME = 1e-6  # largest relative difference from the standard deviations in the table
-
-
-def points_kept_together(names: tuple[str, ...]) -> IntArray:
-    """Return the points whose joint covariance is stored, in rising order: all, or a sample of over 1000.
-
-    Points with real names come first, since other results have them too. The others are drawn at random, so
-    that they are distributed like all points.
-
-    Args:
-        names: names of all points.
-    """
-    n = len(names)
-    if n <= MAX_POINTS:
-        return np.arange(n)
-    named = np.array([UNCODED.fullmatch(name) is None for name in names])
-    order = np.random.default_rng(SEED).permutation(n)
-    order = np.concatenate([order[named[order]], order[~named[order]]])
-    return np.sort(order[: min(MAX_POINTS, MAX_WORK // n)])
 
 
 def write_covariance(

@@ -26,9 +26,10 @@ import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import SurveyFileError
+from sfm.estimate import Mounts
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_blocks, csv_text
-from sfm.network import ImagePoints, Mounts, Network
+from sfm.network import ImagePoints, Network
 from sfm.solution import Solution
 
 MOUNTS, MOMENTS = "mounts.csv", "moments.csv"

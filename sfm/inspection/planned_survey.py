@@ -20,11 +20,12 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotatio
 from sfm.display import counted, listed
 from sfm.distortion.models import MODELS
 from sfm.errors import SurveyFileError
+from sfm.estimate import Estimate, Mounts
 from sfm.files.csv_tables import array_table, read_table
 from sfm.files.open_folders import refuse_links_out
 from sfm.files.plain_text import Content, Name, Text, csv_text, read_json
 from sfm.files.result_tables import IN_FILES, MOMENTS, MOUNTS, SIGMAS, VALUES
-from sfm.network import Estimate, ImagePoints, Mounts, Network, rows_of
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.observations.pose import MountObservations
 from sfm.observations.tables import TABLES
 from sfm.planning.prediction import simulate_network

@@ -12,8 +12,7 @@ from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
-from sfm.remarks.kind import EXPECTED_SIGMAS
-from sfm.remarks.remark import Quantity, Remark, remark, unless_note
+from sfm.remarks.remark import EXPECTED_SIGMAS, Quantity, Remark, remark, unless_note
 from sfm.result import PhotographTargets, SurveyResult
 
 DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected

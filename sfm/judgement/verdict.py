@@ -43,8 +43,7 @@ from sfm.judgement.checks import (
 from sfm.judgement.stated_precision import stated_precision_remarks
 from sfm.network import rows_of
 from sfm.observation_residuals import GivenResiduals, GivenValue
-from sfm.remarks.kind import Grade
-from sfm.remarks.remark import Remark, remark, unless_note
+from sfm.remarks.remark import Grade, Remark, remark, unless_note
 from sfm.remarks.verdict import Level, Verdict, judge
 from sfm.result import SurveyResult
 

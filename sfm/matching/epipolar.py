@@ -7,8 +7,8 @@ import numpy as np
 from sfm.arguments import check_indices, checked_arguments
 from sfm.camera import project, ray_directions, tangents_from_pixel
 from sfm.conventions import FloatArray, IntArray, skew
+from sfm.estimate import Estimate
 from sfm.kernels.compiling import compiled
-from sfm.network import Estimate
 
 VERTICES = 65  # of a path; between two of them ordinary distortion bends it by less than 0.1 px
 

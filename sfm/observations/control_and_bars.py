@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.estimate import Estimate
 from sfm.observations.kind import (
     PARAMETER,
     POINT,
@@ -15,13 +16,11 @@ from sfm.observations.kind import (
     CoordinateKind,
     Kind,
     Linear,
+    Names,
     Values,
     no_index,
     no_value,
 )
-
-if TYPE_CHECKING:
-    from sfm.network import Estimate, Network
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class ObjectPoints(CoordinateKind):
         J = np.broadcast_to(np.eye(3), (len(self), 3, 3))
         return Linear(values.points[self.point] - self.xyz, (J,))
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the points."""
         return tuple(network.points[j] for j in self.point)
 
@@ -131,7 +130,7 @@ class InteriorObservations(Kind):
         difference = values.parameters[self.camera, self.parameter] - self.value
         return Linear(difference[:, None], (np.ones((len(self), 1, 1)),))
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return names such as "c of camera A"."""
         pairs = [(estimate.cameras[a], s) for a, s in zip(self.camera, self.parameter, strict=True)]
         return tuple(f"{camera.names[s]} of camera {camera.owner_of(s)}" for camera, s in pairs)
@@ -217,7 +216,7 @@ class ScaleBars(Kind):
         direction = (d / np.maximum(length, np.finfo(float).tiny)[:, None])[:, None]
         return Linear((length - self.length)[:, None], (-direction, direction))
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of both ends."""
         ends = zip(self.start, self.end, strict=True)
         return tuple(f"{network.points[i]} - {network.points[j]}" for i, j in ends)

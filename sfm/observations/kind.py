@@ -18,14 +18,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, Self
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
 
 # Units that tables have by mistake: the factor that corrects values and standard deviations.
 UNITS_OF_LENGTHS = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048}
@@ -43,6 +41,18 @@ def no_index() -> IntArray:
 def no_value() -> FloatArray:
     """Return an empty array of values, (0,)."""
     return np.zeros(0)
+
+
+class Names(Protocol):
+    """The names of what observations are of; a network has them."""
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of the m photographs."""
+
+    @property
+    def points(self) -> tuple[str, ...]:
+        """Names of the n points."""
 
 
 class Values(Protocol):
@@ -117,7 +127,7 @@ class Kind(ABC):
         """Return computed minus observed and the derivatives at given values of the unknowns."""
 
     @abstractmethod
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the name of each observation in tables, (n,)."""
 
     @abstractmethod
@@ -174,11 +184,11 @@ class Kind(ABC):
         """
         return values.points
 
-    def labels(self, network: Network) -> tuple[str, ...]:
+    def labels(self, network: Names) -> tuple[str, ...]:
         """Return the names of the components in tables, (d,)."""
         return self.components
 
-    def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def parts(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of parts that can be left out separately, such as a wrong observation, (q,)."""
         return tuple(f"{self.single} {name}" for name in self.names(network, estimate))
 
@@ -304,7 +314,7 @@ class TableKind(Kind):
         return np.array([np.degrees(1.0) if name in cls.angles else 1.0 for name in cls.components])
 
     @abstractmethod
-    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+    def table_rows(self, network: Names) -> list[tuple[str | float, ...]]:
         """Return the rows of the table of the observations: `texts`, then `columns`."""
 
     def units(self, estimate: Estimate, length_unit: str) -> tuple[tuple[str, ...], ...]:
@@ -324,7 +334,7 @@ class RowKind(TableKind):
         """Values of `numbers`, object unit, (n, q)."""
         return np.zeros((len(self), 0))
 
-    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+    def table_rows(self, network: Names) -> list[tuple[str | float, ...]]:
         """Return the rows of the table of the observations."""
         names = [
             [(network.images if of == PHOTOGRAPH else network.points)[i] for i in at]
@@ -450,7 +460,7 @@ class Group(TableKind):
         J = -inverse @ (HW @ fit.Jx.reshape(self.sigma.size, -1))
         return OwnParameters(fit.parameters, inverse, J.reshape(len(J), -1, 3))
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the name of the group."""
         return (self.group,)[: len(self)]
 
@@ -459,22 +469,22 @@ class Group(TableKind):
         of_row = tuple("rad" if name in self.angles else length_unit for name in self.components)
         return (of_row * len(self.sigma),)[: len(self)]
 
-    def labels(self, network: Network) -> tuple[str, ...]:
+    def labels(self, network: Names) -> tuple[str, ...]:
         """Return the name of each component of the group, (r c,)."""
         several = len(self.components) > 1
         return tuple(
             f"{row} {part}" if several else row for row in self.rows(network) for part in self.components
         )
 
-    def rows(self, network: Network) -> tuple[str, ...]:
+    def rows(self, network: Names) -> tuple[str, ...]:
         """Return the names of the observations of the group, (r,)."""
         return tuple(" - ".join(names) for names in self.row_points(network))
 
-    def row_points(self, network: Network) -> list[tuple[str, ...]]:
+    def row_points(self, network: Names) -> list[tuple[str, ...]]:
         """Return the names of the points of each observation, in the order of the table columns, (r,)."""
         return [(network.points[j],) for j in self.point[len(self.point) - len(self.value) :]]
 
-    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+    def table_rows(self, network: Names) -> list[tuple[str | float, ...]]:
         """Return the rows of the table of the observations."""
         factor, group = self.in_tables(), self.group if self.labelled else network.points[self.point[0]]
         numbers = np.hstack([factor * self.value, factor * self.sigma])[:, -len(self.columns()) :]
@@ -487,7 +497,7 @@ class Group(TableKind):
             return self
         return replace(self, point=self.point[:0], value=self.value[:0], sigma=self.sigma[:0])
 
-    def parts(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def parts(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the rows, such as "plane wall: 7", (r,)."""
         return tuple(f"{self.single} {self.group}: {row}" for row in self.rows(network))
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
 from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.observations.kind import PHOTOGRAPH, POINT, Block, Fit, Group, Linear, RowKind, Values
-
-if TYPE_CHECKING:
-    from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.observations.kind import PHOTOGRAPH, POINT, Block, Fit, Group, Linear, Names, RowKind, Values
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Pairs(RowKind):
         """Return the blocks of both ends."""
         return Block(self.texts_of, self.start), Block(self.texts_of, self.end)
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of both ends."""
         of = network.images if self.texts_of == PHOTOGRAPH else network.points
         return tuple(f"{of[i]} - {of[j]}" for i, j in zip(self.start, self.end, strict=True))
@@ -142,7 +140,7 @@ class OffsetDistances(Group):
             one = replace(self, value=np.linalg.norm(end - start, axis=1)[:, None])
         return super(OffsetDistances, one).simulated(values, rng)
 
-    def row_points(self, network: Network) -> list[tuple[str, ...]]:
+    def row_points(self, network: Names) -> list[tuple[str, ...]]:
         """Return the names of both points of each distance, (r,)."""
         names = [network.points[j] for j in self.point]
         return [(names[i], names[j]) for i, j in self.ends]

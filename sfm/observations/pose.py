@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from sfm.conventions import (
     rotation_from_angles,
     skew,
 )
+from sfm.estimate import Estimate
 from sfm.observations.kind import (
     MOUNT,
     PHOTOGRAPH,
@@ -24,14 +25,12 @@ from sfm.observations.kind import (
     CoordinateKind,
     Kind,
     Linear,
+    Names,
     RowKind,
     Values,
     no_index,
 )
 from sfm.observations.point_pairs import Pairs
-
-if TYPE_CHECKING:
-    from sfm.network import Estimate, Network
 
 MIN_COS_PHI = 1e-8  # closer to +-90 deg, omega and kappa have no separate sigmas
 
@@ -113,7 +112,7 @@ class OfPhotographs(Kind):
         """Return the block of the photographs."""
         return (Block(PHOTOGRAPH, self.image),)
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the photographs."""
         return tuple(network.images[i] for i in self.image)
 
@@ -210,7 +209,7 @@ class MountObservations(PoseObservations):
             "inverse rotation": replace(self, angles=angles),
         }
 
-    def names(self, network: Network, estimate: Estimate) -> tuple[str, ...]:
+    def names(self, network: Names, estimate: Estimate) -> tuple[str, ...]:
         """Return the names of the cameras."""
         return tuple(estimate.cameras[a].name for a in self.camera)
 

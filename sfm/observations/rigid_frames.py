@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from sfm.conventions import FloatArray, rotation_from_vector, skew
-from sfm.observations.kind import Fit, Group, OwnParameters, Values, inverse_of_determined
-
-if TYPE_CHECKING:
-    from sfm.network import Network
+from sfm.observations.kind import Fit, Group, Names, OwnParameters, Values, inverse_of_determined
 
 ON_LINE = 1e-6  # share of the largest singular value below which a rotation does not change given coordinates
 
@@ -63,7 +60,7 @@ class RigidFrames(Group):
         J = (A @ by_motion).reshape(len(A), -1, 3)
         return OwnParameters((self.hidden_value @ R.T + t).ravel(), cofactor, J)
 
-    def table_rows(self, network: Network) -> list[tuple[str | float, ...]]:
+    def table_rows(self, network: Names) -> list[tuple[str | float, ...]]:
         """Return the rows of the table of coordinates, with points that no photograph shows last."""
         numbers = np.hstack([self.hidden_value, self.hidden_sigma]).tolist()
         rows = zip(self.hidden, numbers, strict=True)

@@ -9,7 +9,8 @@ import numpy as np
 
 from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray, skew
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.orientation.intersection import Intersection, intersect
 
 PLANAR_POINTS = 4

@@ -21,7 +21,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.observations.kind import POINT
 from sfm.planning import MIN_PIXELS
 from sfm.planning.designer import Candidates, Design, StationLimits, candidates, gains, image_rows

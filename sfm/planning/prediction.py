@@ -35,7 +35,8 @@ from sfm.display import counted
 from sfm.distributions import LEVEL, POWER
 from sfm.epochs.displacements import detectable_shift
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ScaleBars, index_of, rows_of, values_of
+from sfm.estimate import Estimate, values_of
+from sfm.network import ImagePoints, Network, ScaleBars, index_of, rows_of
 from sfm.observations.kind import Group
 from sfm.orientation.image_rays import ray_angles
 from sfm.planning.planned_object import PlannedObject

@@ -15,7 +15,7 @@ from sfm.arguments import checked_arguments
 from sfm.camera import Camera
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Mounts
+from sfm.estimate import Mounts
 from sfm.planning.planned_object import PlannedObject
 from sfm.planning.visibility import best_focus
 

@@ -32,7 +32,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, ScaleBars
+from sfm.estimate import Estimate
+from sfm.network import Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.planning.prediction import MIN_POINTS, Prediction, predict_network, select_usable, spread_evenly
 from sfm.planning.visibility import WORDS, Seeing, Visibility

@@ -11,7 +11,7 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.display import counted, plural
-from sfm.files.covariance_file import MAX_POINTS, write_covariance
+from sfm.files.covariance_file import write_covariance
 from sfm.geometry.alignment import Alignment
 from sfm.geometry.shapes.fit import ShapeFit
 from sfm.geometry.tolerance import DECISIONS, Deviations
@@ -36,7 +36,7 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import fixed, general, signed, significant, with_sigma
 from sfm.report.viewer.embedded import measurement_viewer
-from sfm.solution import Solution
+from sfm.solution import MAX_POINTS, Solution
 
 PICTURE = (
     "Length measurement error over length. Bars are the expanded uncertainty of the calibration, lines the "

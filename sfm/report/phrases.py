@@ -18,8 +18,8 @@ from sfm.display import NO_BREAK, counted, listed
 from sfm.distributions import normal_ppf
 from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
 from sfm.judgement.checks import Precision, Sigma0
-from sfm.remarks.kind import probability as probability
-from sfm.remarks.kind import significant as significant
+from sfm.remarks.remark import probability as probability
+from sfm.remarks.remark import significant as significant
 from sfm.report.findings import Findings
 from sfm.result import ControlCheck, SurveyResult
 

@@ -17,8 +17,9 @@ from sfm.comparison.solutions import Baseline, BaselineComparison, compare_basel
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.conventions import IntArray
 from sfm.errors import KolinearError, MissingLibraryError
+from sfm.estimate import Estimate
 from sfm.judgement.verdict import judge_survey
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.remarks.remark import Remark, remark
 from sfm.result import CheckPoint, SeenPlate, StageTime, SurveyResult
 from sfm.runtime.progress import StageClock

@@ -20,7 +20,8 @@ import numpy as np
 from sfm.camera import Camera, project
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import f_isf
-from sfm.network import Estimate, rows_of
+from sfm.estimate import Estimate
+from sfm.network import rows_of
 from sfm.remarks.remark import Remark, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements

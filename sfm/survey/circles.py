@@ -12,7 +12,8 @@ import numpy as np
 
 from sfm.camera import pixel_curvature, pixel_jacobian
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from sfm.remarks.remark import Remark, remark
 from sfm.result import Eccentricity

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm.conventions import IntArray
 from sfm.distributions import f_isf
-from sfm.network import Estimate
+from sfm.estimate import Estimate
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.rigs import middle_rotation, with_moments

@@ -23,8 +23,9 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
 from sfm.distortion.models import MODELS, Role
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
-from sfm.network import Estimate, Network, without_given
+from sfm.network import Network, without_given
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.calibration import plate_family

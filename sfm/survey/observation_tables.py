@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,10 +24,6 @@ from sfm.observations.tables import TABLES
 from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import AXES, ScaleBar, refuse_tiny_sigmas
-
-if TYPE_CHECKING:
-    from sfm.survey.inputs.survey import Survey
-
 
 DISTANCE = "distance"
 
@@ -234,24 +229,26 @@ def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
     return found
 
 
-def unused_observations(survey: Survey, network: Network) -> tuple[Remark, ...]:
+def unused_observations(
+    tables: Sequence[ObservationTable], copied: tuple[str, ...], network: Network
+) -> tuple[Remark, ...]:
     """Return the remarks on observations of tables that are not used: without their points, or copies."""
     frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
-    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+    for one, labels in zip(tables, _labels(tables), strict=True):
         for row in np.flatnonzero(~_known(one, network)):
             names = tuple(column[row] for column in one.table.texts)
             if (labels.get(names[0]), *names[1:]) not in hidden:
                 unused.append(one.name(int(row)))
-    usable = with_tables(survey.tables, replace(network, observations=())).observations
-    for one, labels in zip(survey.tables, _labels(survey.tables), strict=True):
+    usable = with_tables(tables, replace(network, observations=())).observations
+    for one, labels in zip(tables, _labels(tables), strict=True):
         there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is one.of}
         unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
     return (
         *([remark("names_missing", of="observations", names=unused)] if unused else []),
-        *([remark("rows_identical", rows=survey.copied)] if survey.copied else []),
+        *([remark("rows_identical", rows=copied)] if copied else []),
         *([remark("frame_points_computed", points=computed)] if computed else []),
     )
 

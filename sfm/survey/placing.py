@@ -24,7 +24,8 @@ from sfm.adjustment.datum import Datum
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angles, rotation_from_vector, skew
 from sfm.display import counted
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, values_of
+from sfm.estimate import Estimate, values_of
+from sfm.network import Network
 from sfm.observations.control_and_bars import ScaleBars
 from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
 from sfm.observations.pose import MountObservations

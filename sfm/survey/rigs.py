@@ -22,7 +22,8 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.display import counted, listed
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, Mounts, Network
+from sfm.estimate import Estimate, Mounts
+from sfm.network import Network
 from sfm.observations.pose import MountObservations
 from sfm.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import RigSettings

@@ -29,7 +29,8 @@ from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights,
 from sfm.arguments import check_indices, checked_arguments
 from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust

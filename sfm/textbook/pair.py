@@ -25,8 +25,9 @@ from sfm.arguments import checked_arguments
 from sfm.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
 from sfm.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.kernels.sampling import resample
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
 
 BORDER_POINTS = 40  # points per side of a photograph that give the format of its normal image

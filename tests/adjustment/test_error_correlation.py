@@ -19,11 +19,12 @@ from sfm.adjustment.quality.correlations import (
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import MOVED, Alternative
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
-from sfm.network import Estimate, Network, Source, rows_of
+from sfm.network import Network, Source, rows_of
 from sfm.report.phrases import describe_neighbours, significant
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.choices import solve_survey

@@ -16,7 +16,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation, pixel_from_image, rotation_from_angles
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 from tests.places import ROOT
 from tests.tables import rows_of
 

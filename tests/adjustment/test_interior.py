@@ -22,7 +22,8 @@ from sfm.camera import Camera, project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, InteriorObservations, Network, ObjectPoints
 from sfm.textbook.direct import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 

@@ -25,7 +25,8 @@ from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import null_motions
 from sfm.conventions import FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, ScaleBars
+from sfm.estimate import Estimate
+from sfm.network import Network, ScaleBars
 from tests.synthetic import observed_anew, seed_of
 from tests.synthetic_blocks import FREE, HEIGHT, aerial, in_sigmas, lens, run, spoiled, unordered
 

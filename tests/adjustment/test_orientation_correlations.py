@@ -15,7 +15,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary

@@ -16,7 +16,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 

@@ -12,7 +12,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.observations.point_pairs import CoordinateDifferences
 from tests.synthetic import C_MM, PIXEL_MM, SIZE_PX, make_network, seed_of
 

@@ -22,7 +22,8 @@ from sfm.adjustment.engine.unknowns import Unknowns, start_weights, step, unknow
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from tests.rigs import make_rig
 from tests.synthetic import perturb, seed_of
 

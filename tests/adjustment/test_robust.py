@@ -26,7 +26,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of

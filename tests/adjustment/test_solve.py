@@ -16,14 +16,8 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import angles_from_rotation, rotation_from_angles
 from sfm.distortion.models import GENERAL_MODELS, MODELS
 from sfm.errors import GeometryError
-from sfm.network import (
-    Estimate,
-    ExteriorObservations,
-    InteriorObservations,
-    Network,
-    ObjectPoints,
-    ScaleBars,
-)
+from sfm.estimate import Estimate
+from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import angle_jacobian
 from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, perturb, seed_of

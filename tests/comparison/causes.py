@@ -20,7 +20,8 @@ from sfm.comparison.significance import compare_results
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.epochs.differences import Epoch
 from sfm.epochs.series import analyse_epochs, verdict_of_epochs
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import kinds_of
 from sfm.solution import Solution
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of

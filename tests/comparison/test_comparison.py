@@ -23,7 +23,8 @@ from sfm.comparison.two_adjusters.adjusters import common_problem, compare_adjus
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import MODELS as CAMERA_MODELS
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.similarity import Similarity
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of

@@ -23,7 +23,8 @@ from sfm.comparison.stable_points import tests_in_datum as single_tests_in_datum
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import Remark, kinds_of, remark
 from sfm.report.differences import describe_scale
 from sfm.similarity import Similarity

@@ -14,7 +14,8 @@ from sfm.comparison.pairing import pair_results
 from sfm.comparison.significance import compare_results
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.similarity import Similarity
 from sfm.solution import Solution
 from tests.synthetic import make_network, seed_of

@@ -24,7 +24,8 @@ from sfm.comparison.two_adjusters.random_network import (
     random_network,
 )
 from sfm.errors import BackendError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import remark
 
 NETWORKS = 60

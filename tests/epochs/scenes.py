@@ -12,7 +12,8 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
 from sfm.epochs.differences import Epoch
-from sfm.network import Estimate, InteriorObservations, Network
+from sfm.estimate import Estimate
+from sfm.network import InteriorObservations, Network
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 IMAGES, POINTS, NOISE_PX = 14, 60, 0.1

@@ -22,7 +22,8 @@ from sfm.conventions import FloatArray
 from sfm.distributions import t_ppf
 from sfm.epochs.differences import Epoch
 from sfm.epochs.series import EpochSeries, analyse_epochs, verdict_of_epochs
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity
 from tests.places import DATASETS, ROOT

@@ -17,7 +17,8 @@ from sfm.epochs.displacements import find_displacements
 from sfm.epochs.series import analyse_epochs
 from sfm.epochs.together import adjust_together
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, InteriorObservations, Network, ObjectPoints, ScaleBars
 from tests.epochs.scenes import BAR_SIGMA, POINTS, epoch, scene
 
 EVERY = np.ones(POINTS)

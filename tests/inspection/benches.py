@@ -10,7 +10,8 @@ import numpy as np
 import sfm
 from sfm.camera import camera_from_values, project
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.solution import Solution
 from tests.synthetic import seed_of
 

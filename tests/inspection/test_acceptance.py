@@ -14,8 +14,9 @@ from typer.testing import CliRunner
 from adapters.formats.result_tables import read_scale_sources, write_tables
 from sfm.cli.app import app
 from sfm.errors import KolinearError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.inspection.acceptance import Acceptance, CalibratedLengths, accept_result, read_lengths
-from sfm.network import Estimate, ImagePoints, Network, without_given
+from sfm.network import ImagePoints, Network, without_given
 from sfm.remarks.remark import remark
 from sfm.report.pages import write_page
 from sfm.solution import Solution

@@ -11,9 +11,9 @@ import sfm
 from sfm.adjustment.result import Adjustment
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import FloatArray
+from sfm.estimate import Estimate
 from sfm.judgement.calibrated_cameras import interior_parameters, rigs_of
 from sfm.judgement.checks import precision_of
-from sfm.network import Estimate
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 

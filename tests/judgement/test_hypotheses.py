@@ -15,6 +15,7 @@ from sfm.camera import project
 from sfm.comparison.solutions import reprojection
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses import hypotheses, score
 from sfm.judgement.hypotheses import refit as refitting
 from sfm.judgement.hypotheses.alternatives import interiors
@@ -34,10 +35,9 @@ from sfm.judgement.hypotheses.hypotheses import (
 )
 from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.judgement.hypotheses.score import gain_of, log_probability, reduce_adjustment
-from sfm.network import Estimate, InteriorObservations, Network, ObjectPoints
+from sfm.network import InteriorObservations, Network, ObjectPoints
 from sfm.planning.stations import aim_camera
-from sfm.remarks.kind import WRONG_SIGMAS
-from sfm.remarks.remark import Remark, kinds_of
+from sfm.remarks.remark import WRONG_SIGMAS, Remark, kinds_of
 from sfm.similarity import fit_similarity
 from tests.survey.faults import EVERY, FAULTS, planted
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -9,8 +9,9 @@ import pytest
 
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.bumps import _gain, _scores, bump_remarks, find_bumps
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 

@@ -9,7 +9,8 @@ import pytest
 
 import sfm
 from sfm.adjustment.datum import Datum
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity

@@ -26,11 +26,12 @@ from sfm.adjustment.quality.statistics import (
 from sfm.adjustment.result import Adjustment
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import statistics_of
 from sfm.judgement.checks import standard_deviations
 from sfm.judgement.verdict import judge_adjustment, judge_survey
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.remarks.verdict import Verdict

@@ -13,11 +13,12 @@ import pytest
 from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, rotation_from_angles, rotation_from_vector
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.matching.conjugate import difference_of_blur, match_points
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.matching.tracks.correspondence import match_targets
-from sfm.network import Estimate, ImagePoints
+from sfm.network import ImagePoints
 from tests.synthetic import seed_of
 from tests.textures import natural_texture, with_noise
 

@@ -29,6 +29,7 @@ from sfm.conventions import (
     rotation_from_vector,
 )
 from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.coverage import (
     MAX_SHARED_FRACTION,
@@ -52,7 +53,7 @@ from sfm.matching.tracks.feature_tracks import (
 )
 from sfm.matching.tracks.features import Features, PairMatches, matched_features, sift_features
 from sfm.matching.tracks.interest import foerstner_points, natural_points, textured_squares
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import ImagePoints, Network
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of

@@ -6,7 +6,8 @@ from scipy.optimize import least_squares
 
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import rotation_from_angles
-from sfm.network import Estimate, ImagePoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints
 from sfm.orientation import intersection
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.intersection import intersect

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import orient
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity

@@ -9,7 +9,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values, pixel_from_tangents
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental import sequence
 from sfm.orientation.incremental.sequence import orient
 from sfm.remarks.remark import kinds_of

@@ -12,8 +12,9 @@ import sfm
 from sfm.adjustment.solve import predict
 from sfm.camera import camera_from_values
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.planning.plan import further_photographs, plan_of, verdict_of_plan
 from sfm.planning.planned_object import shape_object
 from sfm.planning.prediction import WantedPrecision, predict_network

@@ -15,9 +15,10 @@ from sfm.camera import camera_from_values
 from sfm.conventions import angles_from_rotation, rotation_from_vector
 from sfm.distributions import chi2_ppf
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.files.plain_text import csv_text
 from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.observations.kind import PHOTOGRAPH, Group, TableKind
 from sfm.observations.rigid_frames import RigidFrames
 from sfm.observations.tables import TABLES

@@ -12,8 +12,19 @@ import pytest
 from sfm.display import MAX_LISTED
 from sfm.remarks.catalogue import KINDS, SUBJECTS, TESTS
 from sfm.remarks.catalogue.hypotheses import SHIFT
-from sfm.remarks.kind import FIELD, OPTIONAL, Grade, Kind, significant
-from sfm.remarks.remark import Quantity, Remark, kinds_of, of_kind, remark, unless_note
+from sfm.remarks.remark import (
+    FIELD,
+    OPTIONAL,
+    Grade,
+    Kind,
+    Quantity,
+    Remark,
+    kinds_of,
+    of_kind,
+    remark,
+    significant,
+    unless_note,
+)
 from sfm.remarks.verdict import judge, lines_of
 from tests.places import ROOT
 

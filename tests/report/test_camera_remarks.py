@@ -11,9 +11,10 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import rotation_from_vector
+from sfm.estimate import Estimate
 from sfm.judgement import cameras as camera_remarks
 from sfm.judgement.calibrated_cameras import camera_is_result
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind, remark
 from sfm.remarks.verdict import Verdict

@@ -24,11 +24,12 @@ from sfm.adjustment.quality.consistency import Consistency, Uneven, consistency_
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
 from sfm.conventions import FloatArray
+from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import Given
 from sfm.judgement.cameras import edges_of, larger_than_the_others, sharpness_remarks
 from sfm.judgement.checks import longest_residual
 from sfm.judgement.verdict import given_remarks
-from sfm.network import Estimate, Network, ScaleBars
+from sfm.network import Network, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark, of_kind, remark
 from sfm.report.findings import Findings

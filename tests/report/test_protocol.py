@@ -14,7 +14,8 @@ from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.report.findings import Findings
 from sfm.report.survey_report import text_report

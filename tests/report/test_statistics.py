@@ -27,6 +27,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.conventions import angles_from_rotation
+from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import given_of, statistics_of
 from sfm.judgement.calibrated_cameras import families, interior_parameters
 from sfm.judgement.checks import (
@@ -39,7 +40,7 @@ from sfm.judgement.checks import (
     sigma0_of,
 )
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
-from sfm.network import Estimate, ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.remarks.remark import of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.output import plot_data

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.observations.kind import Group, TableKind
 from tests.rigs import make_rig
 from tests.survey.test_rigs import RIG, written

@@ -12,7 +12,8 @@ import numpy as np
 
 from sfm.camera import project
 from sfm.conventions import FloatArray
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 NOISE_PX = 0.1

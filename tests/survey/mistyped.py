@@ -17,7 +17,8 @@ import numpy as np
 
 from sfm.conventions import FloatArray
 from sfm.errors import KolinearError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.result import SurveyResult

@@ -15,7 +15,7 @@ from sfm.adjustment.quality.other_solutions import scale_estimate
 from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate
+from sfm.estimate import Estimate
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.similarity import reverse_depth

@@ -14,8 +14,9 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import given_of
-from sfm.network import Estimate, ObjectPoints
+from sfm.network import ObjectPoints
 from sfm.observations.pose import MountObservations
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import Remark

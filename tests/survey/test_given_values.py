@@ -12,8 +12,9 @@ from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_tables as write_stored
 from datasets.camcal.reference import prepare
 from sfm.errors import SurveyFileError
+from sfm.estimate import Estimate
 from sfm.judgement.checks import longest_residual
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.observations.control_and_bars import ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind

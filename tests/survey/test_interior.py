@@ -15,7 +15,8 @@ from sfm.adjustment.datum import Datum
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation
 from sfm.errors import GeometryError, SurveyFileError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.survey_report import text_report

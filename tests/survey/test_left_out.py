@@ -13,7 +13,8 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import image_from_pixel
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.output import write_result

@@ -12,7 +12,8 @@ import sfm
 from sfm.camera import camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, Source, empty_estimate
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, Source, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import remark
 from sfm.survey.diagnosis.lost_photographs import (

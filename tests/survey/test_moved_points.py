@@ -11,7 +11,8 @@ import sfm
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.camera import project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.remarks.remark import of_kind
 from sfm.result import SurveyResult
 from sfm.similarity import fit_similarity

@@ -14,7 +14,8 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.conventions import FloatArray
 from sfm.distortion.models import Role
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey

@@ -14,7 +14,8 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import Camera, camera_from_values, project
 from sfm.cli.console import print_result
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.rendering.render import corner_rays, render_photograph

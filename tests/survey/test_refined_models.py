@@ -23,8 +23,9 @@ from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.solvers import refine
 from sfm.conventions import AnyArray, FloatArray
 from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.matching.radiometry import GreyPhotographs
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import ImagePoints, Network
 from sfm.similarity import Similarity
 from sfm.survey.refining import windows as model_photographs
 from sfm.survey.refining.refinement import UNSUPPORTED, refine_model

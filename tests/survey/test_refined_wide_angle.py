@@ -15,7 +15,8 @@ from adapters.colmap.reconstruction import colmap_parameters
 from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.cli.commands.solvers import refine
 from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from tests.synthetic import seed_of
 from tests.tables import rows_of
 

@@ -16,8 +16,9 @@ from sfm.adjustment.quality.variance_components import by_kind
 from sfm.camera import project
 from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate, Mounts
 from sfm.judgement.calibrated_cameras import rigs_of
-from sfm.network import Estimate, Mounts, Network
+from sfm.network import Network
 from sfm.pipeline import run_survey
 from sfm.planning.prediction import simulate_network
 from sfm.remarks.remark import Remark, kinds_of, of_kind

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from sfm.camera import camera_from_values, project
-from sfm.network import Estimate, ImagePoints, Network, empty_estimate
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, empty_estimate
 from sfm.orientation.incremental.sequence import Orientation, orient
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, of_kind

@@ -14,8 +14,9 @@ from sfm.adjustment.quality import variance_components
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.conventions import rotation_from_vector
 from sfm.errors import BackendError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import statistics_of
-from sfm.network import Estimate, Network, ObjectPoints, ScaleBars
+from sfm.network import Network, ObjectPoints, ScaleBars
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import of_kind
 from sfm.report.output import write_result

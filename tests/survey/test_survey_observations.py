@@ -16,17 +16,10 @@ from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.solve import adjust
 from sfm.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.errors import SurveyFileError
+from sfm.estimate import Estimate, values_of
 from sfm.judgement.given import free_network
 from sfm.judgement.given.tables import Contradiction, Table, as_judged
-from sfm.network import (
-    Estimate,
-    ExteriorObservations,
-    InteriorObservations,
-    Network,
-    ObjectPoints,
-    ScaleBars,
-    values_of,
-)
+from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
 from sfm.observations import planes_and_lines
 from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind, inverse_of_determined
 from sfm.observations.planes_and_lines import Lines, PlumbLines

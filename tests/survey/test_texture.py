@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sfm.camera import project
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import JudgedAssumptions
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.remarks.remark import of_kind, remark
 from sfm.similarity import fit_similarity
 from sfm.survey.adjusting import solution

@@ -11,11 +11,12 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.camera import pixel_from_tangents
 from sfm.distributions import LEVEL
+from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings, remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.values import GivenModel
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of, remark
 from sfm.similarity import Similarity

@@ -23,7 +23,8 @@ import numpy as np
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import fit_similarity

@@ -10,7 +10,8 @@ import pytest
 from sfm.camera import project
 from sfm.conventions import rotation_from_vector
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.textbook.pair import make_normal_images
 from tests.synthetic import make_network, seed_of
 

@@ -23,9 +23,10 @@ from sfm.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.display import counted
 from sfm.distortion.models import MAX_PARAMETERS
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate, Mounts
 from sfm.kernels.compiling import compiled
 from sfm.kernels.small_algebra import turn
-from sfm.network import Estimate, Mounts, Network
+from sfm.network import Network
 from sfm.observations.kind import POINT
 from sfm.observations.pose import exterior_jacobian
 

@@ -29,7 +29,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import f_isf
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.similarity import fit_similarity, reverse_depth
 
 STEP = 1.3  # ratio of successive principal distances that are tried

@@ -16,7 +16,8 @@ from sfm.errors import GeometryError, SurveyFileError
 
 if TYPE_CHECKING:
     from sfm.camera import Camera
-    from sfm.network import Mounts, Network
+    from sfm.estimate import Mounts
+    from sfm.network import Network
     from sfm.planning.planned_object import PlannedObject
     from sfm.planning.prediction import ScaleBarPlan
     from sfm.planning.stations import Stations

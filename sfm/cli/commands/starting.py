@@ -25,7 +25,7 @@ from sfm.errors import KolinearError, MissingLibraryError
 
 if TYPE_CHECKING:
     from sfm.adjustment.result import Adjustment
-    from sfm.network import Estimate
+    from sfm.estimate import Estimate
 
 READER_GONE = 141  # exit code 128 + SIGPIPE, as a shell reports it for other programs
 LIBRARIES = (
@@ -210,7 +210,7 @@ def _check_adjustment() -> str:
     """Compare the adjustment of a synthetic network with the true values."""
     import numpy as np
 
-    from sfm.remarks.kind import WRONG_SIGMAS
+    from sfm.remarks.remark import WRONG_SIGMAS
 
     found, truth = _tested_network()
     if not found.converged:

@@ -31,7 +31,8 @@ from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetw
 from sfm.conventions import BoolArray, FloatArray
 from sfm.display import program_name
 from sfm.errors import KolinearError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity

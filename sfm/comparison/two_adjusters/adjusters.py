@@ -36,8 +36,9 @@ from sfm.display import counted, program_name
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import ImagePoints, Network
 from sfm.reduced_network import reduce_network, select_supported
 from sfm.runtime.progress import report_step
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from sfm.camera import Camera, camera_from_values, project
 from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ObjectPoints
 
 MODELS = ("opencv", "full_opencv")  # models that COLMAP also has
 ARRANGEMENTS = ("ring", "hemisphere", "strip", "close pairs")

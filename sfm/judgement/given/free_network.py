@@ -23,8 +23,9 @@ from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.conventions import FloatArray, IntArray
 from sfm.errors import GeometryError
+from sfm.estimate import AdjustedValues, Estimate, values_of
 from sfm.judgement.given.values import RANK, GivenModel
-from sfm.network import AdjustedValues, Estimate, Network, values_of
+from sfm.network import Network
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
 from sfm.similarity import Similarity, similarity_motions
 

@@ -23,8 +23,7 @@ from sfm.judgement.given.values import (
 )
 from sfm.network import Network
 from sfm.observations.kind import CoordinateKind, Kind
-from sfm.remarks.kind import WRONG_SIGMAS
-from sfm.remarks.remark import Remark, remark
+from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import extended_axes
 

@@ -30,8 +30,7 @@ from sfm.judgement.given.values import (
 )
 from sfm.network import ScaleBars
 from sfm.observations.kind import Kind
-from sfm.remarks.kind import significant
-from sfm.remarks.remark import Remark, remark
+from sfm.remarks.remark import Remark, remark, significant
 from sfm.result import GivenTest
 from sfm.similarity import Similarity
 

@@ -24,6 +24,7 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
 from sfm.distributions import MIN_LEAD
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     alternatives_of,
@@ -50,7 +51,7 @@ from sfm.judgement.hypotheses.score import (
     squares_gained,
 )
 from sfm.likelihood import price_of
-from sfm.network import Estimate, Network, rows_of, without_given
+from sfm.network import Network, rows_of, without_given
 from sfm.reduced_network import reduce_network
 from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import reported

@@ -55,8 +55,7 @@ from sfm.judgement.hypotheses.score import (
 )
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Network
-from sfm.remarks.kind import WRONG_SIGMAS
-from sfm.remarks.remark import Remark, remark
+from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
 from sfm.similarity import fit_similarity, without_motions
 
 ROUNDS = 6

@@ -20,6 +20,7 @@ from sfm.camera import Camera, tangents_from_pixel
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.matching.epipolar import essential_matrices
 from sfm.matching.tracks.evidence import (
     SEARCH,
@@ -32,7 +33,6 @@ from sfm.matching.tracks.evidence import (
     prune,
     same_target,
 )
-from sfm.network import Estimate
 
 # Two points that never share a photograph and lie closer than this many tolerances are one target.
 SAME_TOLERANCES = 2.5

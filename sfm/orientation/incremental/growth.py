@@ -18,7 +18,8 @@ from sfm.camera import Camera, project
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.estimate import Estimate
+from sfm.network import Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.intersection import intersect

@@ -23,7 +23,8 @@ from sfm.camera import Camera
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, empty_estimate
+from sfm.estimate import Estimate
+from sfm.network import Network, empty_estimate
 from sfm.orientation.incremental.growth import (
     FIRST_ADJUSTMENT,
     MIN_SHARE,

@@ -16,7 +16,8 @@ import numpy as np
 from sfm.conventions import FloatArray, IntArray
 from sfm.display import counted, listed
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import Network, rows_of
 from sfm.orientation.image_rays import PLANAR_POINTS, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations

@@ -18,7 +18,7 @@ from sfm.remarks.catalogue import (
     plans,
     tested,
 )
-from sfm.remarks.kind import Kind, Tested
+from sfm.remarks.remark import Kind, Tested
 
 SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
     {

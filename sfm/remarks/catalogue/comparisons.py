@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind
+from sfm.remarks.remark import Grade, Kind
 
 OTHER_PROGRAMS = (
     Kind(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sfm.conventions import SWELLING
-from sfm.remarks.kind import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
+from sfm.remarks.remark import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
 
 DATUM = (
     Kind(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Grade, Kind, Unless
+from sfm.remarks.remark import Grade, Kind, Unless
 
 POINTS = (
     Kind(

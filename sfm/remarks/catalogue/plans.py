@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Kind
+from sfm.remarks.remark import Kind
 
 BATCHES = (
     Kind(

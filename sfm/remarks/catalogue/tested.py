@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.remarks.kind import Tested
+from sfm.remarks.remark import Tested
 
 UNDETECTED = (
     "weak: {what}may shift coordinates[[ of the network without {{without:@}}]] by up to {{sigmas}} standard "

@@ -27,11 +27,11 @@ from markupsafe import Markup
 from sfm.camera import project
 from sfm.comparison.stable_points import point_blocks
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.files.covariance_file import MAX_POINTS
+from sfm.estimate import Estimate
 from sfm.files.plain_text import or_none
 from sfm.geometry.tolerance import Deviations
 from sfm.judgement.checks import rms_of_groups
-from sfm.network import Estimate, ImagePoints, Network
+from sfm.network import ImagePoints, Network
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
@@ -48,7 +48,7 @@ from sfm.report.viewer.pictures import (
     distance_sigmas,
 )
 from sfm.result import sort_likeliest_first
-from sfm.solution import SeenTargets, Solution
+from sfm.solution import MAX_POINTS, SeenTargets, Solution
 
 if TYPE_CHECKING:
     from sfm.epochs.displacements import Displacements

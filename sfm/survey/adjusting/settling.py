@@ -30,8 +30,9 @@ from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.choices import Choice, choose
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from sfm.observations.kind import is_observed
 from sfm.orientation.image_rays import ray_angles
 from sfm.reduced_network import merge_estimate, reduce_network, select_determined

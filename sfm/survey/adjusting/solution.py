@@ -22,6 +22,7 @@ from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS, Role
 from sfm.distributions import normal_ppf
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
@@ -30,7 +31,7 @@ from sfm.judgement.hypotheses.bumps import bump_remarks
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
+from sfm.network import ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.orientation.incremental.starting_pair import pair_solutions
 from sfm.reduced_network import merge_estimate, reduce_network

@@ -15,7 +15,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.camera import Camera, base_name
 from sfm.conventions import BoolArray, IntArray
 from sfm.distortion.models import MODELS
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.observations.kind import Group
 from sfm.observations.pose import MountObservations
 from sfm.remarks.remark import Remark, remark
@@ -57,7 +58,7 @@ def remarks_on_solution(
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
         *datum_remarks(survey, adjustment.network, missing, has_scale=adjustment.has_scale),
-        *unused_observations(survey, adjustment.network),
+        *unused_observations(survey.tables, survey.copied, adjustment.network),
         *weak_scale(adjustment),
         *scale_alone(adjustment),
     )

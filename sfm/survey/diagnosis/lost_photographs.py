@@ -41,9 +41,10 @@ from sfm.comparison.significance import compare_results
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.choices import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Estimate, Network, empty_estimate, rows_of
+from sfm.network import Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation

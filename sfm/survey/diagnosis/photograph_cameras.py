@@ -32,11 +32,12 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM, FAMILY, Levels
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
 from sfm.judgement.hypotheses.refit import log_likelihood_of
 from sfm.likelihood import log_likelihood, price_of
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints
+from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.reduced_network import reduce_network

@@ -23,7 +23,8 @@ from sfm.display import counted
 from sfm.distortion.brown import from_balanced
 from sfm.distortion.models import MODELS
 from sfm.errors import PhotographError, SurveyFileError
-from sfm.network import Estimate, InteriorObservations, Network
+from sfm.estimate import Estimate
+from sfm.network import InteriorObservations, Network
 from sfm.observations.pose import MountObservations
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras

@@ -10,7 +10,8 @@ import numpy as np
 from sfm.camera import Camera
 from sfm.conventions import IntArray
 from sfm.errors import SurveyFileError
-from sfm.network import Estimate, ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.estimate import Estimate
+from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.observations.pose import MountObservations
 from sfm.survey.inputs.cameras import refuse_unknown_cameras
 from sfm.survey.inputs.exterior_table import ObservedExterior

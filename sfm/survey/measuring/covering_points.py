@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.estimate import Estimate
 from sfm.kernels.threads import in_threads
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
@@ -25,7 +26,7 @@ from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
-from sfm.network import Estimate, ImagePoints, rows_of
+from sfm.network import ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.runtime.progress import give_back_memory, reported
 

@@ -18,6 +18,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.matching.lsm.coverage import (
     CoveredPixels,
     Windows,
@@ -26,7 +27,7 @@ from sfm.matching.lsm.coverage import (
     project_points,
 )
 from sfm.matching.lsm.surface_planes import on_surface
-from sfm.network import Estimate, ImagePoints, Network, without_given
+from sfm.network import ImagePoints, Network, without_given
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles

@@ -17,9 +17,10 @@ from sfm.adjustment.solve import adjust
 from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
 from sfm.display import counted
 from sfm.errors import GeometryError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.matching.correlation import LsmFlag, in_words
 from sfm.matching.lsm.coverage import points_apart
-from sfm.network import Estimate, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.network import ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.reduced_network import merge_estimate, reduce_network, select_determined
 from sfm.remarks.remark import Remark, remark

@@ -23,13 +23,14 @@ from sfm.display import counted
 from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
+from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import judge_given
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, project_points
 from sfm.matching.radiometry import odd_window
-from sfm.network import Estimate, Network, without_given
+from sfm.network import Network, without_given
 from sfm.reduced_network import check_number
 from sfm.remarks.remark import Remark, remark, unless_note
 from sfm.runtime.progress import SILENT, Progress

@@ -15,13 +15,14 @@ import numpy as np
 
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.errors import PhotographError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files.globs import why_no_folder
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, plane_warps, points_apart
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import planes_at
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import MEMORY_BYTES, Grey, GreyPhotographs, grey_of, shrink_photograph
-from sfm.network import Estimate, ImagePoints, Network, rows_of
+from sfm.network import ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph

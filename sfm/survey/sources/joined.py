@@ -20,7 +20,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.errors import GeometryError
-from sfm.network import Estimate, ImagePoints, Network, ScaleBars, without_given
+from sfm.estimate import Estimate
+from sfm.network import ImagePoints, Network, ScaleBars, without_given
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import decoding_once

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Protocol
 
 from sfm.conventions import IntArray
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.remarks.remark import Remark
 from sfm.result import Eccentricity, LeftOutPoint, PhotographTargets

@@ -14,7 +14,8 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, BoolArray
-from sfm.network import Estimate, Network, rows_of, without_given
+from sfm.estimate import Estimate
+from sfm.network import Network, rows_of, without_given
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect

@@ -19,7 +19,8 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import camera_from_values
 from sfm.comparison.solutions import reprojection
 from sfm.errors import BackendError, OutputError, SurveyFileError
-from sfm.network import Estimate, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey

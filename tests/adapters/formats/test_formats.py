@@ -37,8 +37,9 @@ from sfm.comparison.camera_conversion import convert_camera, convert_cameras, un
 from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection
 from sfm.errors import KolinearError, OutputError, SurveyFileError
+from sfm.estimate import Estimate
 from sfm.files.csv_tables import write_ply
-from sfm.network import Estimate, Network, ObjectPoints
+from sfm.network import Network, ObjectPoints
 from tests.places import SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of
 from tests.tables import rows_of

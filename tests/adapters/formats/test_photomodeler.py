@@ -18,7 +18,8 @@ from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.solvers import convert
 from sfm.conventions import angles_from_rotation
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, Network, ObjectPoints
+from sfm.estimate import Estimate
+from sfm.network import Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey

@@ -24,7 +24,8 @@ from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_cameras
 from sfm.conventions import rotation_from_vector
 from sfm.errors import OutputError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.solution import Solution
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of

@@ -23,7 +23,8 @@ from adapters.reading.text_lines import Lines
 from adapters.reading.xml_lines import read_xml
 from sfm.comparison.camera_conversion import convert_cameras
 from sfm.errors import OutputError, SurveyFileError
-from sfm.network import Estimate, Network
+from sfm.estimate import Estimate
+from sfm.network import Network
 from sfm.solution import Solution
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of

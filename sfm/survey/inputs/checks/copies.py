@@ -28,7 +28,8 @@ from sfm.conventions import FloatArray, IntArray
 from sfm.display import agreeing, counted, listed
 from sfm.distributions import f_sf
 from sfm.errors import GeometryError
-from sfm.network import Estimate, Network, rows_of
+from sfm.estimate import Estimate
+from sfm.network import Network, rows_of
 
 # Correlation from which half of the variance of the errors is common. Real photographs saved again as JPEG of
 # quality 40 reach 0.99.
