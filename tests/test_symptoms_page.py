@@ -28,6 +28,7 @@ REASONS = (
     "sfm/survey/measuring/targets.py",
     "sfm/survey/orientation.py",
     "sfm/survey/adjusting/settling.py",
+    "sfm/survey/inputs/checks/contradictions.py",
     "sfm/survey/inputs/settings.py",
     "sfm/orientation/incremental",
     "sfm/pipeline.py",
@@ -69,10 +70,8 @@ def trees(*places: str) -> Iterator[tuple[str, ast.Module]]:
 
 
 def error_messages(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield what errors and rules for settings say, and what is put into a list of remarks."""
+    """Yield what errors say, and what is put into a list of remarks."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Yield) and isinstance(node.value, ast.JoinedStr | ast.Constant):
-            yield node.lineno, text_of(node.value)
         if isinstance(node, ast.Call) and node.args:
             target = node.func.value if isinstance(node.func, ast.Attribute) else None
             is_remark = isinstance(target, ast.Name) and target.id == "remarks" and called(node) == "append"
