@@ -23,7 +23,8 @@ Every name is listed in `__init__.pyi` and is imported when it is first used.
 
 from __future__ import annotations
 
-from sfm.runtime.installation import public_names, refuse_mixed_installation
+from sfm.runtime.installation import refuse_mixed_installation
+from sfm.runtime.public_names import public_names
 
 refuse_mixed_installation()
 

@@ -25,6 +25,6 @@ The computation is in `engine`, the assessment of quality in `quality`.
 
 from __future__ import annotations
 
-from sfm.runtime.installation import public_names
+from sfm.runtime.public_names import public_names
 
 __getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

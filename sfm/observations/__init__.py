@@ -31,6 +31,6 @@ residuals, redundancy numbers, tests and variance component follow:
 
 from __future__ import annotations
 
-from sfm.runtime.installation import public_names
+from sfm.runtime.public_names import public_names
 
 __getattr__, __dir__, __all__ = public_names(__name__, __path__[0])

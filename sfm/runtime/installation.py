@@ -1,8 +1,4 @@
-"""The installation: public names, foreign packages of the same names, and settings in the current folder.
-
-Public names are imported on first use. They are listed once, in the stub `__init__.pyi` of their package,
-which type checkers and editors read. Every row of the stub is one public name, `from module import name as
-name`, or one room, `from . import room as room`. A new name only needs a new row.
+"""The installation: foreign packages of the same names, and settings in the current folder.
 
 Two other projects on the registry have packages with the names of Kolinear's two packages, and a user may
 have a folder of such a name. Installers silently merge packages of one name into one folder, in which the
@@ -14,16 +10,12 @@ reads `.numba_config.yaml` there, which can name a folder of compiled functions.
 programs. matplotlib reads `matplotlibrc` there, which can have every text set by LaTeX. Python searches it
 first for modules in processes of multiprocessing and Dask, which are started with `python -c`, unless
 PYTHONSAFEPATH is set.
-
-Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
-from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 
 from sfm.errors import InstallationError, KolinearError
@@ -31,44 +23,6 @@ from sfm.errors import InstallationError, KolinearError
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))
 """a file of each of the other projects, PyPI's sfm and adapters, that Kolinear does not have"""
-Face = tuple[Callable[[str], object], Callable[[], list[str]], list[str]]
-
-
-def public_names(package: str, folder: str) -> Face:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package from its stub.
-
-    Args:
-        package: name of the package.
-        folder: folder of the package, with its `__init__.pyi`.
-
-    Raises:
-        AttributeError: from `__getattr__`, if a name is not public.
-    """
-    module_of = _modules_of_stub(package, os.path.join(folder, "__init__.pyi"))
-    names = sorted(module_of)
-
-    def get(name: str) -> object:
-        if name not in module_of:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'", name=name)
-        module = import_module(module_of[name])
-        value = module if module.__name__ == f"{package}.{name}" else getattr(module, name)
-        setattr(sys.modules[package], name, value)
-        return value
-
-    return get, lambda: list(names), names
-
-
-def _modules_of_stub(package: str, stub: str) -> dict[str, str]:
-    """Return the module of each name that a stub imports."""
-    module_of = {}
-    with open(stub, encoding="utf-8") as lines:
-        for line in lines:
-            if line.startswith("from "):
-                _, module, _, name, *_ = line.split()
-                module_of[name] = f"{package}.{name}" if module == "." else module
-    return module_of
-
-
 ROOT = os.path.abspath(os.path.join(__file__, *[os.pardir] * 3))
 COMMANDS = ("kolinear", "kolinear.exe", "-m")  # these print one line and no traceback
 BAD_INPUT = 2
