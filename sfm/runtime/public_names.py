@@ -2,7 +2,7 @@
 
 They are listed once, in the stub `__init__.pyi` of their package,
 which type checkers and editors read. Every row of the stub is one public name, `from module import name as
-name`, or one room, `from . import room as room`. A new name only needs a new row.
+name`, or one room, `from place import room as room`. A new name only needs a new row.
 
 Source: lazy loading as in Scientific Python's SPEC 1, https://scientific-python.org/specs/spec-0001/.
 """
@@ -34,7 +34,12 @@ def public_names(package: str, folder: str) -> Face:
         if name not in module_of:
             raise AttributeError(f"module '{package}' has no attribute '{name}'", name=name)
         module = import_module(module_of[name])
-        value = module if module.__name__ == f"{package}.{name}" else getattr(module, name)
+        if module.__name__ == f"{package}.{name}":
+            value: object = module
+        elif hasattr(module, name):
+            value = getattr(module, name)
+        else:  # a room within another
+            value = import_module(f"{module_of[name]}.{name}")
         setattr(sys.modules[package], name, value)
         return value
 
