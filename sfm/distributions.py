@@ -14,13 +14,15 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-# Probabilities of tests. All tests of image coordinates share the first; one question has the second.
+# Probabilities of tests. All tests of image coordinates of a survey share the first.
 FALSE_ALARM = 0.05  # that the tests of one kind, together, report anything in a result without errors
-LEVEL = 0.001  # that one question is answered wrongly although nothing is wrong; Baarda (1968)
+LEVEL = 0.001  # that one question is answered wrongly where there is no survey; Baarda (1968)
 POWER = 0.8  # that an error of the size that is called detectable is found; Baarda (1968)
-# Level of a question about a whole survey, as if five shared a false alarm: alternatives, choices of model,
-# points, photographs, divisions of these, cameras. More are asked; not all are open in one survey.
-FAMILY = FALSE_ALARM / 5
+# Questions that share a false alarm. About a whole survey: alternatives, choices of model, points,
+# photographs, divisions of these, cameras; more are asked, but not all are open in one survey. About single
+# values of it: as many as give Baarda's 0.001 for a false alarm of 0.05.
+WHOLE, SINGLE = 5, 50
+FAMILY = FALSE_ALARM / WHOLE
 MARGIN = 2 * np.log(1 / LEVEL)  # lead in -2 ln likelihood that distinguishes an explanation from others
 MIN_LEAD = np.log(100)  # difference of ln likelihood below which two alternatives cannot be separated
 
@@ -36,13 +38,13 @@ class Levels:
 
     @property
     def question(self) -> float:
-        """Level of one question: LEVEL, for FALSE_ALARM."""
-        return LEVEL * (self.false_alarm / FALSE_ALARM)
+        """Level of one question about single values of the survey."""
+        return self.false_alarm / SINGLE
 
     @property
     def family(self) -> float:
         """Level of a question about the whole survey: FAMILY, for FALSE_ALARM."""
-        return FAMILY * (self.false_alarm / FALSE_ALARM)
+        return self.false_alarm / WHOLE
 
     def of_each(self, tests: int) -> float:
         """Level of each of several tests that share the false alarm, see `level_of_single`."""

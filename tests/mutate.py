@@ -101,7 +101,7 @@ ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that 
     **{
         f"sfm/judgement/{module}.py": tests
         for module, tests in (
-            ("choices", ("tests/judgement/test_choices.py",)),
+            ("model_choice", ("tests/judgement/test_model_choice.py",)),
             (
                 "verdict",
                 (

@@ -89,6 +89,7 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
         "planning/": "a plan",
         "report/planning.py": "a plan",
         "comparison/": "two results",
+        "cli/commands/solvers.py": "several results",
         "epochs/": "several results",
         "geometry/": "a shape",
     }
@@ -106,7 +107,9 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
 
 def test_all_levels_have_the_share_of_the_user() -> None:
     usual, strict = distributions.Levels(), distributions.Levels(distributions.FALSE_ALARM / 10)
-    assert (usual.question, usual.family) == (distributions.LEVEL, distributions.FAMILY)
+    assert usual.false_alarm == distributions.FALSE_ALARM and usual.family == distributions.FAMILY
+    assert usual == distributions.Levels(distributions.FALSE_ALARM)
+    assert distributions.Levels(0.05).question == distributions.LEVEL  # whatever the default is
     assert strict.question == pytest.approx(usual.question / 10)
     assert strict.family == pytest.approx(usual.family / 10)
     assert strict.of_each(1000) == pytest.approx(usual.of_each(1000) / 10, rel=0.03)

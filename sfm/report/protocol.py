@@ -113,7 +113,8 @@ def _limits(result: SurveyResult) -> str:
     if result.reject == "tau":
         critical = tau_critical(a.test_alpha, a.redundancy)
         return (
-            f"where |tau| exceeds {critical:.2f} (level {a.test_alpha:.2g}), restored where it no longer does"
+            f"where |tau| exceeds {critical:.2f} (level {a.test_alpha:.2g}, all together {a.false_alarm:g}), "
+            "restored where it no longer does"
         )
     if result.reject == "tukey":
         return f"weight 0 beyond {TUKEY:g} standard deviations, restored below"

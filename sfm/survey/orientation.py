@@ -25,7 +25,7 @@ from sfm.camera import Camera, camera_from_values
 from sfm.conventions import BoolArray, IntArray
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
-from sfm.judgement.choices import Choice, solve_likeliest
+from sfm.judgement.model_choice import Choice, solve_likeliest
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
 from sfm.orientation.image_rays import intersect_image_points

@@ -286,3 +286,15 @@ def test_undetermined_unknowns_are_named(made: tuple[Network, Estimate]) -> None
     (said,) = verdicts.convergence_remarks(replace(a, undetermined=("c of camera A", "point 7")))
     assert said.kind == "rank_defect" and said.names("undetermined") == ("c of camera A", "point 7")
     assert verdicts.convergence_remarks(a) == ()
+
+
+def test_a_level_left_out_is_the_same_as_the_same_level_stated() -> None:
+    """In everything that is said; single questions had Baarda's level at the default, whatever that was."""
+    network, truth = make_network(seed_of("stated and left out"), images=6, points=30)
+    network = with_gross_errors(network)
+    reports = []
+    for adjust in ({"reject": "tau"}, {"reject": "tau", "false_alarm": FALSE_ALARM}):
+        result = run_survey(survey_of(network, truth, adjust=adjust))
+        reports.append((result.verdict, text_report(findings_of(result))))
+        assert result.adjustment.levels.question == pytest.approx(FALSE_ALARM / 50)
+    assert reports[0] == reports[1]

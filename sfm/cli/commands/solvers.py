@@ -226,11 +226,14 @@ def epochs(
         str, typer.Option("--model", help="Motion of a group: rigid, similarity or affine.")
     ] = "rigid",
     alpha: Annotated[
-        float,
+        float | None,
         typer.Option(
-            "--alpha", min=1e-6, max=0.5, help="Probability of reporting a motion where nothing moved."
+            "--alpha",
+            min=1e-6,
+            max=0.5,
+            help="Probability of reporting a motion where nothing moved; as for a survey if left out.",
         ),
-    ] = 0.05,
+    ] = None,
     together: Annotated[
         bool,
         typer.Option(
@@ -249,6 +252,7 @@ def epochs(
     """
     with loading():
         from sfm.cli.console import exit_by, print_verdict
+        from sfm.distributions import FALSE_ALARM
         from sfm.epochs.series import analyse_epochs, verdict_of_epochs
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.report.epochs import describe_block, describe_stable
@@ -274,7 +278,7 @@ def epochs(
             reference=_split_names(reference),
             groups=groups,
             model=model,
-            alpha=alpha,
+            alpha=FALSE_ALARM if alpha is None else alpha,
             together=together,
         )
     page = write_page(found, out)

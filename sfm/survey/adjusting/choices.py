@@ -17,7 +17,7 @@ from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.camera import base_name
 from sfm.conventions import IntArray
 from sfm.estimate import Mounts
-from sfm.judgement.choices import Choice, choose
+from sfm.judgement.model_choice import Choice, choose
 from sfm.judgement.verdict import judge_adjustment
 from sfm.remarks.remark import Quantity, of_kind, remark
 from sfm.runtime.progress import report_step

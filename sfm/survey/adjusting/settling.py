@@ -31,7 +31,7 @@ from sfm.distortion.models import Role
 from sfm.distributions import chi2_isf
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
-from sfm.judgement.choices import Choice, choose
+from sfm.judgement.model_choice import Choice, choose
 from sfm.network import Network
 from sfm.observations.kind import is_observed
 from sfm.orientation.image_rays import ray_angles

@@ -23,13 +23,13 @@ from sfm.distortion.models import MODELS, Role
 from sfm.distributions import normal_ppf
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
-from sfm.judgement.choices import Choice, choose
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.hypotheses.bumps import bump_remarks
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.rejections import explain_rejections
+from sfm.judgement.model_choice import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import ExteriorObservations, Network, ScaleBars
 from sfm.observations.pose import MountObservations

@@ -42,7 +42,7 @@ from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.distributions import FALSE_ALARM
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
-from sfm.judgement.choices import Choice, choose
+from sfm.judgement.model_choice import Choice, choose
 from sfm.likelihood import areas_of_photographs, log_likelihood
 from sfm.network import Network, empty_estimate, rows_of
 from sfm.orientation.image_rays import image_tangents, rays_of

@@ -33,9 +33,9 @@ from sfm.distortion.models import Role
 from sfm.distributions import FALSE_ALARM, FAMILY, Levels
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
-from sfm.judgement.choices import Choice, choose
 from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
 from sfm.judgement.hypotheses.refit import log_likelihood_of
+from sfm.judgement.model_choice import Choice, choose
 from sfm.likelihood import log_likelihood, price_of
 from sfm.network import ImagePoints, Network, ObjectPoints
 from sfm.orientation.incremental.growth import residual_lengths

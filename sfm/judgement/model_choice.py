@@ -42,7 +42,7 @@ class Choice(Generic[Model, Solution]):
     Example:
         The mean of a sample, or none:
 
-        >>> from sfm.judgement.choices import Choice, choose
+        >>> from sfm.judgement.model_choice import Choice, choose
         >>> row = Choice(lambda _: [0.0, 2.0], lambda before, after: after - before)
         >>> choose(1.0, [row], solve=float)
         2.0

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from sfm.errors import GeometryError
-from sfm.judgement.choices import Choice, choose, solve_likeliest
+from sfm.judgement.model_choice import Choice, choose, solve_likeliest
 
 
 def solve(model: float) -> float:
