@@ -73,12 +73,14 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     """
     a = result.adjustment
     statistics, consistency = statistics_of(a), consistency_of(a)
+    of_sigma0 = sigma0_remarks(sigma0_of(a), a)
+    is_explained = any(said.kind == "sigma0_high" for said in of_sigma0)  # by a cause, whatever this shifts
     remarks = (
         *convergence_remarks(a),
         *photograph_remarks(result),
-        *slight_as_tests(result.stage_remarks),
+        *(result.stage_remarks if is_explained else slight_as_tests(result.stage_remarks)),
         *other_solution_remarks(result),
-        *sigma0_remarks(sigma0_of(a), a),
+        *of_sigma0,
         *residual_remarks(longest_residual(a)),
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),

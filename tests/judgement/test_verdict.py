@@ -40,7 +40,7 @@ from sfm.report.survey_report import text_report
 from sfm.result import FailedImage, SurveyResult
 from tests.findings import findings_of
 from tests.surveys import survey_of
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of
 
 
 @pytest.fixture(scope="module")
@@ -256,6 +256,20 @@ def test_an_effect_below_what_users_expect_is_a_row_of_the_table(made: tuple[Net
         slight = [one for one in verdict.tests if one.kind == "slight_effect"]
         assert [one.number("shift") for one in slight] == ([] if kinds else [shift])
         assert all("a different camera" in one.tested[1] for one in slight)
+
+
+def test_a_cause_of_large_residuals_is_named_whatever_it_shifts() -> None:
+    """b1 is held at a wrong value, which the other unknowns compensate in all but the residuals."""
+    network, truth = make_network(seed_of("held 1"), images=16, points=80)
+    camera = truth.cameras[0]
+    values = dict(zip(camera.names, camera.parameters, strict=True)) | {"b1": 3e-3}
+    right = replace(camera, parameters=np.array([values[name] for name in camera.names]))
+    network = observed_anew(network, replace(truth, cameras=(right,)), 0.1, seed_of("held b1 noise"))
+    result = run_survey(survey_of(network, truth, free=("c", "x0", "y0", "K1")))
+    named = {said.kind: said for said in result.verdict.remarks}
+    assert named["sigma0_high"].number("ratio") > 2
+    assert "b1" in named["held_parameter"].names("parameters")
+    assert named["held_parameter"].number("shift") < 2
 
 
 def test_no_test_of_points_is_a_row_where_none_was_tested() -> None:
