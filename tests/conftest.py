@@ -27,6 +27,16 @@ os.environ["XDG_CACHE_HOME"] = CACHES  # never that of the user
 atexit.register(shutil.rmtree, CACHES, ignore_errors=True)
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile the kernels before the first test, which would wait for it and read that it is done."""
+    from sfm.kernels.warmed import is_warm
+
+    if not hasattr(session.config, "workerinput") and not is_warm():
+        from sfm.warm_up import main
+
+        main()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Leave to the study what `sweep` does not list, by its place among the cases of a test.

@@ -48,7 +48,7 @@ def test_a_survey_is_not_compared_and_says_why(tmp_path: Path, capsys: pytest.Ca
         assert "not compared: pycolmap" in " ".join((out / page).read_text(encoding="utf-8").split())
 
 
-@pytest.mark.parametrize("arguments", [("validate", "--networks", 1), ("refine", "MODEL", "--images", ".")])
+@pytest.mark.parametrize("arguments", [("refine", "MODEL", "--images", ".")])
 def test_commands_that_need_pycolmap_end_in_one_line(
     arguments: tuple[object, ...],
     tmp_path: Path,

@@ -315,7 +315,7 @@ def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 
 
 @dataclass(frozen=True)
 class ColmapBackend:
-    """COLMAP as the other adjuster of a validation (sfm.comparison.two_adjusters.adjuster_validation)."""
+    """COLMAP as the other adjuster of a validation (benchmarks.validation)."""
 
     name: str = "colmap"
 

@@ -52,7 +52,6 @@ for _command in (
     measuring.targets,
     inspecting.measure,
     inspecting.accept,
-    solvers.validate,
     solvers.compare,
     solvers.epochs,
     solvers.convert,

@@ -53,7 +53,6 @@ PAGES: Mapping[str, str] = {
     "Refinement": "sfm.report.refinement:page",
     "ResultComparison": "sfm.report.differences:page",
     "UnfinishedSurvey": "sfm.report.unfinished:page",
-    "Validation": "sfm.report.differences:validation_page",
     "ViewerScene": "sfm.report.view_page:page",
 }
 """For each type of result, the module (imported when needed) and the function that declares its page."""

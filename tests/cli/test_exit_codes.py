@@ -42,7 +42,6 @@ COMMANDS = {
     "accept": ("result", "lengths.csv", "--limit-a", "0.1"),
     "match": ("left.png", "right.png"),
     "targets": ("--out", "sheet.pdf"),
-    "validate": (),
     "doctor": (),
     "compare": ("a", "b"),
     "epochs": ("a", "b"),

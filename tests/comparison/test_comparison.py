@@ -11,6 +11,7 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap, adjust_with_covariance
 from adapters.formats.photomodeler import read_photomodeler
+from benchmarks.random_networks import random_network
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.solve import adjust
@@ -18,7 +19,6 @@ from sfm.camera import camera_from_values
 from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
 from sfm.comparison.two_adjusters import adjusters
-from sfm.comparison.two_adjusters.adjuster_validation import random_network
 from sfm.comparison.two_adjusters.adjusters import common_problem, compare_adjusters, grouped_free
 from sfm.conventions import rotation_from_vector
 from sfm.distortion.models import MODELS as CAMERA_MODELS

@@ -9,16 +9,12 @@ from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from sfm.batch.job import SurveyRow
 from sfm.batch.table import batch_page
 from sfm.comparison.significance import compare_results
-from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
-from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import remark
 from sfm.report.output import write_result
 from sfm.report.pages import content_policy, html, write_page
 from sfm.solution import Solution
@@ -95,21 +91,13 @@ def index_page(folder: Path) -> str:
     return html(batch_page(rows, EVIL))
 
 
-def validation_page(folder: Path) -> str:
-    plan = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
-    figures = ((10.0, 10.0), (0.1, 0.1), (5, 12), (0.01, 0.02), 1e-6, 2e-6, 3e-6, 4e-6, 1e-12, np.nan, 1.4)
-    ended = remark("other_adjuster_failed", network=0, program="COLMAP", their_message=EVIL)
-    trial = Trial(0, plan, 60, 400, *figures, ended)
-    return write_page(Validation("colmap", 7, (trial,)), folder / "out").read_text(encoding="utf-8")
-
-
 def differences_page(folder: Path) -> str:
     network, truth = make_network(seed_of("policy"), model="opencv", images=5, points=20)
     found = compare_results(Solution(EVIL, network, truth), Solution("b", network, truth))
     return write_page(found, folder / "out", xyz=truth.points).read_text(encoding="utf-8")
 
 
-PAGES = (report_page, index_page, validation_page, differences_page)
+PAGES = (report_page, index_page, differences_page)
 
 
 @pytest.mark.parametrize("write", PAGES)

@@ -21,16 +21,14 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
-from sfm.comparison.two_adjusters.adjuster_validation import Trial, Validation
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.comparison.two_adjusters.random_network import Plan
 from sfm.display import bound
 from sfm.errors import GeometryError, OutputError
 from sfm.files.whole_files import remove_leftovers
 from sfm.network import Network
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark, kinds_of, remark
-from sfm.report.differences import TRIALS, largest_difference, verdict_of_validation
+from sfm.remarks.remark import kinds_of
+from sfm.report.differences import largest_difference
 from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
 from sfm.report.output import write_result
 from sfm.report.page import FoldedParts, Heading, Paragraph, Part, Statement, Table
@@ -50,88 +48,29 @@ from tests.tables import rows_of
 
 pytestmark = pytest.mark.usefixtures("plots")
 
-PLAN = Plan("ring", 8, 60, False, 0.8, 0.1, "opencv", 1, "all", "free")
 
-
-def trial(number: int, *, cost: float = 10.0, ended: Remark | None = None) -> Trial:
-    return Trial(
-        number,
-        PLAN,
-        60,
-        400,
-        (10.0, cost),
-        (0.1, 0.1),
-        (5, 12),
-        (0.01, 0.02),
-        1e-6,
-        2e-6,
-        3e-6,
-        4e-6,
-        1e-12,
-        np.nan,
-        1.4,
-        ended or remark("same_optimum", network=number, program="COLMAP", apart=0.0),
-    )
-
-
-def test_validation_is_written_with_every_figure(tmp_path: Path) -> None:
-    failed = remark(
-        "other_adjuster_failed", network=1, program="COLMAP", apart=np.nan, their_message="<out of order>"
-    )
-    lost = trial(1, cost=np.nan, ended=failed)
-    path = write_page(Validation("colmap", 7, (trial(0), lost)), tmp_path / "out")
-    rows = rows_of(tmp_path / "out" / "validation.csv")
-    assert list(rows[0]) == [one.name for one in TRIALS if one.name]
-    assert rows[0]["ended"] == "same_optimum" and rows[1]["cost_other_px2"] == ""
-    assert rows[1]["message"] == "<out of order>"
-    summary = json.loads((tmp_path / "out" / "validation.json").read_text())
-    assert summary["passed"] is True and summary["verdict"] == "fair"
-    assert summary["ended"] == {"same_optimum": 1, "other_adjuster_failed": 1}
-    assert summary["largest"]["cost"] == 0.0
-    assert summary["trials"][1]["cost"] == [10.0, None]
-    assert summary["trials"][1]["remark"] == failed.as_dict()
-    page = path.read_text(encoding="utf-8")
-    assert "1 of 2 networks" in page
-    assert "&lt;out of order&gt;" in page and "<out of order>" not in page
-    assert 'src="http' not in page and 'href="http' not in page
-
-
-def test_a_worse_kolinear_comes_first(tmp_path: Path) -> None:
-    def ended(kind: str, number: int) -> Trial:
-        return trial(number, cost=9.0, ended=remark(kind, network=number, program="COLMAP", apart=4.0))
-
-    validation = Validation("colmap", 7, (trial(0), ended("kolinear_lower", 1), ended("kolinear_higher", 2)))
-    verdict = verdict_of_validation(validation)
-    assert verdict.level == "bad" and not validation.passed
-    assert kinds_of(verdict.remarks) == ("kolinear_higher", "kolinear_lower")
-    page = write_page(validation, tmp_path / "out").read_text()
-    assert '<div class="banner bad"><strong>1 of 3 networks' in page and verdict.remarks[0].text in page
-    good = verdict_of_validation(Validation("colmap", 7, (trial(0),)))
-    assert good.level == "good" and good.remarks == ()
-
-
-def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
-    validation = Validation("colmap", 7, (trial(0),))
-    write_page(validation, tmp_path / "out")
-    write_page(validation, tmp_path / "out")  # an earlier one is replaced
+def test_foreign_folders_are_left_alone(moved: tuple[ResultComparison, np.ndarray], tmp_path: Path) -> None:
+    comparison, xyz = moved
+    write_page(comparison, tmp_path / "out", xyz=xyz)
+    write_page(comparison, tmp_path / "out", xyz=xyz)  # an earlier one is replaced
     (tmp_path / "out" / "mine.txt").write_text("keep")
     with pytest.raises(OutputError, match=r"contains 'mine\.txt'"):
-        write_page(validation, tmp_path / "out")
+        write_page(comparison, tmp_path / "out", xyz=xyz)
     assert (tmp_path / "out" / "mine.txt").read_text() == "keep"
     with pytest.raises(OutputError, match="a file has this name"):
-        write_page(validation, tmp_path / "out" / "mine.txt")
+        write_page(comparison, tmp_path / "out" / "mine.txt", xyz=xyz)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3])
 def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
-    moment: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    moment: int, moved: tuple[ResultComparison, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class KilledError(BaseException):
         """After it nothing is done any more."""
 
-    validation = Validation("colmap", 7, (trial(0),))
-    page = write_page(validation, tmp_path / "out")
+    comparison, xyz = moved
+    page = write_page(comparison, tmp_path / "out", xyz=xyz)
     before, renamed = page.read_text(), []
 
     def rename(path: Path, target: Path, real: Any = Path.replace) -> None:
@@ -147,7 +86,7 @@ def test_an_earlier_page_outlives_a_run_that_is_killed_while_it_replaces_it(
     with monkeypatch.context() as patch, pytest.raises(KilledError):
         patch.setattr(Path, "replace", rename)
         patch.setattr(shutil, "rmtree", rmtree)
-        write_page(validation, tmp_path / "out")
+        write_page(comparison, tmp_path / "out", xyz=xyz)
     remove_leftovers(tmp_path / "out")
     assert page.read_text() == before
     assert [path.name for path in tmp_path.iterdir()] == ["out"]

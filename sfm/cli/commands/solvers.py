@@ -1,4 +1,4 @@
-"""Commands for solutions: validate, compare, convert, epochs and refine."""
+"""Commands for solutions: compare, convert, epochs and refine."""
 
 from __future__ import annotations
 
@@ -15,45 +15,6 @@ from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.epochs.differences import Epoch
-
-WORSE = 1  # exit code if Kolinear's adjuster was the worse one on any network
-
-
-def validate(
-    networks: Annotated[
-        int, typer.Option("--networks", metavar="N", min=1, help="Number of random networks.")
-    ] = 50,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the random numbers.")] = 1,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
-    ] = Path("out/validation"),
-    jobs: Annotated[
-        int, typer.Option("--jobs", metavar="N", min=1, help="Number of networks processed at a time.")
-    ] = 2,
-) -> None:
-    """Compare the adjuster with COLMAP's on random networks.
-
-    Exit code 1 if Kolinear's adjuster was worse on any network.
-    """
-    with loading():
-        from adapters.colmap.adjuster import ColmapBackend, load_pycolmap
-        from sfm.cli.console import print_verdict
-        from sfm.comparison.two_adjusters.adjuster_validation import validate as validate_networks
-        from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.report.pages import page_of, write_declared
-        from sfm.runtime.progress_bar import drawn_progress
-
-    load_pycolmap()  # a missing library is reported here and not as a verdict on a network
-    refuse_foreign_folder(out)
-    with drawn_progress() as progress:
-        found = validate_networks(ColmapBackend(), networks=networks, seed=seed, jobs=jobs, progress=progress)
-    page = page_of(found)
-    path = write_declared(page, out)
-    print_verdict(page.verdict)
-    print(page.text)
-    print(f"Report: {path}")
-    if not found.passed:
-        raise SystemExit(WORSE)
 
 
 def compare(

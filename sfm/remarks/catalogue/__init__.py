@@ -32,7 +32,7 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "Other programs": comparisons.OTHER_PROGRAMS,
         "Refining": comparisons.REFINING,
         "Drafts of survey files": photographs.DRAFTS,
-        "Batches and validation": plans.BATCHES,
+        "Batches": plans.BATCHES,
         "Input": photographs.INPUT,
         "Comparisons and epochs": comparisons.ROWS,
         "Measuring and acceptance": measuring.ROWS,

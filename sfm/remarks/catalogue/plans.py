@@ -1,4 +1,4 @@
-"""Remarks on plans, batches and validations."""
+"""Remarks on plans and batches."""
 
 from __future__ import annotations
 
@@ -27,54 +27,6 @@ BATCHES = (
         "{surveys:survey} worked with warnings: {surveys}.",
         "see the remarks in the report of each",
         "Read {surveys:its report before using the result|their reports before using the results}.",
-    ),
-    Kind(
-        "same_optimum",
-        "note",
-        "Network {network}: Kolinear and {program} end at the same optimum.",
-        "both adjusters are right",
-        "Compare larger networks, or networks with errors, to test more than this.",
-        short="same optimum",
-    ),
-    Kind(
-        "kolinear_higher",
-        "error",
-        "Network {network}: Kolinear ends at a higher cost than {program}, {apart} standard deviations away.",
-        "a fault of the adjuster, or a network with several minima",
-        "Look at this network in the table.",
-        short="Kolinear higher",
-    ),
-    Kind(
-        "kolinear_lower",
-        "warning",
-        "Network {network}: {program} ends at a higher cost than Kolinear, {apart} standard deviations away.",
-        "the other program stops early, or a network with several minima",
-        "Look at this network in the table.",
-        short="Kolinear lower",
-    ),
-    Kind(
-        "kolinear_failed",
-        "error",
-        "Network {network}: Kolinear finds no solution, but {program} does[[: {message}]].",
-        "a fault of the adjuster, or start values too far off",
-        "Look at this network in the table.",
-        short="Kolinear failed",
-    ),
-    Kind(
-        "other_adjuster_failed",
-        "warning",
-        "Network {network}: {program} finds no solution, but Kolinear does[[: {their_message}]].",
-        "the other program stops early, or loses points",
-        "Look at this network in the table.",
-        short="the other adjuster failed",
-    ),
-    Kind(
-        "both_adjusters_failed",
-        "warning",
-        "Network {network}: neither Kolinear nor {program} finds a solution: {message}; {their_message}.",
-        "start values too far off, or a network that is not determined",
-        "Look at this network in the table.",
-        short="both failed",
     ),
 )
 ROWS = (

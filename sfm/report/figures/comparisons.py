@@ -10,9 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from sfm.comparison.two_adjusters.adjuster_validation import Validation
 from sfm.conventions import AnyArray, BoolArray, FloatArray
-from sfm.display import program_name
 from sfm.epochs.displacements import Displacements
 from sfm.epochs.series import EpochSeries
 from sfm.geometry.tolerance import IN, OUT, Deviations
@@ -83,20 +81,6 @@ def difference_figure(
     axes.set_aspect("equal")
     suffix = f" [{unit}]" if unit else ""
     axes.set(xlabel=f"{names[0]}{suffix}", ylabel=f"{names[1]}{suffix}")
-    return picture
-
-
-def time_figure(validation: Validation) -> Figure:
-    """Draw the seconds of both adjusters over the number of image points."""
-    k = np.array([t.image_points for t in validation.trials])
-    seconds = np.array([t.seconds for t in validation.trials])
-    picture = single_panel_figure(3.6)
-    axes = picture.subplots()
-    axes.loglog(k, seconds[:, 0], "o", ms=3.5, color=BLUE, label=program_name("kolinear"))
-    axes.loglog(k, seconds[:, 1], "o", ms=3.5, color=RED, label=program_name(validation.backend))
-    axes.set(xlabel="image points", ylabel="s")
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, loc="upper left")
     return picture
 
 

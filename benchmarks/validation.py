@@ -1,43 +1,51 @@
-"""Validation of the in-house adjuster against another one, on random networks with the same start values.
+"""Validates the in-house adjuster against COLMAP's on random networks, with the same start values.
 
-Each trial has cost, RMS, steps and seconds of both adjusters. It has the largest differences of their results
-in standard deviations, and of their covariances at the same solution. A remark states how the two ended. Two
-solutions are the same optimum if their costs differ by no more than a shift of SAME_SIGMAS standard
-deviations in one direction causes.
+    python -m benchmarks.validation [--networks N] [--seed S] [--jobs N] [--out FILE]
+
+Each trial has cost, RMS, steps and seconds of both adjusters, how the two ended, and the largest differences
+of their results in standard deviations, and of their covariances at the same solution. Two solutions are the
+same optimum if their costs differ by no more than a shift of SAME_SIGMAS standard deviations in one direction
+causes. A table of all networks is written as CSV. The exit code is 1 if the in-house adjuster was worse on
+any network.
 """
 
 from __future__ import annotations
 
+import argparse
+import csv
+import math
 import multiprocessing
 import signal
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from typing import Protocol, TypeVar
+from pathlib import Path
+from typing import Literal, Protocol, TypeVar, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from adapters.colmap.adjuster import ColmapBackend
+from benchmarks.random_networks import MODELS, Plan, RandomNetwork, random_network
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import SAME_SIGMAS, reprojection, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
-from sfm.comparison.two_adjusters.random_network import MODELS, Plan, RandomNetwork, random_network
 from sfm.conventions import BoolArray, FloatArray
-from sfm.display import program_name
 from sfm.errors import KolinearError
 from sfm.estimate import Estimate
 from sfm.network import Network
-from sfm.remarks.remark import Remark, remark
-from sfm.runtime.progress import SILENT, Progress
 from sfm.similarity import fit_similarity
 
 T = TypeVar("T")
+Ended = Literal["same optimum", "ours higher", "ours failed", "ours lower", "the other failed", "both failed"]
+WORSE: tuple[Ended, ...] = ("ours higher", "ours failed")  # faults of the in-house adjuster
 MAX_ITERATIONS = 100
 WARM_UP_SEED = 0  # of networks that are adjusted before the timing starts
 WARM_UP_IMAGE_POINTS = 3000  # these networks have fewer image points
@@ -98,7 +106,9 @@ class Trial:
     conditional_difference: float  # relative, of the points' covariances with cameras held
     interior_difference: float  # relative, of the marginal covariances of the interior orientation
     marginal_over_conditional: float  # median ratio of a point's sigma to its sigma with cameras held
-    remark: Remark  # on how the two ended
+    ended: Ended  # how the two ended
+    apart: float  # shift in one direction that explains the difference of the costs, standard deviations
+    messages: tuple[str, ...] = ()  # why each that failed did
 
 
 @dataclass(frozen=True)
@@ -112,16 +122,38 @@ class Validation:
     @property
     def passed(self) -> bool:
         """Whether the in-house adjuster is never the worse one."""
-        return not any(trial.remark.severity == "error" for trial in self.trials)
+        return not any(trial.ended in WORSE for trial in self.trials)
 
-    def counts(self) -> tuple[tuple[str, int], ...]:
-        """Return (kind of remark, number of networks), the most frequent first."""
-        return tuple(Counter(trial.remark.kind for trial in self.trials).most_common())
+    def counts(self) -> dict[Ended, int]:
+        """Return the number of networks by how they ended, the most frequent first."""
+        return dict(Counter(trial.ended for trial in self.trials).most_common())
+
+    def largest(self) -> dict[str, float]:
+        """Return the largest differences over all networks, in standard deviations or relative; NaN: none."""
+        solved = [trial for trial in self.trials if trial.ended == "same optimum"]
+        costs = [
+            abs(trial.cost[1] - trial.cost[0]) / min(trial.cost) for trial in solved if min(trial.cost) > 0
+        ]
+        return {
+            "cost, relative": max(costs, default=math.nan),
+            "interior parameter, sigmas": _largest(trial.interior_sigmas for trial in solved),
+            "projection centre, sigmas": _largest(trial.position_sigmas for trial in solved),
+            "rotation, sigmas": _largest(trial.rotation_sigmas for trial in solved),
+            "object coordinate, sigmas": _largest(trial.point_sigmas for trial in solved),
+            "conditional covariance of a point, relative": _largest(
+                trial.conditional_difference for trial in self.trials
+            ),
+            "covariance of interior orientation, relative": _largest(
+                trial.interior_difference for trial in self.trials
+            ),
+        }
 
 
-def validate(
-    backend: ValidationBackend, *, networks: int, seed: int, jobs: int = 1, progress: Progress = SILENT
-) -> Validation:
+def _largest(values: Iterable[float]) -> float:
+    return max((value for value in values if math.isfinite(value)), default=math.nan)
+
+
+def validate(backend: ValidationBackend, *, networks: int, seed: int, jobs: int = 1) -> Validation:
     """Adjust random networks with both adjusters, and compare the results.
 
     Args:
@@ -129,14 +161,8 @@ def validate(
         networks: number of networks.
         seed: seed of the random networks; network k is the same for any number of networks.
         jobs: number of processes, each with one thread.
-        progress: receives every network.
     """
-    progress.stage("networks", networks)
-    trials = []
-    for trial in _run(backend, seed, networks, jobs):
-        trials.append(trial)
-        progress.advance(f"network {trial.number}")
-    return Validation(backend.name, seed, tuple(trials))
+    return Validation(backend.name, seed, tuple(_run(backend, seed, networks, jobs)))
 
 
 def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
@@ -180,14 +206,9 @@ def make_trial(number: int, seed: int, backend: ValidationBackend) -> Trial:
         (our_seconds, np.nan if theirs is None else theirs.seconds),
         *sigmas,
         *covariances,
-        remark(
-            _remark_on_end(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
-            network=number,
-            program=program_name(backend.name),
-            apart=sigmas_apart(cost_a, cost_b, plan.noise_px),
-            message=our_failure or None,
-            their_message=their_failure or None,
-        ),
+        how_ended(cost_a, cost_b, plan.noise_px, our_failure, their_failure),
+        sigmas_apart(cost_a, cost_b, plan.noise_px),
+        (*our_failure, *their_failure),
     )
 
 
@@ -276,20 +297,18 @@ def sigmas_apart(a: float, b: float, sigma_px: float) -> float:
     return float(np.sqrt(2 * abs(a - b)) / sigma_px)
 
 
-def _remark_on_end(
-    a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]
-) -> str:
-    """Return the kind of remark on how two adjusters ended, from their costs (px^2) and failures."""
+def how_ended(a: float, b: float, sigma_px: float, ours: tuple[str, ...], theirs: tuple[str, ...]) -> Ended:
+    """Return how two adjusters ended, from their costs (px^2) and failures."""
     # An adjuster that ends at the other's optimum has solved the network, whatever it reports.
     if sigmas_apart(a, b, sigma_px) <= SAME_SIGMAS:
-        return "same_optimum"
+        return "same optimum"
     if ours and theirs:
-        return "both_adjusters_failed"
+        return "both failed"
     if ours or not np.isfinite(a):
-        return "kolinear_failed"
+        return "ours failed"
     if theirs or not np.isfinite(b):
-        return "other_adjuster_failed"
-    return "kolinear_lower" if a < b else "kolinear_higher"
+        return "the other failed"
+    return "ours lower" if a < b else "ours higher"
 
 
 def _differences(full: Adjustment, theirs: Estimate, *, control: bool) -> tuple[float, float, float, float]:
@@ -346,3 +365,52 @@ def _relative(ours: FloatArray, theirs: FloatArray) -> float:
     """Return the largest difference of two covariances, each element over its two sigmas."""
     sigma = np.sqrt(np.diag(theirs))
     return float(np.abs((ours - theirs) / np.outer(sigma, sigma)).max())
+
+
+def write_table(validation: Validation, path: Path) -> None:
+    """Write a row for each network, with its plan and every figure, as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [_row(trial) for trial in validation.trials]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _row(trial: Trial) -> dict[str, object]:
+    row: dict[str, object] = {"network": trial.number, **vars(trial.plan)}
+    for name, value in vars(trial).items():
+        if name in ("cost", "rms_px", "iterations", "seconds"):
+            row[f"{name}_ours"], row[f"{name}_other"] = value
+        elif name not in ("number", "plan"):
+            row[name] = "; ".join(value) if name == "messages" else value
+    return row
+
+
+def main() -> int:
+    """Validate on so many networks, print the figures and write the table."""
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--networks", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("out/validation.csv"))
+    given = parser.parse_args()
+    validation = validate(ColmapBackend(), networks=given.networks, seed=given.seed, jobs=given.jobs)
+    counts = validation.counts()
+    for ended in get_args(Ended):
+        print(f"{ended:45} {counts.get(ended, 0):8}")
+    for what, value in validation.largest().items():
+        print(f"{what:45} {value:8.1e}")
+    for place, program in enumerate(("Kolinear", "COLMAP")):
+        seconds = sum(trial.seconds[place] for trial in validation.trials if trial.seconds[place] > 0)
+        print(f"{f'{program}, s':45} {seconds:8.2f}")
+    for trial in validation.trials:
+        if trial.ended != "same optimum":
+            print(f"network {trial.number}: {trial.ended}, {trial.apart:.2g} sigmas apart {trial.messages}")
+    write_table(validation, given.out)
+    print(f"Table: {given.out}")
+    return 0 if validation.passed else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import ColmapBackend, adjust_with_colmap
-from sfm.comparison.solutions import reprojection
-from sfm.comparison.two_adjusters.adjuster_validation import (
-    Validation,
-    _remark_on_end,
-    make_trial,
-    validate,
-)
-from sfm.comparison.two_adjusters.random_network import (
+from benchmarks.random_networks import (
     ARRANGEMENTS,
     IMAGES,
     MIN_POINTS,
@@ -23,10 +17,19 @@ from sfm.comparison.two_adjusters.random_network import (
     SIZE_PX,
     random_network,
 )
+from benchmarks.validation import (
+    WORSE,
+    Validation,
+    how_ended,
+    make_trial,
+    validate,
+    write_table,
+)
+from sfm.comparison.solutions import reprojection
 from sfm.errors import BackendError
 from sfm.estimate import Estimate
 from sfm.network import Network
-from sfm.remarks.remark import remark
+from tests.tables import rows_of
 
 NETWORKS = 60
 
@@ -76,32 +79,31 @@ HUNDREDTH = 0.01**2 * 0.5**2 / 2  # what a difference of 0.01 standard deviation
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "ours", "theirs", "ended", "severity"),
+    ("a", "b", "ours", "theirs", "ended", "is_worse"),
     [
-        (1.0, 1.0, (), (), "same_optimum", "note"),
-        (1.0, 1.0, ("c",), (), "same_optimum", "note"),
-        (1.0, 1.0 + 0.9 * HUNDREDTH, (), (), "same_optimum", "note"),
-        (1.0, 1.0 + 1.1 * HUNDREDTH, (), (), "kolinear_lower", "warning"),
-        (1.0 + 1.1 * HUNDREDTH, 1.0, (), (), "kolinear_higher", "error"),
-        (2.0, 1.0, ("c",), (), "kolinear_failed", "error"),
-        (np.nan, 1.0, (), (), "kolinear_failed", "error"),
-        (1.0, np.nan, (), ("stopped",), "other_adjuster_failed", "warning"),
-        (1.0, np.nan, (), (), "other_adjuster_failed", "warning"),
-        (np.nan, np.nan, ("c",), ("stopped",), "both_adjusters_failed", "warning"),
+        (1.0, 1.0, (), (), "same optimum", False),
+        (1.0, 1.0, ("c",), (), "same optimum", False),
+        (1.0, 1.0 + 0.9 * HUNDREDTH, (), (), "same optimum", False),
+        (1.0, 1.0 + 1.1 * HUNDREDTH, (), (), "ours lower", False),
+        (1.0 + 1.1 * HUNDREDTH, 1.0, (), (), "ours higher", True),
+        (2.0, 1.0, ("c",), (), "ours failed", True),
+        (np.nan, 1.0, (), (), "ours failed", True),
+        (1.0, np.nan, (), ("stopped",), "the other failed", False),
+        (1.0, np.nan, (), (), "the other failed", False),
+        (np.nan, np.nan, ("c",), ("stopped",), "both failed", False),
     ],
 )
 def test_how_two_adjusters_end(
-    a: float, b: float, ours: tuple[str, ...], theirs: tuple[str, ...], ended: str, severity: str
+    a: float, b: float, ours: tuple[str, ...], theirs: tuple[str, ...], ended: str, is_worse: bool
 ) -> None:
-    kind = _remark_on_end(a, b, 0.5, ours, theirs)
-    assert kind == ended
-    assert remark(kind).severity == severity
+    assert how_ended(a, b, 0.5, ours, theirs) == ended
+    assert (ended in WORSE) == is_worse
 
 
 def test_both_adjusters_end_at_the_same_optimum_with_the_same_covariances() -> None:
     found = validate(ColmapBackend(), networks=5, seed=2)
     assert found.passed
-    assert found.counts() == (("same_optimum", 5),)
+    assert found.counts() == {"same optimum": 5}
     for trial in found.trials:
         for name in ("position_sigmas", "rotation_sigmas", "point_sigmas"):
             assert getattr(trial, name) < 1e-3  # of a standard deviation
@@ -134,23 +136,29 @@ class Spoiled:
 @pytest.mark.parametrize(
     ("kind", "ended"),
     [
-        ("beside", "kolinear_lower"),
-        ("refuses", "other_adjuster_failed"),
-        ("lost", "other_adjuster_failed"),
+        ("beside", "ours lower"),
+        ("refuses", "the other failed"),
+        ("lost", "the other failed"),
     ],
 )
 def test_a_bad_backend_is_found_out(kind: str, ended: str) -> None:
-    found = make_trial(2, 1, Spoiled(kind)).remark  # type: ignore[arg-type]
-    assert found.kind == ended and found.severity == "warning"
-    assert found.names("their_message") == (("out of order",) if kind == "refuses" else ())
-    assert (found.number("apart") > 0.01) == (kind == "beside")
+    trial = make_trial(2, 1, Spoiled(kind))  # type: ignore[arg-type]
+    assert trial.ended == ended
+    assert trial.messages == (("out of order",) if kind == "refuses" else ())
+    assert (trial.apart > 0.01) == (kind == "beside")
 
 
-def test_a_worse_in_house_adjuster_fails_the_run() -> None:
+def test_a_worse_in_house_adjuster_fails_the_run(tmp_path: Path) -> None:
     trial = make_trial(2, 1, ColmapBackend())
     assert Validation("colmap", 1, (trial,)).passed
-    worse = replace(trial, remark=remark("kolinear_higher", network=2, program="COLMAP", apart=0.02))
-    assert not Validation("colmap", 1, (trial, worse)).passed
+    worse = replace(trial, ended="ours higher", apart=0.02)
+    found = Validation("colmap", 1, (trial, worse))
+    assert not found.passed
+    assert found.largest()["object coordinate, sigmas"] == trial.point_sigmas
+    write_table(found, tmp_path / "out" / "table.csv")
+    rows = rows_of(tmp_path / "out" / "table.csv")
+    assert [row["ended"] for row in rows] == ["same optimum", "ours higher"]
+    assert float(rows[0]["cost_ours"]) == trial.cost[0] and rows[0]["model"] == trial.plan.model
 
 
 def test_processes_give_what_one_gives() -> None:
@@ -163,6 +171,6 @@ def test_processes_give_what_one_gives() -> None:
 def test_two_hundred_networks() -> None:
     found = validate(ColmapBackend(), networks=200, seed=1, jobs=2)
     assert found.passed
-    assert {trial.remark.kind for trial in found.trials} <= {
-        "same_optimum", "other_adjuster_failed", "both_adjusters_failed",
+    assert {trial.ended for trial in found.trials} <= {
+        "same optimum", "the other failed", "both failed",
     }  # fmt: skip
