@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -144,73 +145,135 @@ def try_targets(
     progress.stage("trial", TRIED + 5)
     files = _Files(folder, masks, store)
     tried, photographs, unreadable = _read_spread(paths, files, progress)
-    names = tuple(map(files.name, tried))
-    tagged = ""
-    if min(one.size for one in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
-        greys = [_as_bytes(photograph) for photograph in photographs]
-        looks = [_look(grey) for grey in greys]
-        board = checkerboard_of_parts(greys, [look.board for look in looks])
+    seen = _Seen(files, tried, photographs, unreadable)
+    if min(photograph.size for photograph in photographs) > MIN_PIXEL_RATIO * LOOK_PX**2:
+        looks = [_look(grey) for grey in seen.greys.values()]
+        board = checkerboard_of_parts(list(seen.greys.values()), [look.board for look in looks])
         if not any(look.shows_targets for look in looks) and board is None:
             circles = float(np.median([look.circles for look in looks]))
-            return TargetTrial("none", "auto", (), (), circles, np.nan, names, unreadable=unreadable)
-        tagged, _ = _shared_family([look.tags for look in looks])
-    plain = [files.measure(path, tagged or "none") for path in tried]  # with tags: not measured twice
-    readers = list(map(_ring_reader, photographs, plain))
-    counts = _repeated_rings(readers, RINGS)
-    if all(len(codes) < TARGETS.fewest for codes in counts.values()):
-        counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of other families
+            return TargetTrial("none", "auto", (), (), circles, np.nan, seen.names, unreadable=unreadable)
+        seen.tags, _ = _shared_family([look.tags for look in looks])
+    _try_rings(seen)
     progress.advance("rings")
-    best, measured = max(counts, key=lambda family: len(counts[family])), plain
-    plates, left_out = tuple[PlateFamily, ...](), tuple[tuple[PlateFamily, str], ...]()
-    ringed: tuple[Ringed, ...] = ()
-    if len(counts[best]) < TARGETS.fewest:
+    if not seen.is_coded:
         refused = {name for name, _ in unreadable}
-        more = [
-            paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED) if files.name(paths[k]) not in refused
-        ]
-        read_already = dict(zip(tried, map(_as_bytes, photographs), strict=True))
-        tags, plates = _tags_and_boards(read_already, more, files, progress)
-        if not plates and tags:
-            measured = plain if tags == tagged else [files.measure(path, tags) for path in tried]
-            counts[tags] = _repeated_codes([one.code for one in measured])
-            best = max(counts, key=lambda family: len(counts[family]))
-        if plates or len(counts[best]) < TARGETS.fewest:  # else these are tags
-            ringed = tuple(map(ringed_dots, names, read_already.values(), plain))
-            dots = None
-            if not any(one.are_most for one in ringed):
-                dots = _dot_plate(plain, [path for path in more if path not in tried], files)
-            seen = zip(read_already.values(), plain, strict=True)
-            if dots is None or not plates:
-                plates = plates if dots is None else (dots,)
-            elif any(_shows_both(grey, targets, plates[0], dots) for grey, targets in seen):
-                plates, left_out = _side_by_side((*plates, dots))
-            else:
-                left_out = ((dots, "no photograph tried shows it with the first plate"),)
+        spread = (paths[k] for k in _spread_evenly(len(paths), PLATES_TRIED))
+        more = [path for path in spread if files.name(path) not in refused]
+        _try_tags_and_boards(seen, more, progress)
+        _try_dots(seen, [path for path in more if path not in tried])
         progress.advance("plates of dots")
-        if not plates and len(counts[best]) < TARGETS.fewest:
-            rings = [read_resolved(photograph) for photograph in photographs]
-            counts |= {family: _repeated_codes([one[family] for one in rings]) for family in CONCENTRIC}
-            best = max(counts, key=lambda family: len(counts[family]))
-            if len(counts[best]) >= TARGETS.fewest:
-                measured = [files.measure(path, best) for path in tried]
+        _try_concentric_tags(seen)
         progress.advance("concentric tags")
-    coded = len(counts[best]) >= TARGETS.fewest and not plates
-    if coded and best in RING_NAMES:
-        measured = [files.measure(path, best) for path in tried]
+    return _decided(seen)
+
+
+@dataclass
+class _Seen:
+    """What the trials have found in the photographs so far."""
+
+    files: _Files
+    paths: list[Path]
+    photographs: list[AnyArray]
+    unreadable: tuple[tuple[str, str], ...]
+    tags: str = ""  # dictionary that a first look found
+    counts: dict[str, tuple[int, ...]] = field(default_factory=dict)  # repeated codes of each family
+    measured: list[Targets] = field(default_factory=list)  # with the best family; empty: as `plain`
+    plates: tuple[PlateFamily, ...] = ()
+    left_out: tuple[tuple[PlateFamily, str], ...] = ()
+    ringed: tuple[Ringed, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the photographs."""
+        return tuple(map(self.files.name, self.paths))
+
+    @cached_property
+    def greys(self) -> dict[Path, AnyArray]:
+        """Intensities of the photographs as bytes."""
+        return dict(zip(self.paths, map(_as_bytes, self.photographs), strict=True))
+
+    @cached_property
+    def plain(self) -> list[Targets]:
+        """Targets measured without a family, or with the tags of the first look."""
+        return self.measure(self.tags or "none")  # with tags: not measured twice
+
+    @property
+    def best(self) -> str:
+        """Family with most repeated codes."""
+        return max(self.counts, key=lambda family: len(self.counts[family]))
+
+    @property
+    def is_coded(self) -> bool:
+        """Whether the best family has as many repeated codes as orient a photograph."""
+        return len(self.counts[self.best]) >= TARGETS.fewest
+
+    def measure(self, family: str) -> list[Targets]:
+        """Return the targets of the photographs, with codes of a family."""
+        return [self.files.measure(path, family) for path in self.paths]
+
+
+def _try_rings(seen: _Seen) -> None:
+    readers = list(map(_ring_reader, seen.photographs, seen.plain))
+    seen.counts = _repeated_rings(readers, RINGS)
+    if all(len(codes) < TARGETS.fewest for codes in seen.counts.values()):
+        seen.counts |= _repeated_rings(readers, NECKLACES)  # no parity: they also read rings of others
+
+
+def _try_tags_and_boards(seen: _Seen, more: Sequence[Path], progress: Progress) -> None:
+    tags, seen.plates = _tags_and_boards(seen.greys, more, seen.files, progress)
+    if tags and not seen.plates:
+        seen.measured = seen.plain if tags == seen.tags else seen.measure(tags)
+        seen.counts[tags] = _repeated_codes([targets.code for targets in seen.measured])
+
+
+def _try_dots(seen: _Seen, others: Sequence[Path]) -> None:
+    """Search a plate of dots beside the boards, unless tags are read."""
+    if seen.is_coded and not seen.plates:
+        return
+    seen.ringed = tuple(map(ringed_dots, seen.names, seen.greys.values(), seen.plain))
+    if any(dots.are_most for dots in seen.ringed):
+        return
+    plate = _dot_plate(seen.plain, others, seen.files)
+    if plate is None:
+        return
+    pictures = zip(seen.greys.values(), seen.plain, strict=True)
+    if not seen.plates:
+        seen.plates = (plate,)
+    elif any(_shows_both(grey, targets, seen.plates[0], plate) for grey, targets in pictures):
+        seen.plates, seen.left_out = _side_by_side((*seen.plates, plate))
+    else:
+        seen.left_out = ((plate, "no photograph tried shows it with the first plate"),)
+
+
+def _try_concentric_tags(seen: _Seen) -> None:
+    if seen.plates or seen.is_coded:
+        return
+    rings = [read_resolved(photograph) for photograph in seen.photographs]
+    seen.counts |= {family: _repeated_codes([read[family] for read in rings]) for family in CONCENTRIC}
+    if seen.is_coded:
+        seen.measured = seen.measure(seen.best)
+
+
+def _decided(seen: _Seen) -> TargetTrial:
+    """Return what the trials have found: codes, else plates, else what is like them."""
+    best, counts = seen.best, seen.counts
+    coded = seen.is_coded and not seen.plates
+    measured = seen.measure(best) if coded and best in RING_NAMES else seen.measured or seen.plain
+    unknown = not coded and not seen.plates
     return TargetTrial(
-        best if coded else plates[0].name if plates else "none",
+        best if coded else seen.plates[0].name if seen.plates else "none",
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
-        tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda one: -one[1])),
-        float(np.median([one.is_circle.sum() for one in measured])),
+        tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda row: -row[1])),
+        float(np.median([targets.is_circle.sum() for targets in measured])),
         _blur(measured),
-        names,
-        min(int((one.code >= 0).sum()) for one in measured) if coded else 0,
-        plates,
-        left_out,
-        unreadable,
-        None if coded or plates else _largest_lattice(plain),
-        () if coded or plates else tuple(one for one in ringed if one.are_most),
+        seen.names,
+        min(int((targets.code >= 0).sum()) for targets in measured) if coded else 0,
+        seen.plates,
+        seen.left_out,
+        seen.unreadable,
+        _largest_lattice(seen.plain) if unknown else None,
+        tuple(dots for dots in seen.ringed if dots.are_most) if unknown else (),
     )
 
 
