@@ -148,33 +148,41 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
     path = folder / ARRAYS
     if not path.is_file():
         return result
+    known = _stored_arrays(path)
     images, cameras = result.network.images, result.estimate.cameras
     free = [int(camera.free.sum()) for camera in cameras]
+    interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
+    fits = all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
+    exterior, stored = None, known.get("exterior")
+    if stored is not None:
+        names = np.asarray(known.get("image_names", ())).tolist()
+        exterior = np.full((len(images), 6, 6), np.nan)
+        fits &= stored.shape == (len(names), 6, 6) and len(set(names)) == len(names)
+        fits &= set(names) <= set(images)
+        if fits:
+            place = {name: i for i, name in enumerate(images)}
+            exterior[[place[name] for name in names]] = stored
+    rigs = known.get("rigs")
+    solution = replace(
+        result, exterior_covariance=exterior, interior_covariance=interior, rig_covariance=rigs
+    )
+    if rigs is not None:
+        unknowns = solution.rig_parameters
+        fits &= tuple(known.get("rig_parameters", ())) == unknowns
+        fits &= rigs.shape == (len(unknowns), len(unknowns))
+    matrices = (*interior, *(Q for Q in (stored, rigs) if Q is not None))
+    if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
+        raise SurveyFileError(f"{path}: its photographs or cameras are not those of the tables beside it")
+    return solution
+
+
+def _stored_arrays(path: Path) -> dict[str, AnyArray]:
+    """Return the arrays of a file that are read back, by name."""
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise SurveyFileError(f"{path}: arrays of more than {MAX_BYTES} bytes, no more are read")
         with np.load(path, allow_pickle=False) as arrays:
-            known = {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
+            return {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
     except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
         raise SurveyFileError(f"{path}: not an array of NumPy") from error
-    stored = known.get("exterior")
-    named = np.asarray(known.get("image_names", ())).tolist()
-    exterior = None if stored is None else np.full((len(images), 6, 6), np.nan)
-    interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
-    fits = stored is None or (
-        stored.shape == (len(named), 6, 6) and len(set(named)) == len(named) and set(named) <= set(images)
-    )
-    fits &= all(Q.shape in ((f, f), (0, 0)) for Q, f in zip(interior, free, strict=True))
-    rigs = known.get("rigs")
-    if exterior is not None and stored is not None and fits:
-        place = {name: i for i, name in enumerate(images)}
-        exterior[[place[name] for name in named]] = stored
-    found = replace(result, exterior_covariance=exterior, interior_covariance=interior, rig_covariance=rigs)
-    if rigs is not None:
-        names = found.rig_parameters
-        fits &= tuple(known.get("rig_parameters", ())) == names and rigs.shape == (len(names), len(names))
-    matrices = (*interior, *(Q for Q in (stored, rigs) if Q is not None))
-    if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
-        raise SurveyFileError(f"{path}: its photographs or cameras are not those of the tables beside it")
-    return found

@@ -157,19 +157,7 @@ def read_table(
             too large.
     """
     header = tuple(dict(aliases).get(name, name) for name in read_header(path))
-    wanted = (*texts, *numbers)
-    shape = ",".join(wanted) + (f"[,{','.join(optional)}]" if optional else "")
-    for name in header:
-        if header.count(name) > 1:
-            raise SurveyFileError(f"{path}, line 1: column {name!r:.60} is a duplicate in the header")
-        if ignored is not None and name not in (*wanted, *optional, *ignored):
-            hint = "; commas must separate the columns" if ";" in name or "\t" in name else ""
-            raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}{hint}")
-    if any(name in header for name in optional):
-        numbers = (*numbers, *optional)
-    for name in (*texts, *numbers):
-        if name not in header:
-            raise SurveyFileError(f"{path}, line 1: no column {name}, needed {shape}")
+    numbers = _numbers_in(path, header, texts, numbers, optional, ignored)
     text_at = [header.index(name) for name in texts]
     number_at = [header.index(name) for name in numbers]
     columns: list[list[str]] = [[] for _ in texts]
@@ -194,6 +182,31 @@ def read_table(
         np.array(lines, dtype=np.int64),
         numbers=numbers,
     )
+
+
+def _numbers_in(
+    path: Path,
+    header: tuple[str, ...],
+    texts: tuple[str, ...],
+    numbers: tuple[str, ...],
+    optional: tuple[str, ...],
+    ignored: tuple[str, ...] | None,
+) -> tuple[str, ...]:
+    """Return the columns of numbers that a header has; raise SurveyFileError if its columns are wrong."""
+    wanted = (*texts, *numbers)
+    shape = ",".join(wanted) + (f"[,{','.join(optional)}]" if optional else "")
+    for name in header:
+        if header.count(name) > 1:
+            raise SurveyFileError(f"{path}, line 1: column {name!r:.60} is a duplicate in the header")
+        if ignored is not None and name not in (*wanted, *optional, *ignored):
+            hint = "; commas must separate the columns" if ";" in name or "\t" in name else ""
+            raise SurveyFileError(f"{path}, line 1: unknown column {name!r:.60}, needed {shape}{hint}")
+    if any(name in header for name in optional):
+        numbers = (*numbers, *optional)
+    for name in (*texts, *numbers):
+        if name not in header:
+            raise SurveyFileError(f"{path}, line 1: no column {name}, needed {shape}")
+    return numbers
 
 
 def array_table(
