@@ -269,33 +269,15 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
             raise SurveyFileError(f"{where}: targets.{name} is missing, codes = '{targets.codes}' needs it")
     plate = plate_family(targets)
     assert plate is not None
-    board = targets.codes in TAGGED
-    if board and targets.dictionary not in DICTIONARIES:
-        raise SurveyFileError(
-            f"{where}: targets.dictionary = '{targets.dictionary or ''}', codes = '{targets.codes}' needs "
-            f"one of {', '.join(DICTIONARIES)}"
-        )
-    if board and not 0 < plate.tag_share < 1:
-        raise SurveyFileError(
-            f"{where}: targets.tag_size is the side of the tags of a ChArUco board or AprilGrid, needed "
-            "between 0 and the pitch"
-        )
-    if board and plate.last_tag >= tag_family(plate.dictionary).count:
-        raise SurveyFileError(
-            f"{where}: the board has tags {plate.first_tag} to {plate.last_tag}, dictionary "
-            f"'{plate.dictionary}' has 0 to {tag_family(plate.dictionary).count - 1}"
-        )
-    if targets.codes == "aprilgrid" and (plate.rows % 2 or plate.columns % 2):
-        raise SurveyFileError(
-            f"{where}: an AprilGrid of {plate.rows} x {plate.columns} corners, even numbers are needed (rows "
-            "and columns count corners, two for each tag)"
-        )
-    for name in ("dictionary", "first_tag"):
-        if not board and name in targets.model_fields_set:
-            raise SurveyFileError(
-                f"{where}: targets.{name} belongs to codes = 'charuco' or 'aprilgrid', found "
-                f"'{targets.codes}'"
-            )
+    if targets.codes in TAGGED:
+        _refuse_contradicting_tags(targets, plate, where)
+    else:
+        for name in ("dictionary", "first_tag"):
+            if name in targets.model_fields_set:
+                raise SurveyFileError(
+                    f"{where}: targets.{name} belongs to codes = 'charuco' or 'aprilgrid', found "
+                    f"'{targets.codes}'"
+                )
     if targets.codes not in GRIDS and targets.marks:
         raise SurveyFileError(f"{where}: targets.marks belong to {', '.join(GRIDS)}, found '{targets.codes}'")
     if targets.codes == "checkerboard" and min(plate.rows, plate.columns) < MIN_SIDE:
@@ -307,6 +289,30 @@ def refuse_contradicting_plates(targets: PlateSettings, where: str) -> None:
         refuse_unusable_plate(plate)
     except GeometryError as error:
         raise SurveyFileError(f"{where}: targets.marks: {error}") from error
+
+
+def _refuse_contradicting_tags(targets: PlateSettings, plate: PlateFamily, where: str) -> None:
+    """Raise SurveyFileError if the tags of a board are unknown, too many or of an impossible size."""
+    if targets.dictionary not in DICTIONARIES:
+        raise SurveyFileError(
+            f"{where}: targets.dictionary = '{targets.dictionary or ''}', codes = '{targets.codes}' needs "
+            f"one of {', '.join(DICTIONARIES)}"
+        )
+    if not 0 < plate.tag_share < 1:
+        raise SurveyFileError(
+            f"{where}: targets.tag_size is the side of the tags of a ChArUco board or AprilGrid, needed "
+            "between 0 and the pitch"
+        )
+    if plate.last_tag >= tag_family(plate.dictionary).count:
+        raise SurveyFileError(
+            f"{where}: the board has tags {plate.first_tag} to {plate.last_tag}, dictionary "
+            f"'{plate.dictionary}' has 0 to {tag_family(plate.dictionary).count - 1}"
+        )
+    if targets.codes == "aprilgrid" and (plate.rows % 2 or plate.columns % 2):
+        raise SurveyFileError(
+            f"{where}: an AprilGrid of {plate.rows} x {plate.columns} corners, even numbers are needed (rows "
+            "and columns count corners, two for each tag)"
+        )
 
 
 def refuse_free_points_without_turn(targets: TargetSettings, datum: str, where: str) -> None:

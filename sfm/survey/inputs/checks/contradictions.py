@@ -229,31 +229,20 @@ def _of_values(camera: CameraSettings) -> Iterator[str]:
 
 
 def _of_rigs(survey: Described) -> Iterator[str]:
-    known = {camera.name: camera for camera in survey.cameras}
+    known = {camera.name for camera in survey.cameras}
     owner: dict[str, str] = {}
     for rig in survey.rigs:
-        here = f"rig {rig.name}"
-        if len(rig.cameras) < 2:
-            yield f"{here}: {counted(len(rig.cameras), 'camera')}, at least 2 are needed"
         for name in rig.cameras:
             if name not in known:
-                yield (f"{here}: no camera is named '{name}'; cameras are {listed(sorted(known), most=10)}")
+                yield (
+                    f"rig {rig.name}: no camera is named '{name}'; cameras are "
+                    f"{listed(sorted(known), most=10)}"
+                )
             if name in owner:
-                yield f"{here}: camera {name} is already on rig {owner[name]}, needed one rig"
+                yield f"rig {rig.name}: camera {name} is already on rig {owner[name]}, needed one rig"
             owner[name] = rig.name
-        if rig.blocks and rig.mounts is not None:
-            yield f"{here}: mounts and blocks are both given, needed one: blocks find their own mounts"
-        if "tolerance_s" in rig.model_fields_set and rig.moment != "exif":
-            yield (
-                f"{here}: tolerance_s is given, moment = \"exif\" is needed with it; moment is '{rig.moment}'"
-            )
-        if rig.moment != "order" and not rig.named:
-            yield from (f"{here}: {contradiction}" for contradiction in _of_pattern(rig.moment))
-        if rig.moment == "exif" and not reads_photographs(survey):
-            yield (
-                f"{here}: moment = 'exif' needs photographs, [observations] have none; name the moments by "
-                "an expression, 'order' or a table"
-            )
+        for contradiction in _of_rig(rig, from_photographs=reads_photographs(survey)):
+            yield f"rig {rig.name}: {contradiction}"
     for camera in survey.cameras if survey.rigs else ():
         if camera.per_photograph or camera.groups:
             yield (
@@ -262,6 +251,22 @@ def _of_rigs(survey: Described) -> Iterator[str]:
             )
     if len({rig.name for rig in survey.rigs}) < len(survey.rigs):
         yield "two rigs have the same name"
+
+
+def _of_rig(rig: RigSettings, *, from_photographs: bool) -> Iterator[str]:
+    if len(rig.cameras) < 2:
+        yield f"{counted(len(rig.cameras), 'camera')}, at least 2 are needed"
+    if rig.blocks and rig.mounts is not None:
+        yield "mounts and blocks are both given, needed one: blocks find their own mounts"
+    if "tolerance_s" in rig.model_fields_set and rig.moment != "exif":
+        yield f"tolerance_s is given, moment = \"exif\" is needed with it; moment is '{rig.moment}'"
+    if rig.moment != "order" and not rig.named:
+        yield from _of_pattern(rig.moment)
+    if rig.moment == "exif" and not from_photographs:
+        yield (
+            "moment = 'exif' needs photographs, [observations] have none; name the moments by an expression, "
+            "'order' or a table"
+        )
 
 
 def _of_pattern(pattern: str) -> Iterator[str]:
