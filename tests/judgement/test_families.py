@@ -345,3 +345,43 @@ def test_four_given_points_have_a_shape_that_the_image_points_test(given: int, t
     assert len(found) == tested
     for one, refitted in found:
         assert one.points.tolist() == list(range(given)) and refitted.beta.shape == (3 * given,)
+
+
+@pytest.mark.parametrize(("px", "said"), [(0.8e-3, False), (1.4e-3, True)])
+def test_what_no_measurement_shows_is_no_part_of_a_remark(a: Adjustment, px: float, said: bool) -> None:
+    """A thousandth of a pixel: of c at the edge, of the principal point, and of one photograph."""
+    both = remark(a, alternative("centre"), [px, px, 0.0, 1.0])
+    assert ("change" in both.numbers) == ("away" in both.numbers) == said
+    drift = remark(a, alternative("c", "linear", (-1, -0.6, -0.2, 0.2, 0.6, 1)), [px / 2])
+    assert ("change" in drift.numbers) == said  # from the first photograph to the last
+    beta = np.zeros((6, 4))
+    beta[2] = px * 6 / 5  # from the mean of six photographs
+    beta[2, 2] = 0.0
+    each = remark(a, alternative("centre", "each", (0, 1, 2, 3, 4, 5)), beta.ravel().tolist())
+    for part in ("change", "away", "distortion"):
+        assert (part in each.numbers) == said
+
+
+def test_the_largest_part_of_a_camera_of_each_photograph_is_stated(a: Adjustment) -> None:
+    beta = np.zeros((6, 9))
+    beta[1, 3], beta[4, 8] = 2.4, -3.6
+    every = remark(a, alternative("camera", "each", (0, 1, 2, 3, 4, 5)), beta.ravel().tolist())
+    assert every.number("distortion") == pytest.approx(3.0)
+    assert "change" not in every.numbers and "away" not in every.numbers
+
+
+def test_rows_of_a_shutter_displace_by_their_speed(a: Adjustment) -> None:
+    """2 px at the edge of 1,000 px are so many over all rows; a zoom of all photographs is none."""
+    rows = next(one for one in families.OF_EACH if one.name == "rows")
+    beta = np.zeros((6, 3))
+    beta[:, 0] = 1.0  # of c
+    beta[3] = (4.0, 0.0, 2.0)
+    beta[5] = (1.0, 0.0, 1.7)
+    one = Alternative(rows, "each", np.arange(6.0), Gain(9.0, 18, np.ones(18)))
+    said = remark(a, one, beta.ravel().tolist())
+    speed = np.hypot(beta[:, 0] - 1.5, beta[:, 2])
+    assert said.number("skew") == pytest.approx(2 * speed.max() * 1500 / 2000)
+    assert said.names("photographs") == tuple(
+        a.network.images[i] for i in np.flatnonzero(speed >= speed.max() / 2)
+    )
+    assert said.names("photographs") == ("image 4", "image 6")
