@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.camera import project
-from sfm.estimate import Estimate
-from sfm.judgement.hypotheses.bumps import _gain, _scores, bump_remarks, find_bumps
-from sfm.network import Network
+from sfm.conventions import angles_from_rotation, rotation_from_angles
+from sfm.distributions import chi2_isf, chi2_sf, level_of_single
+from sfm.judgement.hypotheses.bumps import (
+    Bump,
+    _difference,
+    _gain,
+    _of_freed,
+    _scores,
+    _testable,
+    bump_remarks,
+    find_bumps,
+)
+from sfm.network import Estimate, Network
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 
@@ -100,3 +113,107 @@ def test_the_gain_of_a_pose_is_beside_those_of_others() -> None:
     np.testing.assert_allclose(np.abs(shift), np.abs(np.linalg.solve(G, s)[6:12]), rtol=1e-9)
     alone, _ = _gain(s.reshape(3, 6), G.reshape(3, 6, 3, 6), 1, [])
     assert alone == pytest.approx(s[6:12] @ np.linalg.solve(G[6:12, 6:12], s[6:12]))
+
+
+def freed(by: float, i: int = 4, *, number: int = 7) -> tuple[Adjustment, Network]:
+    """Return a rig of three cameras whose photograph i left its place and was adjusted by itself."""
+    network, truth = scene(number, 3)
+    moved = bumped(network, truth, i, np.array([by, 0.0, 0.0]))
+    free = replace(moved, moment=np.where(np.arange(len(moved.images)) == i, 99, moved.moment))
+    return adjust(free, truth, reject="none"), network
+
+
+@pytest.mark.parametrize("by", [0.0, 0.002, 0.02])
+def test_a_photograph_that_was_freed_is_compared_with_another_moment(by: float) -> None:
+    """Its shift and rotation are those of the bump, in the axes of the other camera."""
+    a, network = freed(by)
+    found = find_bumps(a, network.moment)
+    assert len(found) == (by > 0) and find_bumps(a) == ()
+    (one,) = _of_freed(a, np.array([4]), network.moment)
+    assert one.free and one.shift == pytest.approx(by, abs=5e-4)
+    assert one.turn < 5e-4 and one.probability == pytest.approx(chi2_sf(one.sigmas**2, 6))
+    for bump in found:
+        assert bump.photograph == network.images[4] and bump.camera == "camera 2"
+        (said,) = bump_remarks(a, "m", network.moment)
+        assert said.number("bound") == 0.0 and said.number("angle") == pytest.approx(np.degrees(bump.turn))
+
+
+def test_freed_photographs_that_kept_their_places_are_tested_at_the_level() -> None:
+    """Chi-square of six degrees of freedom, of photographs of several rigs."""
+    squares = []
+    for number in range(20, 32):
+        a, network = freed(0.0, 4, number=number)
+        (one,) = _of_freed(a, np.array([4]), network.moment)
+        squares.append(one.sigmas**2)
+    assert 3 < np.mean(squares) < 10
+
+
+def test_a_freed_photograph_without_another_moment_is_not_compared() -> None:
+    a, network = freed(0.02)
+    once = np.arange(len(network.images)) // 3 + np.where(np.arange(len(network.images)) % 3 == 1, 100, 0)
+    assert list(_of_freed(a, np.array([4]), once)) == []  # alone at its stated moment
+    assert network.moment is not None
+    alone = np.where(np.arange(len(network.images)) < 6, network.moment, 50 + np.arange(len(network.images)))
+    (one,) = _of_freed(a, np.array([4]), alone)  # with the first moment
+    assert one.shift == pytest.approx(0.02, abs=1e-3)
+    last = np.where(
+        np.arange(len(network.images)) // 3 == 1, network.moment, 50 + np.arange(len(network.images))
+    )
+    assert list(_of_freed(a, np.array([4]), last)) == []
+
+
+def test_the_difference_of_two_pairs_has_its_derivatives() -> None:
+    a, _ = freed(0.002)
+    images = np.array([4, 3, 1, 0])
+    d, J = _difference(a, images)
+    for k, i in enumerate(images.tolist()):
+        for c in range(6):
+            step = 1e-5
+            position, rotation = a.estimate.position.copy(), a.estimate.rotation.copy()
+            if c < 3:
+                position[i, c] += step
+            else:
+                angles = np.array(angles_from_rotation(rotation[i]))
+                angles[c - 3] += step
+                rotation[i] = rotation_from_angles(*angles)
+            changed = replace(a, estimate=replace(a.estimate, position=position, rotation=rotation))
+            np.testing.assert_allclose(
+                (_difference(changed, images)[0] - d) / step, J[:, 6 * k + c], atol=2e-4
+            )
+
+
+@pytest.mark.parametrize(
+    ("kept", "testable"),
+    [([0, 1, 2], [0, 1, 2]), ([0, 1], [1]), ([1, 2], [1, 2]), ([0], []), ([2], [])],
+)
+def test_a_photograph_is_contradicted_by_others_of_its_moment(kept: list[int], testable: list[int]) -> None:
+    """With one other photograph, the one that is not of the reference camera is named."""
+    network, truth = scene(8, 3)
+    of_first = np.isin(np.arange(3), kept)
+    moment = np.where(np.arange(24) < 3, np.where(np.r_[of_first, [False] * 21], 0, 90 + np.arange(24)), 100)
+    part: Any = SimpleNamespace(network=SimpleNamespace(moment=moment, camera=network.camera), estimate=truth)
+    assert [i for i in _testable(part) if i < 3] == testable
+
+
+def test_photographs_of_correlated_errors_are_tested_where_they_were_freed() -> None:
+    network, truth = scene(2, 2)
+    a = adjust(bumped(network, truth, 3, np.array([0.004, -0.003, 0.002])), truth, reject="none")
+    assert find_bumps(a)
+    assert find_bumps(replace(a, error_correlation=ErrorCorrelation(0.1, 0.1, 100.0))) == ()
+    assert find_bumps(replace(a, network=replace(a.network, moment=None))) == ()
+    none = replace(a.estimate, mounts=None)
+    assert find_bumps(replace(a, estimate=none)) == ()
+
+
+def test_the_level_is_shared_by_all_that_are_tested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A probability of 0.9 of the share of one of 16 photographs is a bump, one of 1.1 is none."""
+    network, truth = scene(3, 2)
+    a = adjust(network, truth, reject="none")
+    tested = len(_testable(a))
+    critical = level_of_single(a.levels.question, tested)
+    for factor, count in ((0.9, 1), (1.1, 0)):
+        sigmas = np.sqrt(chi2_isf(factor * critical, 6))
+        bump = Bump("x", "camera 2", 1.0, 1.0, sigmas, factor * critical, False)
+        monkeypatch.setattr("sfm.judgement.hypotheses.bumps._of_mounted", lambda *_, one=bump: iter([one]))
+        assert len(find_bumps(a)) == count
+    assert tested == 16 - 8  # of two photographs those that are not of the reference camera
