@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.sparse import csr_matrix
 
-from sfm.conventions import FloatArray
+from sfm.adjustment.datum import Datum
+from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.judgement.given import values as given_values
-from sfm.judgement.given.scales import Scales, common_scale
+from sfm.judgement.given.groups import GivenSettings, Group, contradiction_of, remarks_on_unchecked
+from sfm.judgement.given.points import GivenPoints, judge_points
+from sfm.judgement.given.scales import Comparison, Scales, Source, common_scale
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values, misfit_of
+from sfm.network import ObjectPoints, ScaleBars
+from sfm.remarks.remark import kinds_of
 from sfm.similarity import Similarity
+from tests.given_figures import Figure
 from tests.synthetic import seed_of
 
 
@@ -150,3 +157,173 @@ def test_observations_without_a_scale_give_none() -> None:
     assert scaled(["distances"], [1.0, 2.0], [0.1, 0.2]) == "scale"
     assert scaled(["distances"], [1.0, 2.0, 5.0], [0.1, 0.2, 9.0]) == "scale"
     assert scaled(["one distance, left out"], [0.0, 0.0, 5.0], [0.1, 0.2, 9.0]) is None
+
+
+FRAME = Similarity(0.4, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))
+SIGMA = 1e-3
+
+
+def two_groups(by: FloatArray, name: str) -> tuple[Any, list[Group], FloatArray]:
+    """Return 12 points of one network, six of which are given as control and six as others, shifted."""
+    rng = seed_of(name)
+    X = rng.uniform(-1, 1, (12, 3))
+    given = X + SIGMA * rng.standard_normal((12, 3))
+    given[6:] += by
+    stated = np.tile(SIGMA**2 * np.eye(3), (12, 1, 1))
+    figure = Figure(given, stated, FRAME.apply(X), (0.1 * SIGMA) ** 2 * np.eye(36), 500)
+    groups = []
+    for of, some in (("control", np.arange(6)), ("centres", np.arange(6, 12))):
+        kind = ObjectPoints(some, given[some], stated[some])
+        placed = judge_points(GivenPoints(kind, figure.reference), 1e-3)
+        assert placed is not None and placed.judgement.fits
+        groups.append(Group(of, np.arange(6), tuple(f"{of} {k}" for k in range(6)), placed))
+    settings = GivenSettings(Datum("control"), "mm")
+    task: Any = SimpleNamespace(reference=figure.reference, settings=settings, level=1e-3)
+    return task, groups, given
+
+
+@pytest.mark.parametrize(("sigmas", "said"), [(0.0, False), (1.5, False), (5.0, True), (50.0, True)])
+def test_control_and_centres_must_place_the_network_alike(sigmas: float, said: bool) -> None:
+    """A shift by t standard deviations of a coordinate, of which the mean of six is known to 0.6."""
+    by = sigmas * SIGMA * np.array([0.6, 0.0, 0.8])
+    task, groups, _ = two_groups(by, "placed alike")
+    found = contradiction_of(task, groups)
+    assert (found is not None) == said and contradiction_of(task, groups[:1]) is None
+    if found is not None:
+        assert found.names("given") == ("control", "centres") and found.number("dof") == 7
+        assert found.number("distance") == pytest.approx(sigmas * SIGMA, abs=3 * SIGMA)
+        assert found.number("chi2") == pytest.approx(3 * sigmas**2, rel=0.5)
+
+
+def test_points_that_take_part_are_those_that_fit_with_the_precision_that_they_have() -> None:
+    _, groups, given = two_groups(np.zeros(3), "take part")
+    one, covariance = groups[0], np.tile(SIGMA**2 * np.eye(3), (6, 1, 1))
+    kind = ObjectPoints(np.arange(6), given[:6], covariance)
+    assert len(one.taking_part(rescale=True).given) == 6 and one.dependable and one.out == ()
+    assert (one.test.what, one.test.dof) == ("control", 3 * 6 - 7)
+    found = one.placed.judgement
+    out = replace(one, placed=replace(one.placed, judgement=replace(found, wrong=(2,))))
+    assert out.taking_part(rescale=True).given.tolist() == np.delete(given[:6], 2, axis=0).tolist()
+    assert out.as_judged(kind, rescale=True, used=True).point.tolist() == [0, 1, 3, 4, 5]
+    assert len(out.as_judged(kind, rescale=True, used=False)) == 0
+    doubt = replace(one, placed=replace(one.placed, judgement=replace(found, doubtful=(2,))))
+    assert not doubt.dependable
+    factor = one.placed.model.factor()[0]
+    np.testing.assert_allclose(doubt.taking_part(rescale=True).stated, factor**2 * covariance)
+    np.testing.assert_allclose(doubt.taking_part(rescale=False).stated, covariance)
+    small = replace(one, placed=replace(one.placed, judgement=replace(found, factor=3.0)))
+    np.testing.assert_allclose(small.as_judged(kind, rescale=True, used=True).covariance, 9 * covariance)
+    np.testing.assert_allclose(small.as_judged(kind, rescale=False, used=True).covariance, covariance)
+    exchanged = replace(one, placed=replace(one.placed, order=(1, 0, 2, 3, 4, 5)))
+    np.testing.assert_allclose(
+        exchanged.as_judged(kind, rescale=True, used=True).xyz, given[[1, 0, 2, 3, 4, 5]]
+    )
+
+
+def test_fixed_points_that_scatter_have_their_scatter() -> None:
+    _, groups, _ = two_groups(np.zeros(3), "scatter of fixed")
+    fixed = np.zeros((6, 3, 3))
+    fixed[1, 2, 2] = np.inf
+    scattering = replace(groups[0], scatter=2e-3)
+    found = scattering._confirmed(fixed, True)
+    assert np.isinf(found[1, 2, 2]) and found[0, 0, 0] == pytest.approx(SIGMA**2)
+    np.testing.assert_array_equal(scattering._confirmed(fixed, False), fixed)
+
+
+@pytest.mark.parametrize(("ratio", "weak"), [(1.15, False), (1.3, True)])
+def test_values_whose_errors_shift_the_result_by_five_sigma_are_weakly_checked(
+    ratio: float, weak: bool
+) -> None:
+    """Of two bars the redundancy number of the better is 1 / (1 + q^2): 4.13 q standard deviations."""
+    model = replace(bars(0.0, 0.0), stated=np.diag([1.0, ratio**2]))
+    found = list(remarks_on_unchecked("lengths", ["A", "B"], model, (), 1e-3))
+    assert kinds_of(found) == (("given_weakly_checked",) if weak else ())
+    for one in found:
+        assert one.names("given") == ("A",) and one.names("of") == ("lengths",)
+        assert one.number("sigmas") == pytest.approx(4.13 * ratio, rel=0.01)
+
+
+def test_values_that_nothing_checks_are_named_and_those_checked_in_part() -> None:
+    """A point beside another one in X; Y and Z of both give the datum."""
+    A = np.zeros((6, 5))
+    A[[0, 3], 0] = 1.0  # X of both, in common
+    A[[1, 2, 4, 5], [1, 2, 3, 4]] = 1.0
+    model = GivenModel(np.zeros(6), np.zeros((6, 6)), np.eye(6), A, np.repeat([0, 1], 3), 100)
+    (one,) = remarks_on_unchecked("control", ["A", "B"], model, (), 1e-3)
+    assert one.kind == "given_partly_checked" and one.names("given") == ("A", "B")
+    found = list(remarks_on_unchecked("control", ["A", "B"], model, (1,), 1e-3))
+    assert kinds_of(found) == ("given_unchecked",) and found[0].names("given") == ("A",)
+
+
+def test_the_mean_of_scales_is_that_of_independent_lengths() -> None:
+    J = csr_matrix(np.array([[1.0, 0.0], [0.0, 3.0], [2.0, 0.0]]))
+    scales = Scales(np.array([0.1, 0.2, 0.6]), J, np.array([1.0, 4.0, 4.0]))
+    assert scales.mean.log.tolist() == [pytest.approx(0.3)] and scales.mean.variance.tolist() == [1.0]
+    np.testing.assert_allclose(scales.mean.J.toarray(), [[1.0, 1.0]])
+    np.testing.assert_allclose(scales.looser(2.0).variance, [5.0, 8.0, 8.0])
+    both = Scales.joined([scales, scales.mean])
+    assert both.log.tolist() == [*scales.log, *scales.mean.log] and both.J.shape == (4, 2)
+
+
+def table_of(*off: float, table: int = 1, is_plate: bool = False) -> Comparison:
+    """Return rows of a table whose logarithms of scale are so many standard deviations off."""
+    sigma = 1e-4
+    rows = [
+        Source(
+            f"row {k}", Scales(np.array([one * sigma]), csr_matrix((1, 1)), np.array([sigma**2])), (k,), table
+        )
+        for k, one in enumerate(off)
+    ]
+    rows = [row._replace(is_plate=is_plate) for row in rows]
+    reference: Any = SimpleNamespace(
+        C=np.zeros((1, 1)), marginal=SimpleNamespace(adjustment=SimpleNamespace(redundancy=500))
+    )
+    return Comparison.of(SimpleNamespace(reference=reference, level=1e-3), rows)  # type: ignore[arg-type]
+
+
+def test_rows_of_a_table_that_scatter_are_one_scale_of_less_precision() -> None:
+    """Where nothing shows which of them are wrong; bars that are no table have no common precision."""
+    off = (28.0, 28.0, 0.0, 0.0)
+    rows, apart = table_of(*off), table_of(*off, table=0)
+    assert rows.judgement.doubtful and rows.scatters and not apart.scatters
+    assert rows.factor == pytest.approx(28 / np.sqrt(3), rel=0.2) and apart.factor == 1.0
+    one = rows.as_one("the table")
+    assert one.name == "the table" and one.is_table and one.bars == (0, 1, 2, 3)
+    np.testing.assert_allclose(one.scales.variance, rows.factor**2 * 1e-8)
+    far = table_of(2800.0, 2800.0, 0.0, 0.0)  # beyond an order of magnitude of error
+    assert not far.scatters
+    clear = table_of(0.0, 0.5, -0.5, 0.2, 400.0)
+    assert clear.judgement.wrong == (4,) and not clear.scatters and clear.factor == 1.0
+    assert clear.as_one("the table").bars == (0, 1, 2, 3)
+
+
+def test_lengths_of_the_same_ends_are_no_better_together() -> None:
+    one = table_of(0.0, 0.5, -0.5, table=0).as_one("pair")
+    assert one.name == "row 0" and not one.is_table
+    np.testing.assert_allclose(one.scales.mean.variance, 1e-8)
+    plate = table_of(0.0, 0.5, -0.5, table=0, is_plate=True).as_one("plate")
+    np.testing.assert_allclose(plate.scales.variance, 1e-8)
+    alone = table_of(0.0).as_one("the table")
+    assert alone.name == "row 0" and not alone.is_table
+
+
+def test_sources_of_one_name_are_told_apart_by_their_lengths() -> None:
+    compared = table_of(0.0, 9.0, 1.0)
+    named = compared._replace(
+        sources=[row._replace(name=name) for row, name in zip(compared.sources, "AAB", strict=True)]
+    )
+    lengths = ScaleBars(np.zeros(3, dtype=int), np.ones(3, dtype=int), np.array([1.5, 2.5, 3.5]), np.ones(3))
+    assert [one.name for one in named.with_lengths(lengths, "m")] == ["A (1.50 m)", "A (2.50 m)", "B"]
+
+
+def test_points_that_carry_the_datum_are_not_outvoted() -> None:
+    """Bars, which may share a wrong unit, leave open which is wrong where all points are."""
+    compared = table_of(0.0, 0.5, 90.0)
+    of_points = compared._replace(
+        sources=[row._replace(points="control" if k == 2 else "") for k, row in enumerate(compared.sources)]
+    )
+    assert compared.judgement.wrong == (2,) and not compared.is_open(on_points=True)
+    assert of_points.is_open(on_points=True) and not of_points.is_open(on_points=False)
+    off, sigma = compared.difference(2)
+    assert off == pytest.approx((90.0 - 0.25) * 1e-4)
+    assert sigma == pytest.approx(1e-4 * np.sqrt(1.5), rel=0.02)
