@@ -41,8 +41,6 @@ from sfm.remarks.remark import Remark, remark
 from sfm.result import GivenTest
 from sfm.similarity import Similarity
 
-TINY = float(np.finfo(float).tiny)
-
 
 @dataclass(frozen=True)
 class JudgedGiven:
