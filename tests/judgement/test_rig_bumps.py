@@ -217,3 +217,14 @@ def test_the_level_is_shared_by_all_that_are_tested(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr("sfm.judgement.hypotheses.bumps._of_mounted", lambda *_, one=bump: iter([one]))
         assert len(find_bumps(a)) == count
     assert tested == 16 - 8  # of two photographs those that are not of the reference camera
+
+
+@pytest.mark.parametrize(("share", "counts"), [(0.7e-9, False), (1.4e-9, True)])
+def test_a_direction_of_a_pose_that_nothing_checks_gains_nothing(share: float, counts: bool) -> None:
+    """A shift that a rotation takes up but for a share of its squares."""
+    G = np.eye(6)
+    G[0, 4] = G[4, 0] = 1 - share
+    s = np.array([1.0, 0, 0, 0, -1.0, 0])
+    gain, shift = _gain(s[None], G.reshape(1, 6, 1, 6), 0, [])
+    assert gain == (pytest.approx(2 / share, rel=1e-3) if counts else pytest.approx(0.0, abs=1e-9))
+    assert bool(np.abs(shift).max() > 1) == counts
