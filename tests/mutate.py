@@ -3,10 +3,13 @@
     python -m tests.mutate [COUNT [SEED [FOLDER ...]]]       `make mutate`
 
 draws mutations of the rooms below: a comparison turned round, a sum in place of a difference, a threshold
-doubled or halved, a condition negated. Each is written into a copy of the project, the tests of its room run
-until one fails, and the table lists which survived, and how many ended in no time, apart. Before, the tests
-of each room run on its unchanged modules, written in the same way; where they fail, nothing is counted.
-Nothing is changed in the project.
+doubled or halved, a condition negated. Each is written into a copy of the project. The tests that execute the
+mutated line run until one fails, quickest first; tests/executed.py measures which these are. Of a constant,
+and whatever else runs while modules are loaded, they are the tests that execute what loads its name. Tests of
+the same files follow, as they may share what the first of them computed. A mutation that is not noticed
+within `BUDGET` survives, although a slower test may notice it. The table lists which survived, and how many
+ended in no time, apart. Before, the tests run once on the unchanged program; where they fail, nothing is
+counted. Nothing is changed in the project.
 
 Some change nothing that a test could notice: in score.py the centre of the motions that `_constraints` fixes,
 as rotations about any centre are the same motions, and the scale of the normals, which only rounding needs;
@@ -22,188 +25,54 @@ from __future__ import annotations
 
 import ast
 import importlib
-import os
 import random
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from queue import Queue
 from typing import Literal
 
 import numpy as np
 
+from tests.executed import Executed, keep, measured, run_tests
 from tests.places import ROOT
 
-LONGER = 3.0  # times the tests of a room, on its unchanged modules, that those of one mutation may take
+BUDGET = 60.0  # s that the tests of one mutation take on the unchanged program; slower ones are not tried
+LONGER = 3.0  # times as long may they take on the mutation
 COMPILING = 120.0  # s beside it, for kernels that a mutation makes compile again
 Ended = Literal["killed", "survived", "timed out"]
-ROOMS: dict[str, tuple[str, ...]] = {  # module or package, with the tests that check it
-    **{
-        f"sfm/judgement/hypotheses/{module}.py": tuple(f"tests/judgement/test_{name}.py" for name in names)
-        for module, names in (
-            ("alternatives", ("alternatives", "unchecked_assumptions", "hypotheses")),
-            ("columns", ("columns", "alternatives", "hypotheses")),
-            ("families", ("families", "alternatives", "hypotheses")),
-            ("hypotheses", ("families", "hypotheses", "alternatives")),
-            ("bumps", ("rig_bumps",)),
-            ("rejections", ("rejections", "hypotheses")),
-            ("refit", ("families", "unchecked_assumptions", "alternatives", "hypotheses")),
-            ("score", ("alternatives", "hypotheses")),
-        )
-    },
-    "sfm/remarks/remark.py": ("tests/remarks",),
-    "sfm/remarks/verdict.py": ("tests/remarks",),
-    "sfm/adjustment/quality/statistics.py": (
-        "tests/adjustment/test_statistical_tests.py",
-        "tests/adjustment/test_statistics.py",
-        "tests/adjustment/test_minimal_bias.py",
-    ),
-    **{
-        f"sfm/judgement/given/{module}.py": (
-            "tests/judgement/test_given_model.py",
-            "tests/judgement/test_given_values.py",
-        )
-        for module in ("values", "points", "mistakes")
-    },
-    "sfm/adjustment/quality/consistency.py": (
-        "tests/report/test_findings.py",
-        "tests/report/test_consistency.py",
-    ),
-    "sfm/adjustment/quality/other_solutions.py": (
-        "tests/adjustment/test_other_solutions.py",
-        "tests/survey/test_weak_networks.py",
-    ),
-    "sfm/comparison/causes.py": ("tests/comparison/test_causes.py",),
-    "sfm/remarks/catalogue": ("tests/remarks",),
-    "sfm/judgement/given/scales.py": (
-        "tests/judgement/test_given_thresholds.py",
-        "tests/survey/test_wrong_scale.py",
-        "tests/survey/test_plates.py",
-        "tests/survey/test_unchecked.py",
-        "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
-    ),
-    **{
-        f"sfm/judgement/given/{module}.py": (
-            "tests/survey/test_survey_observations.py",
-            "tests/survey/test_rigs.py",
-            "tests/judgement/test_given_model.py",
-        )
-        for module in ("tables", "mounts", "free_network")
-    },
-    **{
-        f"sfm/judgement/{module}.py": tests
-        for module, tests in (
-            ("model_choice", ("tests/judgement/test_model_choice.py",)),
-            (
-                "verdict",
-                (
-                    "tests/judgement/test_verdict.py",
-                    "tests/report/test_findings.py",
-                    "tests/report/test_statistics.py",
-                    "tests/report/test_camera_remarks.py",
-                    "tests/survey/test_unchecked.py",
-                ),
-            ),
-            ("cameras", ("tests/report/test_camera_remarks.py", "tests/report/test_findings.py")),
-            (
-                "calibrated_cameras",
-                (
-                    "tests/judgement/test_calibrated_cameras.py",
-                    "tests/report/test_camera_remarks.py",
-                    "tests/report/test_statistics.py",
-                ),
-            ),
-            (
-                "checks",
-                (
-                    "tests/judgement/test_calibrated_cameras.py",
-                    "tests/judgement/test_verdict.py",
-                    "tests/report/test_statistics.py",
-                    "tests/report/test_findings.py",
-                ),
-            ),
-            (
-                "bundle_statistics",
-                (
-                    "tests/report/test_geometry.py",
-                    "tests/report/test_statistics.py",
-                    "tests/report/test_findings.py",
-                ),
-            ),
-        )
-    },
-    "sfm/judgement/stated_precision.py": ("tests/judgement/test_stated_precision.py",),
-    "sfm/judgement/given/groups.py": (
-        "tests/judgement/test_given_thresholds.py",
-        "tests/survey/test_unchecked.py",
-    ),
-    "sfm/judgement/given/judge.py": (
-        "tests/judgement/test_given_thresholds.py",
-        "tests/survey/test_unchecked.py",
-        "tests/survey/test_wrong_scale.py",
-        "tests/survey/test_rigs.py",
-        "tests/survey/test_mistyped.py::test_what_is_mistyped_is_found_and_named",
-    ),
-    "sfm/observations": (
-        "tests/survey/test_survey_observations.py",
-        "tests/adjustment/test_statistics.py",
-        "tests/survey/test_rigs.py",
-        "tests/planning/test_planned_rigs.py",
-        "tests/test_new_kind.py",
-        "tests/adjustment/test_solve.py",
-    ),
-    **{
-        f"sfm/adjustment/{module}.py": (
-            *first,
-            "tests/adjustment/test_null_space.py",
-            "tests/adjustment/test_interior.py",
-            "tests/adjustment/test_solve.py",
-            "tests/adjustment/test_rigs.py",
-            "tests/survey/test_survey_observations.py",
-        )
-        for module, first in (
-            ("datum", ()),
-            ("engine/unknowns", ("tests/adjustment/test_rank.py",)),
-            ("engine/observed", ()),
-            ("engine/iterate", ("tests/adjustment/test_valleys.py", "tests/adjustment/test_robust.py")),
-        )
-    },
-    "sfm/survey/rigs.py": ("tests/survey/test_rigs.py",),
-    "sfm/survey/observation_tables.py": ("tests/survey/test_survey_observations.py",),
-    "sfm/survey/placing.py": (
-        "tests/survey/test_given_values.py",
-        "tests/survey/test_exterior.py",
-        "tests/survey/test_solution.py",
-        "tests/survey/test_survey_observations.py",
-    ),
-    "sfm/orientation/resection/fischler_bolles.py": (
-        "tests/orientation/resection/test_fischler_bolles.py",
-        "tests/orientation/resection/test_robust.py",
-    ),
-    "sfm/orientation/resection/least_squares.py": (
-        "tests/orientation/resection/test_least_squares.py",
-        "tests/textbook/resection/test_methods.py",
-        "tests/orientation/resection/test_robust.py",
-    ),
-    "sfm/orientation/resection/ransac.py": (
-        "tests/orientation/resection/test_robust.py",
-        "tests/orientation/test_effort.py::test_the_fewest_fitting_of_a_million_points_are_found_by_halving",
-    ),
-    "sfm/similarity.py": ("tests/orientation/test_absolute.py", "tests/test_similarity.py"),
-    "sfm/orientation/intersection.py": ("tests/orientation/test_intersection.py",),
-    "sfm/epochs/displacements.py": ("tests/epochs/test_displacements.py",),
-    "sfm/conventions.py": ("tests/test_units.py", "tests/test_conventions_page.py"),
-    "sfm/targets/codes/rings.py": ("tests/targets/test_codes.py",),
-    "sfm/targets/codes/dot_plates.py": ("tests/targets/test_plates.py",),
-}
+ROOMS = (  # modules, and folders with all that are in them
+    "sfm/judgement",
+    "sfm/remarks",
+    "sfm/observations",
+    "sfm/adjustment/quality/statistics.py",
+    "sfm/adjustment/quality/consistency.py",
+    "sfm/adjustment/quality/other_solutions.py",
+    "sfm/adjustment/datum.py",
+    "sfm/adjustment/engine/unknowns.py",
+    "sfm/adjustment/engine/observed.py",
+    "sfm/adjustment/engine/iterate.py",
+    "sfm/comparison/causes.py",
+    "sfm/survey/rigs.py",
+    "sfm/survey/observation_tables.py",
+    "sfm/survey/placing.py",
+    "sfm/orientation/resection/fischler_bolles.py",
+    "sfm/orientation/resection/least_squares.py",
+    "sfm/orientation/resection/ransac.py",
+    "sfm/orientation/intersection.py",
+    "sfm/similarity.py",
+    "sfm/epochs/displacements.py",
+    "sfm/conventions.py",
+    "sfm/targets/codes/rings.py",
+    "sfm/targets/codes/dot_plates.py",
+)
 COMPARED = {
     ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
 }  # fmt: skip
@@ -217,28 +86,129 @@ class Mutation:
     file: str
     line: int
     what: str
-    tests: tuple[str, ...]
-    number: int  # of the changed node
-    change: Callable[..., object]
-
-    @property
-    def source(self) -> str:
-        """The changed module."""
-        tree = _tree_of(self.file)
-        self.change(next(one for k, one in enumerate(ast.walk(tree)) if k == self.number))
-        return ast.unparse(ast.fix_missing_locations(tree))
+    source: str  # the changed module
+    tests: tuple[str, ...]  # that may notice it, in their order
+    seconds: float  # they take unchanged, s
 
 
-def _tree_of(file: str) -> ast.Module:
-    return ast.parse((ROOT / file).read_text(encoding="utf-8"))
+class Module:
+    """A module of the program, its statements, and where it loads which name."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        self.text = (ROOT / file).read_bytes()
+        self.tree = ast.parse(self.text)
+        self.parent = {child: node for node in ast.walk(self.tree) for child in ast.iter_child_nodes(node)}
+        self.starts = [0, *accumulate(len(line) for line in self.text.splitlines(keepends=True))]
+
+    def around(self, node: ast.AST) -> list[ast.AST]:
+        """Return what a node is part of, from itself to the module."""
+        found = [node]
+        while found[-1] in self.parent:
+            found.append(self.parent[found[-1]])
+        return found
+
+    def statement_of(self, node: ast.AST) -> ast.AST:
+        """Return the statement that a node is part of."""
+        return next(one for one in self.around(node) if isinstance(one, ast.stmt | ast.Module))
+
+    def changed(self, old: ast.expr, new: ast.expr) -> str:
+        """Return the text with another expression in one place."""
+        texts = [one for one in self.around(old) if isinstance(one, ast.JoinedStr)]
+        place = texts[-1] if texts else old  # parts of formatted text have no places before Python 3.12
+        start, end = (
+            self.starts[(line or 1) - 1] + (column or 0)
+            for line, column in (
+                (place.lineno, place.col_offset),
+                (place.end_lineno, place.end_col_offset),
+            )
+        )
+        written = ast.unparse(_Replacing(old, new).visit(place))
+        _Replacing(new, old).visit(place)  # the tree as it was
+        return b"".join((self.text[:start], f"({written})".encode(), self.text[end:])).decode()
 
 
-def mutations_of(file: str, tests: tuple[str, ...]) -> Iterator[Mutation]:
-    """Return all mutations of a module."""
-    numbers = _numbers_of(file)
-    for number, node in enumerate(ast.walk(_tree_of(file))):
-        for what, change in _changes(node, numbers):
-            yield Mutation(file, getattr(node, "lineno", 0), what, tests, number, change)
+@dataclass(frozen=True)
+class _Replacing(ast.NodeTransformer):
+    old: ast.AST
+    new: ast.AST
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        return self.new if node is self.old else self.generic_visit(node)
+
+
+class Noticing:
+    """Which tests may notice a change of which line."""
+
+    def __init__(self, executed: Executed) -> None:
+        self.executed = executed
+        self.modules = {file: Module(file) for file in executed.program}
+        self.loading: dict[str, list[tuple[Module, ast.AST]]] = defaultdict(list)
+        for module in self.modules.values():
+            for node in ast.walk(module.tree):
+                for name in _loaded(node):
+                    self.loading[name].append((module, module.statement_of(node)))
+        self.of_file = defaultdict[str, set[str]](set)
+        for test in executed.seconds:
+            self.of_file[test.split("::")[0]].add(test)
+
+    def of(self, module: Module, node: ast.AST) -> tuple[str, ...]:
+        """Return the tests of the statement that a node is part of: first those that execute it."""
+        seconds = self.executed.seconds
+        executing = self._executing(module, module.statement_of(node), set())
+        beside = set().union(*(self.of_file[test.split("::")[0]] for test in executing)) - executing
+        order = [*sorted(executing, key=seconds.__getitem__), *sorted(beside, key=seconds.__getitem__)]
+        sums = accumulate(seconds[test] for test in order)
+        return tuple(test for test, s in zip(order, sums, strict=True) if s <= BUDGET)
+
+    def _executing(self, module: Module, statement: ast.AST, seen: set[ast.AST]) -> set[str]:
+        """Return the tests that execute a statement, or what loads the names that it is known by."""
+        seen.add(statement)
+        around = module.around(statement)[1:]
+        if any(isinstance(one, ast.FunctionDef) for one in around):
+            found = self.executed.executing(module.file, _lines_of(statement))
+            if found:
+                return found
+        names = {one.name for one in around if isinstance(one, ast.FunctionDef | ast.ClassDef)}
+        if not any(isinstance(one, ast.FunctionDef) for one in around):
+            names |= set(_defined(statement))
+        loads = [one for name in names for one in self.loading[name]]
+        return set().union(*(self._executing(*one, seen) for one in loads if one[1] not in seen))
+
+
+def _lines_of(statement: ast.AST) -> range:
+    """Return the lines of a statement, without those of statements in it."""
+    assert isinstance(statement, ast.stmt)
+    body = getattr(statement, "body", None)
+    last = max(body[0].lineno - 1, statement.lineno) if body else statement.end_lineno
+    return range(statement.lineno, (last or statement.lineno) + 1)
+
+
+def _loaded(node: ast.AST) -> tuple[str, ...]:
+    """Return the names that a node loads."""
+    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load):
+        return (node.id,)
+    if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+        return (node.attr,)
+    return tuple(one.name for one in node.names if one.asname) if isinstance(node, ast.ImportFrom) else ()
+
+
+def _defined(statement: ast.AST) -> tuple[str, ...]:
+    """Return the names by which a statement that runs while its module is loaded is known."""
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return (statement.name,)
+    if isinstance(statement, ast.ImportFrom):
+        return tuple(one.asname for one in statement.names if one.asname)
+    names = (one for one in ast.walk(statement) if isinstance(one, ast.Name))
+    return tuple(one.id for one in names if isinstance(one.ctx, ast.Store))
+
+
+def changes_of(module: Module) -> Iterator[tuple[str, ast.AST, ast.expr, ast.expr]]:
+    """Return all changes of a module: words, where, an expression and another in its place."""
+    numbers = _numbers_of(module.file)
+    for node in ast.walk(module.tree):
+        for what, old, new in _changes(node, numbers):
+            yield what, node, old, new
 
 
 def _numbers_of(file: str) -> dict[str, object]:
@@ -255,35 +225,34 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
-def _changes(node: ast.AST, numbers: dict[str, object]) -> Iterator[tuple[str, Callable[..., object]]]:
-    """Return what can be changed of a node: words, and a function that changes it."""
+def _changes(node: ast.AST, numbers: dict[str, object]) -> Iterator[tuple[str, ast.expr, ast.expr]]:
+    """Return what can be changed of a node: words, an expression and another in its place."""
     if isinstance(node, ast.Compare) and type(node.ops[0]) in COMPARED:
-        new = COMPARED[type(node.ops[0])]
-        yield f"{type(node.ops[0]).__name__} -> {new.__name__}", lambda one: one.ops.__setitem__(0, new())
+        turned = COMPARED[type(node.ops[0])]
+        new = ast.Compare(node.left, [turned(), *node.ops[1:]], node.comparators)
+        yield f"{type(node.ops[0]).__name__} -> {turned.__name__}", node, new
     elif isinstance(node, ast.BinOp) and type(node.op) in COMPUTED and not _is_text(node):
-        new = COMPUTED[type(node.op)]
-        yield f"{type(node.op).__name__} -> {new.__name__}", lambda one: setattr(one, "op", new())
+        computed = COMPUTED[type(node.op)]
+        other = ast.BinOp(node.left, computed(), node.right)
+        yield f"{type(node.op).__name__} -> {computed.__name__}", node, other
     elif isinstance(node, ast.BoolOp):
-        new = ast.Or if isinstance(node.op, ast.And) else ast.And
-        yield f"{type(node.op).__name__} -> {new.__name__}", lambda one: setattr(one, "op", new())
+        joined = ast.Or if isinstance(node.op, ast.And) else ast.And
+        yield f"{type(node.op).__name__} -> {joined.__name__}", node, ast.BoolOp(joined(), node.values)
     elif isinstance(node, ast.If | ast.IfExp):
-        yield (
-            "condition negated",
-            lambda one: setattr(one, "test", ast.UnaryOp(ast.Not(), one.test)),
-        )
+        yield "condition negated", node.test, ast.UnaryOp(ast.Not(), node.test)
     elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
         target = node.targets[0] if isinstance(node, ast.Assign) else node.target
         value = numbers.get(target.id) if isinstance(target, ast.Name) else None
         if isinstance(node.value, ast.Tuple):
-            computed = any(isinstance(one, ast.Starred) for one in node.value.elts)
+            starred = any(isinstance(one, ast.Starred) for one in node.value.elts)
         else:
-            computed = isinstance(value, tuple)  # twice it would be no tuple of numbers
-        if isinstance(target, ast.Name) and value is not None and not computed:
-            yield from _scalings(target.id, value)
+            starred = isinstance(value, tuple)  # twice it would be no tuple of numbers
+        if isinstance(target, ast.Name) and value is not None and not starred:
+            yield from _scalings(target.id, node.value, value)
     elif isinstance(node, ast.Call):
-        for k, one in enumerate(node.keywords):
+        for one in node.keywords:
             if one.arg is not None and _is_limit(node, one):
-                yield from _scalings(one.arg, 1.0, k)
+                yield from _scalings(one.arg, one.value, 1.0)
 
 
 def _is_text(node: ast.BinOp) -> bool:
@@ -301,21 +270,14 @@ def _is_limit(call: ast.Call, one: ast.keyword) -> bool:
     return isinstance(one.value, ast.Constant) and isinstance(one.value.value, float) and one.value.value != 0
 
 
-def _scalings(
-    name: str, value: object, keyword: int | None = None
-) -> Iterator[tuple[str, Callable[..., object]]]:
+def _scalings(name: str, old: ast.expr, value: object) -> Iterator[tuple[str, ast.expr, ast.expr]]:
     """Return what makes a number, or each of several, twice and half as large."""
-
-    def scale(node: ast.Assign | ast.AnnAssign | ast.Call, factor: float) -> None:
-        owner = node if keyword is None else node.keywords[keyword]  # type: ignore[union-attr]
-        assert isinstance(owner, ast.Assign | ast.AnnAssign | ast.keyword) and owner.value is not None
-        parts = owner.value.elts if isinstance(owner.value, ast.Tuple) else [owner.value]
-        values = value if isinstance(owner.value, ast.Tuple) and isinstance(value, tuple) else [value]
-        new = [_times(*one, factor) for one in zip(parts, values, strict=True)]
-        owner.value = ast.Tuple(new, ast.Load()) if isinstance(owner.value, ast.Tuple) else new[0]
-
     for factor in (2.0, 0.5):
-        yield f"{name} times {factor:g}", lambda node, f=factor: scale(node, f)
+        if isinstance(old, ast.Tuple) and isinstance(value, tuple):
+            parts = [_times(*one, factor) for one in zip(old.elts, value, strict=True)]
+            yield f"{name} times {factor:g}", old, ast.Tuple(parts, ast.Load())
+        elif not (isinstance(value, int) and max(round(factor * value), 1) == value):  # half of one is one
+            yield f"{name} times {factor:g}", old, _times(old, value, factor)
 
 
 def _times(node: ast.expr, value: object, factor: float) -> ast.expr:
@@ -327,55 +289,56 @@ def _times(node: ast.expr, value: object, factor: float) -> ast.expr:
 def files_of(room: str) -> list[str]:
     """Return the modules of a room."""
     path = ROOT / room
-    files = [path] if path.is_file() else sorted(path.glob("*.py"))
+    files = [path] if path.is_file() else sorted(path.rglob("*.py"))
     return [file.relative_to(ROOT).as_posix() for file in files]
 
 
-def drawn(count: int, seed: int, rooms: Iterable[str]) -> list[Mutation]:
-    """Return so many mutations, spread over rooms by their size."""
-    every = [one for room in rooms for file in files_of(room) for one in mutations_of(file, ROOMS[room])]
+def drawn(count: int, seed: int, files: Iterable[str], noticing: Noticing) -> list[Mutation]:
+    """Return so many mutations, spread over modules by their size."""
+    modules = [noticing.modules[file] for file in files]
+    every = [(module, *change) for module in modules for change in changes_of(module)]
     random.Random(seed).shuffle(every)
-    return every[:count]
+    some = []
+    for module, what, node, old, new in every[:count]:
+        tests = noticing.of(module, node)
+        seconds = sum(noticing.executed.seconds[test] for test in tests)
+        line = getattr(node, "lineno", 0)
+        some.append(Mutation(module.file, line, what, module.changed(old, new), tests, seconds))
+    return some
 
 
-def run_changed(
-    sources: dict[str, str], tests: tuple[str, ...], folder: Path, limit: float | None = None
-) -> tuple[Ended, str]:
-    """Return how tests end where modules are other ones, in a copy of the project, and their output.
+def check_unchanged(some: Iterable[Mutation], executed: Executed, folder: Path) -> str:
+    """Return why the tests of mutations say nothing, empty if they pass on the unchanged program."""
+    chosen = {test for one in some for test in one.tests} - executed.passed[1]
+    if chosen:
+        ended = run_tests(sorted(chosen), folder)
+        if ended.returncode:
+            return f"tests fail on the unchanged program\n{ended.stdout}{ended.stderr}"
+        executed.passed[1].update(chosen)
+        keep(executed)
+    return ""
 
-    The tests may take `limit` seconds.
-    """
-    before = {file: (folder / file).read_text(encoding="utf-8") for file in sources}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+def run_mutation(one: Mutation, folder: Path) -> Ended:
+    """Return how tests end on a mutation, in a copy of the project."""
+    if not one.tests:
+        return "survived"
+    module = folder / one.file
+    before = module.read_text(encoding="utf-8")
     try:
-        for file, source in sources.items():
-            (folder / file).write_text(source, encoding="utf-8")
-        ended = subprocess.run(
-            command, cwd=folder, capture_output=True, timeout=limit, env=environment, text=True
-        )
-        return ("killed" if ended.returncode else "survived"), ended.stdout + ended.stderr
+        module.write_text(one.source, encoding="utf-8")
+        ended = run_tests(one.tests, folder, "-x", limit=LONGER * one.seconds + COMPILING)
+        return "killed" if ended.returncode else "survived"
     except subprocess.TimeoutExpired:
-        return "timed out", ""
+        return "timed out"
     finally:
-        for file, source in before.items():
-            (folder / file).write_text(source, encoding="utf-8")
-
-
-def run_unchanged(room: str, folder: Path) -> tuple[str, float]:
-    """Return why the tests of a room say nothing, empty if they pass unchanged, and how long they took, s."""
-    sources = {file: ast.unparse(_tree_of(file)) for file in files_of(room)}
-    start = time.monotonic()
-    ended, output = run_changed(sources, ROOMS[room], folder)
-    seconds = time.monotonic() - start
-    return ("" if ended == "survived" else f"{room}: {ended} without a change\n{output}"), seconds
+        module.write_text(before, encoding="utf-8")
 
 
 def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> int:
     """Run the mutations of the rooms, or of those in these folders, and print those that survive."""
-    chosen = [room for room in ROOMS if room.startswith(rooms or "")]
-    some, found = drawn(count, seed, chosen), Counter[tuple[str, Ended]]()
-    files = {one.file for one in some}
+    files = [file for room in ROOMS for file in files_of(room) if file.startswith(rooms or "")]
+    found = Counter[tuple[str, Ended]]()
     with tempfile.TemporaryDirectory() as place, ThreadPoolExecutor(processes) as pool:
         folders: Queue[Path] = Queue()
         for k in range(processes):
@@ -384,45 +347,36 @@ def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> in
                 ROOT, copied, ignore=shutil.ignore_patterns(".venv", ".git", "node_modules", "out", "build")
             )
             folders.put(copied)
-
-        @contextmanager
-        def a_copy() -> Iterator[Path]:
-            folder = folders.get()
-            try:
-                yield folder
-            finally:
-                folders.put(folder)
-
-        def unchanged(room: str) -> tuple[str, float]:
-            with a_copy() as folder:
-                return run_unchanged(room, folder)
-
-        drawn_rooms = [room for room in chosen if files & set(files_of(room))]
-        before = dict(zip(drawn_rooms, pool.map(unchanged, drawn_rooms), strict=True))
-        failed = [why for why, _ in before.values() if why]
-        if failed:
-            print("\n".join(failed))
+        try:
+            executed = measured(folders.queue[0])
+        except RuntimeError as failed:
+            print(failed)
             return 2
-        limits = {
-            file: LONGER * seconds + COMPILING
-            for room, (_, seconds) in before.items()
-            for file in files_of(room)
-        }
+        some = drawn(count, seed, files, Noticing(executed))
+        failing = check_unchanged(some, executed, folders.queue[0])
+        if failing:
+            print(failing)
+            return 2
 
         def ended_of(one: Mutation) -> Ended:
-            with a_copy() as folder:
-                return run_changed({one.file: one.source}, one.tests, folder, limits[one.file])[0]
+            folder = folders.get()
+            try:
+                return run_mutation(one, folder)
+            finally:
+                folders.put(folder)
 
         for k, (one, ended) in enumerate(zip(some, pool.map(ended_of, some), strict=True), start=1):
             found[one.file, ended] += 1
             if ended != "killed":
-                print(f"{k} of {count}: {ended}: {one.file}:{one.line} {one.what}", flush=True)
+                tried = f"{len(one.tests)} tests, {one.seconds:.0f} s"
+                print(f"{k} of {count}: {ended}: {one.file}:{one.line} {one.what} ({tried})", flush=True)
     print(f"{'room':50} killed survived timed out")
-    for file in sorted(files):
+    for file in sorted({one.file for one in some}):
         print(_row(file, *(found[file, ended] for ended in ("killed", "survived", "timed out"))))
-    killed, survived, out = (
-        sum(found[file, ended] for file in files) for ended in ("killed", "survived", "timed out")
-    )
+    count_of = Counter[Ended]()
+    for (_, ended), number in found.items():
+        count_of[ended] += number
+    killed, survived, out = count_of["killed"], count_of["survived"], count_of["timed out"]
     print(_row("all", killed, survived, out), f" {100 * killed / max(killed + survived, 1):.0f} %")
     return 0 if killed >= 0.95 * (killed + survived) else 1
 
@@ -432,4 +386,4 @@ def _row(name: str, killed: int, survived: int, out: int) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(one) for one in sys.argv[1:3]), *sys.argv[3:]))
+    sys.exit(main(*map(int, sys.argv[1:3]), *sys.argv[3:]))  # type: ignore[arg-type]
