@@ -41,14 +41,14 @@ def test_of_a_cube_all_turned_and_mirrored_triangles_are_tried() -> None:
 def test_half_of_the_points_right_place_the_others(n: int) -> None:
     """The chance that no list of triangles is of right points only is 1 in 15, and one was tried for each."""
     placed = 0
-    for k in range(20 if n == 8 else 5):
+    for k in range(12 if n == 8 else 3):
         rng = seed_of(f"half right {n} {k}")
         X = rng.uniform(-1, 1, (n, 3))
         given = FRAME.apply(X)
         given[n // 2 :] = FRAME.apply(rng.uniform(-1, 1, (n - n // 2, 3)))
         right = [np.linalg.norm(one.apply(X) - given, axis=1) < 1e-6 for one in mistakes._placings(X, given)]
         placed += any(one.sum() >= n // 2 for one in right)
-    assert placed >= (15 if n == 8 else 4)
+    assert placed >= (9 if n == 8 else 2)
 
 
 def test_assignments_that_are_judged_are_few() -> None:
