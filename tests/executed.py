@@ -29,7 +29,8 @@ from tests.places import ROOT
 
 KEPT = ROOT / "build/executed.json"
 CHOSEN = "KOLINEAR_CHOSEN_TESTS"  # environment variables: a file of tests to run, each on its line
-TAKEN = "KOLINEAR_SECONDS_TAKEN"  # and one to write the seconds of each test to
+TAKEN = "KOLINEAR_SECONDS_TAKEN"  # one to write the seconds of each test to
+FAILED = "KOLINEAR_FAILED_TEST"  # and one to write the last test that failed to
 SECONDS = defaultdict[str, float](float)
 
 
@@ -211,8 +212,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Add the time of one part of a test."""
+    """Add the time of one part of a test, and keep which one failed."""
     SECONDS[report.nodeid] += report.duration
+    if report.failed and FAILED in os.environ:
+        Path(os.environ[FAILED]).write_text(report.nodeid, encoding="utf-8")
 
 
 def pytest_sessionfinish() -> None:

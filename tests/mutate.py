@@ -8,8 +8,8 @@ mutated line run until one fails, quickest first; tests/executed.py measures whi
 and whatever else runs while modules are loaded, they are the tests that execute what loads its name. Tests of
 the same files follow, as they may share what the first of them computed. A mutation that is not noticed
 within `BUDGET` survives, although a slower test may notice it. The table lists which survived, and how many
-ended in no time, apart. Before, the tests run once on the unchanged program; where they fail, nothing is
-counted. Nothing is changed in the project.
+ended in no time, apart. In the end, each test that noticed one runs once on the unchanged program; where it
+fails, nothing is counted. Nothing is changed in the project.
 
 Some change nothing that a test could notice: in score.py the centre of the motions that `_constraints` fixes,
 as rotations about any centre are the same motions, and the scale of the normals, which only rounding needs;
@@ -40,8 +40,9 @@ from queue import Queue
 from typing import Literal
 
 import numpy as np
+import pytest
 
-from tests.executed import Executed, keep, measured, run_tests
+from tests.executed import FAILED, Executed, keep, measured, run_tests
 from tests.places import ROOT
 
 BUDGET = 60.0  # s that the tests of one mutation take on the unchanged program; slower ones are not tried
@@ -307,32 +308,39 @@ def drawn(count: int, seed: int, files: Iterable[str], noticing: Noticing) -> li
     return some
 
 
-def check_unchanged(some: Iterable[Mutation], executed: Executed, folder: Path) -> str:
-    """Return why the tests of mutations say nothing, empty if they pass on the unchanged program."""
-    chosen = {test for one in some for test in one.tests} - executed.passed[1]
-    if chosen:
-        ended = run_tests(sorted(chosen), folder)
-        if ended.returncode:
-            return f"tests fail on the unchanged program\n{ended.stdout}{ended.stderr}"
-        executed.passed[1].update(chosen)
-        keep(executed)
-    return ""
-
-
-def run_mutation(one: Mutation, folder: Path) -> Ended:
-    """Return how tests end on a mutation, in a copy of the project."""
+def run_mutation(one: Mutation, folder: Path) -> tuple[Ended, str]:
+    """Return how tests end on a mutation, in a copy of the project, and which one noticed it."""
     if not one.tests:
-        return "survived"
+        return "survived", ""
     module = folder / one.file
     before = module.read_text(encoding="utf-8")
-    try:
-        module.write_text(one.source, encoding="utf-8")
-        ended = run_tests(one.tests, folder, "-x", limit=LONGER * one.seconds + COMPILING)
-        return "killed" if ended.returncode else "survived"
-    except subprocess.TimeoutExpired:
-        return "timed out"
-    finally:
-        module.write_text(before, encoding="utf-8")
+    with tempfile.TemporaryDirectory() as place:
+        failed = Path(place) / "failed"
+        try:
+            module.write_text(one.source, encoding="utf-8")
+            limit, environment = LONGER * one.seconds + COMPILING, {FAILED: str(failed)}
+            ended = run_tests(one.tests, folder, "-x", limit=limit, environment=environment)
+        except subprocess.TimeoutExpired:
+            return "timed out", ""
+        finally:
+            module.write_text(before, encoding="utf-8")
+        if ended.returncode in (pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+            raise RuntimeError(ended.stdout + ended.stderr)
+        if not ended.returncode:
+            return "survived", ""
+        return "killed", failed.read_text(encoding="utf-8") if failed.is_file() else ""
+
+
+def check_unchanged(tests: set[str], executed: Executed, folder: Path) -> str:
+    """Return why tests say nothing, empty if they pass on the unchanged program."""
+    tests = tests - executed.passed[1]
+    if tests:
+        ended = run_tests(sorted(tests), folder)
+        if ended.returncode:
+            return f"tests fail on the unchanged program\n{ended.stdout}{ended.stderr}"
+        executed.passed[1].update(tests)
+        keep(executed)
+    return ""
 
 
 def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> int:
@@ -353,23 +361,25 @@ def main(count: int = 200, seed: int = 1, *rooms: str, processes: int = 2) -> in
             print(failed)
             return 2
         some = drawn(count, seed, files, Noticing(executed))
-        failing = check_unchanged(some, executed, folders.queue[0])
-        if failing:
-            print(failing)
-            return 2
 
-        def ended_of(one: Mutation) -> Ended:
+        def ended_of(one: Mutation) -> tuple[Ended, str]:
             folder = folders.get()
             try:
                 return run_mutation(one, folder)
             finally:
                 folders.put(folder)
 
-        for k, (one, ended) in enumerate(zip(some, pool.map(ended_of, some), strict=True), start=1):
+        noticed = set[str]()
+        for k, (one, (ended, by)) in enumerate(zip(some, pool.map(ended_of, some), strict=True), start=1):
             found[one.file, ended] += 1
+            noticed |= {by} - {""}
             if ended != "killed":
                 tried = f"{len(one.tests)} tests, {one.seconds:.0f} s"
                 print(f"{k} of {count}: {ended}: {one.file}:{one.line} {one.what} ({tried})", flush=True)
+        failing = check_unchanged(noticed, executed, folders.queue[0])
+        if failing:
+            print(failing)
+            return 2
     print(f"{'room':50} killed survived timed out")
     for file in sorted({one.file for one in some}):
         print(_row(file, *(found[file, ended] for ended in ("killed", "survived", "timed out"))))

@@ -1,0 +1,138 @@
+"""What survey observations and mounts are judged beside: the given values of the datum, and the bars."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.solve import adjust
+from sfm.judgement.given import judge as given
+from sfm.judgement.given.free_network import FreeNetwork
+from sfm.judgement.given.groups import GivenSettings
+from sfm.judgement.given.judge import JudgedGiven, judge_given
+from sfm.judgement.given.tables import Contradiction, Table
+from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
+from sfm.observations.point_pairs import HeightDifferences
+from sfm.remarks.remark import kinds_of
+from sfm.similarity import Similarity
+from tests.synthetic import make_network, observed_anew, seed_of
+
+UNCHANGED = Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Network, Estimate, FreeNetwork]:
+    """Photographs with control, two bars and heights, without errors and in the frame of the object."""
+    network, truth = make_network(seed_of("beside"), images=6, points=20)
+    network = observed_anew(network, truth, 0.0, seed_of("beside"))
+    free = FreeNetwork(adjust(network, truth, datum=Datum("free"), reject="none"))
+    X = truth.points
+    start, end = np.arange(5), np.arange(5) + 8
+    heights = HeightDifferences(start, end, (X[end, 2] - X[start, 2])[:, None], np.full((5, 1), 1e-3))
+    length = np.linalg.norm(X[[10, 11]] - X[[16, 17]], axis=1)
+    bars = ScaleBars(np.array([10, 11]), np.array([16, 17]), length, np.full(2, 1e-3))
+    network = network.with_control(network.points[:8], X[:8], 1e-3)
+    return replace(network, observations=(heights,), scale_bars=bars), truth, free
+
+
+def judged(
+    network: Network, free: FreeNetwork | None, kind: Literal["free", "control"], **parts: Any
+) -> JudgedGiven:
+    settings = GivenSettings(Datum(kind), "m")
+    return judge_given(network, free, settings, place=lambda _: UNCHANGED, **parts)
+
+
+@pytest.mark.parametrize("kind", ["free", "control"])
+def test_tables_are_judged_beside_the_values_that_carry_the_datum(
+    kind: Literal["free", "control"],
+    made: tuple[Network, Estimate, FreeNetwork],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In a free datum control places the network afterwards, and bars scale it in any."""
+    network, truth, free = made
+    variance = np.tile(np.diag([1e-6] * 3 + [np.inf] * 3), (2, 1, 1))
+    centres = ExteriorObservations(np.arange(2), truth.position[:2], np.zeros((2, 3)), variance)
+    beside: list[tuple[Network, Any]] = []
+    monkeypatch.setattr(
+        given, "judge_tables", lambda tables, part, _, place, level: beside.append((part, place)) or ()
+    )
+    found = judged(replace(network, exterior=centres), free, kind)
+    ((part, place),) = beside
+    in_control = kind == "control"
+    assert (len(part.control), len(part.exterior), len(part.scale_bars)) == (
+        (8, 2, 2) if in_control else (0, 0, 2)
+    )
+    assert [len(one) for one in part.observations] == [5]
+    assert (place(part) is UNCHANGED) != in_control  # which control has decided before
+    assert not found.others_contradict and found.network.observations == network.observations
+
+
+def test_observations_without_a_datum_of_control_are_not_judged(
+    made: tuple[Network, Estimate, FreeNetwork],
+) -> None:
+    network, _, free = made
+    assert "given_not_judged" not in kinds_of(judged(network, free, "control").remarks)
+    none = judged(network, None, "control")
+    assert [one.names("of") for one in none.remarks] == [("bars", "control"), ("observations",)]
+    assert none.checks_handedness  # control in space connects the parts, whatever its precision
+    flat = network.with_control(network.points[:8], network.control.xyz * [1, 1, 0], 1e-3)
+    assert not judged(flat, None, "control").checks_handedness
+    assert not judged(network, None, "free").checks_handedness
+    alone = replace(network, observations=())
+    assert [one.names("of") for one in judged(alone, None, "control").remarks] == [("bars", "control")]
+    without = judge_given(network, free, GivenSettings(Datum("free"), "m"))
+    assert [one.names("of") for one in without.remarks] == [("observations",)]
+
+
+@pytest.mark.parametrize(("wrong", "whole"), [((0, 1, 2, 3, 4), True), ((2,), False), ((), False)])
+def test_wrong_observations_leave_the_network(
+    wrong: tuple[int, ...], whole: bool, made: tuple[Network, Estimate, FreeNetwork]
+) -> None:
+    """Named by their ends; a whole table by its kind, and the control stays."""
+    network, _, free = made
+    heights = network.observations[0]
+    assert isinstance(heights, HeightDifferences)
+    off = np.where(np.isin(np.arange(5), wrong), [0.3, -0.2, 0.25, 0.4, -0.3], 0.0)[:, None]
+    spoiled = replace(network, observations=(replace(heights, value=heights.value + off),))
+    found = judged(spoiled, free, "control")
+    kinds = ("kind_wrong",) if whole else ("observations_wrong",) if wrong else ()
+    assert kinds_of(found.remarks) == ("given_weakly_checked", *kinds)  # the bars
+    assert found.others_contradict == bool(wrong)
+    assert [len(one) for one in found.network.observations] == ([] if whole else [5 - len(wrong)])
+    assert len(found.network.control) == 8 and len(found.network.scale_bars) == 2
+
+
+@pytest.mark.parametrize(("bars", "kinds", "judged_again"), [(1, 2, True), (1, 1, False), (2, 2, False)])
+def test_the_one_scale_of_bars_that_several_kinds_contradict_is_open(
+    bars: int,
+    kinds: int,
+    judged_again: bool,
+    made: tuple[Network, Estimate, FreeNetwork],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Then the bar is judged as a table of distances beside them, and may be what is wrong."""
+    network, _, free = made
+    network = replace(network, scale_bars=network.scale_bars.select(np.arange(bars)))
+    wrong = tuple(Contradiction(f"kind {k}", whole=True) for k in range(kinds))
+    asked: list[list[Table]] = []
+
+    def judge(tables: list[Table], part: Network, *_: Any) -> tuple[Contradiction, ...]:
+        asked.append(list(tables))
+        if len(asked) == 1:
+            return wrong
+        assert len(part.scale_bars) == 0
+        return (Contradiction("distances", tuple((tables[-1].number, k) for k in range(bars)), whole=True),)
+
+    monkeypatch.setattr(given, "judge_tables", judge)
+    found = judged(network, free, "free")
+    assert len(asked) == 1 + judged_again
+    if judged_again:
+        assert [one.kind.name for one in asked[1]] == ["height differences", "distances"]
+        assert asked[1][-1].number == 1
+        assert len(found.network.scale_bars) == 0
+    else:
+        assert len(found.network.scale_bars) == bars
