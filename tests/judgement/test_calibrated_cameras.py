@@ -103,7 +103,10 @@ def test_points_known_to_a_pixel_make_a_calibration(pixels: float, result: bool)
     stated = np.sqrt(3) * sigma[:, None] * [0.6, 0.8, 0.0]
     covariance = stated[:, :, None] ** 2 * np.eye(3)
     control = replace(a.network.control, covariance=covariance)
-    assert camera_is_result(replace(a, network=replace(a.network, control=control))) == result
+    far = replace(a.estimate, points=a.estimate.points + 90.0, position=a.estimate.position + 90.0)
+    for estimate in (a.estimate, far):
+        other = replace(a, estimate=estimate, network=replace(a.network, control=control))
+        assert camera_is_result(other) == result
 
 
 def test_a_calibration_has_as_many_parameters_as_unknown_coordinates() -> None:

@@ -210,12 +210,17 @@ def test_the_level_is_shared_by_all_that_are_tested(monkeypatch: pytest.MonkeyPa
     network, truth = scene(3, 2)
     a = adjust(network, truth, reject="none")
     tested = len(_testable(a))
-    critical = level_of_single(a.levels.question, tested)
-    for factor, count in ((0.9, 1), (1.1, 0)):
-        sigmas = np.sqrt(chi2_isf(factor * critical, 6))
-        bump = Bump("x", "camera 2", 1.0, 1.0, sigmas, factor * critical, False)
-        monkeypatch.setattr("sfm.judgement.hypotheses.bumps._of_mounted", lambda *_, one=bump: iter([one]))
-        assert len(find_bumps(a)) == count
+    monkeypatch.setattr("sfm.judgement.hypotheses.bumps._of_freed", lambda *_: iter(()))
+    for freed in (0, 5):  # whose moment is another one than was stated
+        stated = np.where(np.arange(16) < freed, 99, network.moment)
+        critical = level_of_single(a.levels.question, tested + freed)
+        for factor, count in ((0.9, 1), (1.1, 0)):
+            sigmas = np.sqrt(chi2_isf(factor * critical, 6))
+            bump = Bump("x", "camera 2", 1.0, 1.0, sigmas, factor * critical, False)
+            monkeypatch.setattr(
+                "sfm.judgement.hypotheses.bumps._of_mounted", lambda *_, one=bump: iter([one])
+            )
+            assert len(find_bumps(a, stated)) == count
     assert tested == 16 - 8  # of two photographs those that are not of the reference camera
 
 
