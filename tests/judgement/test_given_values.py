@@ -478,3 +478,18 @@ def test_derivatives_of_scales_by_the_free_network(n: int) -> None:
         free.flat[k] += 1e-6
         change = (scales(replace(one, free=free)).log - log) / 1e-6
         assert change == pytest.approx(J[:, k], abs=2e-3 * np.abs(J).max())
+
+
+def test_two_points_have_a_scale_where_nothing_else_is_given() -> None:
+    """With the heights of others their distance is not all that gives the scale, and is not judged."""
+    one = points(7, "two complete")
+    given = one.given.copy()
+    given[2:, :2] = np.nan
+    for count, there in ((2, True), (7, False)):
+        placed = judge(replace(one, given=given).select(np.arange(count)), LEVEL, start=FRAME.inverse())
+        assert placed is not None
+        scale = scale_of_points(placed)
+        assert (scale is not None) == there
+        if scale is not None:
+            apart = np.linalg.norm(one.given[1] - one.given[0]) / np.linalg.norm(one.free[1] - one.free[0])
+            assert np.exp(scale.log) == pytest.approx([apart])
