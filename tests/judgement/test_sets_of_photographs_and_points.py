@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import comb, log
 from types import SimpleNamespace
 from typing import Any
@@ -10,12 +11,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import ErrorCorrelation
+from sfm.adjustment.solve import adjust
 from sfm.conventions import BoolArray, FloatArray
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses.alternatives import Part, runs_of
-from sfm.judgement.hypotheses.columns import rigid_motions
-from sfm.judgement.hypotheses.score import NONE, Gain
-from tests.synthetic import seed_of
+from sfm.judgement.hypotheses.columns import columns_of, rigid_motions
+from sfm.judgement.hypotheses.score import NONE, Gain, reduce_adjustment
+from sfm.survey.inputs.sources import TEXTURE
+from tests.synthetic import make_network, seed_of
 
 
 def random_part(name: str, m: int, moved: list[int], *, by: float = 8.0, f: int = 2) -> Part:
@@ -325,3 +330,23 @@ def test_each_photograph_must_exceed_all_its_other_freedoms() -> None:
     g = strong.g.ravel()[rows] - cross @ np.linalg.solve(flat[np.ix_(at, at)], strong.g.ravel()[at])
     assert one.spread.redundancy == 8 * 31 and not one.spread.among
     assert one.spread.factor == pytest.approx(g @ np.linalg.solve(inner, g) / (8 * 31), rel=1e-6)
+
+
+def test_errors_of_neighbours_count_for_what_would_be_significant() -> None:
+    """Of texture: its gains are divided by the design effect, those of others need none."""
+    network, truth = make_network(seed_of("neighbours of texture"), images=8, points=40, free=("c",))
+    seen = network.image_points
+    by = np.where(seen.image >= 5, 0.03, 0.0)[:, None] * (seen.xy - (999.5, 749.5))
+    network = replace(network, image_points=replace(seen, xy=seen.xy + by), sources=(TEXTURE,))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    columns = columns_of(a)
+    effects: list[dict[tuple[str, str], float]] = []
+    for correlation in (None, ErrorCorrelation(alone=0.1, common=0.9, length_px=300.0)):
+        reduced = reduce_adjustment(a, columns)
+        found = alternatives.alternatives_of(a, replace(reduced, correlation=correlation), columns)
+        effects.append({(one.family.name, one.pattern): one.design_effect for one in found})
+        needed = np.log(1 / a.levels.family)
+        for one in found:
+            plain = replace(one, design_effect=1.0).evidence_beside_spread
+            assert one.design_effect == 1 or (correlation is not None and plain > needed)
+    assert set(effects[0].values()) == {1.0} and effects[1]["c", "split"] > 1.1
