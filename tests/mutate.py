@@ -18,7 +18,9 @@ polished by its misfit, which saves time, as no wrong one passes the polish; in 
 rings are sampled, as arcs are counted alike in a mirror; in given.py the length of a direction left open; in
 rigid_frames.py the singular values below which a step is cut, which only rounding needs; in intersection.py
 how much room there is for directions, of which there may be more; in point_pairs.py the multiple of 2 pi by
-which directions are wrapped.
+which directions are wrapped; in bumps.py the step of a numerical derivative; in mounts.py and
+calibrated_cameras.py the smallest number that divides; in values.py how much covariance along the parameters
+makes that of fixed values regular.
 """
 
 from __future__ import annotations
