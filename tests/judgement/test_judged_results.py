@@ -22,7 +22,7 @@ from sfm.judgement.bundle_statistics import Given
 from sfm.judgement.checks import ControlCoordinate, LongestResidual, sigma0_of
 from sfm.network import ScaleBars
 from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.remarks.remark import Remark, kinds_of, of_kind
+from sfm.remarks.remark import Remark, kinds_of, of_kind, remark
 from sfm.result import SurveyResult
 from tests.synthetic import make_network, seed_of
 
@@ -278,3 +278,15 @@ def test_a_photograph_without_start_is_missing(
     assert f"{oriented} of {images} photographs" in verdict.headline
     for one in of_kind(verdict.remarks, "photographs_missing"):
         assert one.number("share") == pytest.approx((images - oriented) / images)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_only_given_image_points_have_stated_standard_deviations(
+    measured: bool, a: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of measured ones are the program's."""
+    said = remark("image_sigmas", count=9, points=["1"], stated=(0.1, "px"), factor=3.0, rejected=0.0)
+    monkeypatch.setattr(verdicts, "stated_precision_remarks", lambda _: (said,))
+    photograph: Any = SimpleNamespace(image="image 1", blur=None, camera="")
+    verdict = verdicts.judge_survey(result_of(a, photographs=(photograph,) if measured else ())).verdict
+    assert bool(of_kind(verdict.remarks, "image_sigmas")) != measured

@@ -15,13 +15,15 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import families, hypotheses
+from sfm.judgement.hypotheses.alternatives import alternatives_of, is_significant
+from sfm.judgement.hypotheses.columns import Columns, columns_of
 from sfm.judgement.hypotheses.families import Alternative
 from sfm.judgement.hypotheses.hypotheses import Cause, find_causes, free_network, judge_alternatives
 from sfm.judgement.hypotheses.refit import Refit
-from sfm.judgement.hypotheses.score import Gain, log_likelihood_gain
+from sfm.judgement.hypotheses.score import Gain, Reduced, log_likelihood_gain, reduce_adjustment
 from sfm.network import Estimate, ImagePoints, Network, ScaleBars
 from sfm.remarks.remark import kinds_of
-from tests.synthetic import make_network, seed_of
+from tests.synthetic import make_network, observed_anew, seed_of
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +111,11 @@ def tried_in(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Alter
     return tried, most[0]
 
 
+def reduced_of(a: Adjustment) -> tuple[Reduced, Columns]:
+    columns = columns_of(a)
+    return reduce_adjustment(a, columns), columns
+
+
 def test_two_alternatives_of_each_kind_are_adjusted(
     zoomed: Adjustment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +127,25 @@ def test_two_alternatives_of_each_kind_are_adjusted(
     assert max(count.values()) == 2 and len(count) >= 2
     of_camera = [one.photographs.tolist() for one in tried if one.family.cause(one)[0] == "camera"]
     assert of_camera[0] == [5, 6, 7]
+
+
+def test_only_what_is_clear_is_adjusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What chance does not explain, and parameters that would do so in all photographs together."""
+    rng = seed_of("clear movement")
+    network, truth = make_network(rng, images=8, points=20, free=("c",))
+    X = truth.points.copy()
+    X[:3, 0] += 4e-3
+    there = observed_anew(network, replace(truth, points=X), 0.1, rng).image_points.xy
+    seen = network.image_points
+    xy = np.where(seen.image[:, None] >= 4, there, seen.xy)
+    network = replace(network, image_points=replace(seen, xy=xy))
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
+    every, needed = alternatives_of(a, *reduced_of(a)), np.log(1 / a.levels.family)
+    tried, _ = tried_in(a, monkeypatch)
+    assert tried and any(one.family.name == "held" for one in every)
+    for one in tried:
+        clear = is_significant(one, len(every), a.levels.family) and one.evidence > needed
+        assert clear or (one.family.name == "held" and one.evidence_beside_spread > needed)
 
 
 def test_the_work_of_a_search_is_bounded(zoomed: Adjustment, monkeypatch: pytest.MonkeyPatch) -> None:
