@@ -14,9 +14,10 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
 from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.judgement.given import judge as given
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.groups import GivenSettings, Group, contradiction_of, remarks_on_unchecked
-from sfm.judgement.given.points import GivenPoints, judge_points
+from sfm.judgement.given.points import STRAINS, GivenPoints, Strain, judge_points
 from sfm.judgement.given.scales import Comparison, Scales, Source, common_scale
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values, misfit_of
 from sfm.network import ObjectPoints, ScaleBars
@@ -327,3 +328,50 @@ def test_points_that_carry_the_datum_are_not_outvoted() -> None:
     off, sigma = compared.difference(2)
     assert off == pytest.approx((90.0 - 0.25) * 1e-4)
     assert sigma == pytest.approx(1e-4 * np.sqrt(1.5), rel=0.02)
+
+
+def judged_group(name: str, **found: Any) -> tuple[Any, Group]:
+    """Return a group of six points of which something was found, and what it is judged with."""
+    task, groups, _ = two_groups(np.zeros(3), name)
+    placed = groups[0].placed
+    return task, replace(groups[0], placed=replace(placed, judgement=replace(placed.judgement, **found)))
+
+
+@pytest.mark.parametrize("rescale", [True, False])
+def test_the_shift_by_doubtful_points_is_that_of_the_weights_that_they_get(rescale: bool) -> None:
+    """Where one of them is wrong; with standard deviations from their differences, if these are replaced."""
+    task, group = judged_group("doubtful shift", doubtful=(1, 4), one_wrong=True)
+    task.settings = replace(task.settings, rescale=rescale)
+    said = given._doubtful(task, group)
+    model = group.placed.model
+    shift = given._shifts(model)[[1, 4]].max() / (model.factor()[0] if rescale else 1.0)
+    assert said.kind == "given_contradicted" and said.names("given") == ("control 1", "control 4")
+    assert said.number("shift") == pytest.approx(shift)
+    fixed = replace(
+        group, placed=replace(group.placed, points=group.placed.points.with_stated(np.zeros((6, 3, 3))))
+    )
+    assert given._doubtful(task, fixed).number("shift") == pytest.approx(given._shifts(model)[[1, 4]].max())
+    _, several = judged_group("doubtful shift", doubtful=(1, 4))
+    assert "shift" not in given._doubtful(task, several).numbers
+
+
+def test_strained_points_name_the_axis() -> None:
+    task, group = judged_group("strained group", doubtful=(0, 1, 2, 3, 4, 5))
+    strain = Strain(STRAINS[1], np.diag([1.0, 1.02, 1.0]), "Y", 30.0)
+    said = given._doubtful(task, replace(group, placed=replace(group.placed, strain=strain)))
+    assert said.kind == "given_strained" and said.names("axis") == ("Y",)
+    assert said.number("elongation") == pytest.approx(2.0) and said.number("fitting") == 30.0
+
+
+def test_points_that_are_left_out_state_their_distance_from_the_others() -> None:
+    """Of each without the other ones that are left out; the farthest counts."""
+    _, group = judged_group("left out", wrong=(1, 4))
+    said = given._left_out(group, "mm")
+    model = group.placed.model
+    pairs = [(model.kept((b,)).difference(a)) for a, b in ((1, 4), (4, 1))]
+    d, covariance = max(pairs, key=lambda pair: float(np.linalg.norm(pair[0])))
+    length = float(np.linalg.norm(d))
+    assert said.number("distance") == pytest.approx(length)
+    along = d / length
+    assert said.number("sigmas") == pytest.approx(length / np.sqrt(along @ covariance @ along))
+    assert said.names("given") == ("control 1", "control 4")
