@@ -215,12 +215,13 @@ class CameraFamily(OfPhotographs):
             of_each = self._of_each(beta.reshape(-1, len(self.places)), half)
             return {**of_each, "parameters": tuple(np.array(camera.names)[varying])}
         linear = one.pattern == "linear"
-        sign = 1.0 if linear or one.factor[one.photographs[0]] > 0 else -1.0
+        grows = linear or one.factor[one.photographs[0]] > 0  # where the factor is 1, or in the others
         # a column of 1 moves an image point at the edge by 1 px
         largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
         parts: Parts = {"photographs": tuple(a.network.images[i] for i in one.photographs)}
         if abs(largest * float(beta[0])) > SEEN_PX:
-            parts["change"] = (100 * sign * largest * float(beta[0]) / half, "%")
+            change = 100 * largest * float(beta[0]) / half
+            parts["change"] = (change if grows else -change, "%")
         if one.among is not None and not one.among.all():
             parts["camera"] = camera.shared_name
         if len(beta) > 2 and not linear and np.hypot(beta[1], beta[2]) > SEEN_PX:
