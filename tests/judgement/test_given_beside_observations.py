@@ -136,3 +136,29 @@ def test_the_one_scale_of_bars_that_several_kinds_contradict_is_open(
         assert len(found.network.scale_bars) == 0
     else:
         assert len(found.network.scale_bars) == bars
+
+
+@pytest.mark.parametrize(
+    ("control", "centres", "kind"),
+    [(False, False, "control"), (True, False, "control"), (False, True, "control"), (True, True, "free")],
+)
+def test_the_datum_stays_while_one_kind_of_given_points_is_used(
+    control: bool, centres: bool, kind: str, made: tuple[Network, Estimate, FreeNetwork]
+) -> None:
+    """Those that are mirrored are not; without any the datum is free."""
+    network, truth, free = made
+    mirror = np.array([1.0, 1.0, -1.0])
+    xyz = truth.points[:12] * (mirror if control else 1.0)
+    position = truth.position * (mirror if centres else 1.0)
+    variance = np.tile(np.diag([1e-6] * 3 + [np.inf] * 3), (6, 1, 1))
+    exterior = ExteriorObservations(np.arange(6), position, np.zeros((6, 3)), variance)
+    network = replace(network.with_control(network.points[:12], xyz, 1e-3), exterior=exterior)
+    found = judged(replace(network, observations=(), scale_bars=ScaleBars()), free, "control")
+    assert found.datum.kind == kind
+    assert [len(found.network.control), len(found.network.exterior)] == [
+        0 if control else 12,
+        0 if centres else 6,
+    ]
+    assert (found.placing is None) == (control and centres) and found.checks_handedness
+    of = [one.names("of")[0] for one in found.remarks if one.kind == "given_mirrored"]
+    assert of == [name for name, wrong in (("control", control), ("centres", centres)) if wrong]

@@ -588,3 +588,12 @@ def test_values_that_are_right_predict_the_others_as_they_would_together(fixed: 
     without = beside.kept((0,)).chi2 + model.part(right).kept().chi2
     assert without == pytest.approx(model.kept((3,)).chi2, rel=1e-8)
     assert model.beside(np.zeros(9, dtype=bool)) is model
+
+
+def test_a_coordinate_without_error_leaves_the_reliability_of_its_point() -> None:
+    """One of two coordinates is exact, of the network and as given: the covariance is singular."""
+    A = np.tile(np.eye(2), (4, 1))
+    stated = np.diag([1.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    model = GivenModel(np.zeros(8), np.zeros((8, 8)), stated, A, np.repeat(np.arange(4), 2), 100)
+    reach = model.external()
+    assert np.isfinite(reach[1:]).all() and reach[1] == pytest.approx(reach[2]) and reach[0] > 0
