@@ -18,7 +18,7 @@ from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.distributions import normal_ppf
 from sfm.judgement import verdict as verdicts
-from sfm.judgement.bundle_statistics import Given
+from sfm.judgement.bundle_statistics import Given, statistics_of
 from sfm.judgement.checks import ControlCoordinate, LongestResidual, sigma0_of
 from sfm.network import ScaleBars
 from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
@@ -290,3 +290,26 @@ def test_only_given_image_points_have_stated_standard_deviations(
     photograph: Any = SimpleNamespace(image="image 1", blur=None, camera="")
     verdict = verdicts.judge_survey(result_of(a, photographs=(photograph,) if measured else ())).verdict
     assert bool(of_kind(verdict.remarks, "image_sigmas")) != measured
+
+
+@pytest.mark.parametrize(("bars", "named"), [(1, False), (5, True)])
+def test_a_kind_of_given_values_that_scatters_more_than_stated_is_named(bars: int, named: bool) -> None:
+    """Not a single value, and none of a kind that was judged against the free network."""
+    rng = seed_of("scattering bars")
+    network, truth = make_network(rng, images=6, points=14, free=("c",))
+    start, end = np.arange(bars), np.arange(bars) + 7
+    length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1)
+    off = 0.02 * np.array([1.0, -1.0, 1.0, -1.0, 1.0])[:bars]
+    given = ScaleBars(start, end, length + off, np.full(bars, 1e-3))
+    network = network.with_control(network.points[:8], truth.points[:8], 1e-3)
+    a = adjust(replace(network, scale_bars=given), truth, datum=Datum("control"), reject="none")
+    statistics = statistics_of(a)
+    found = [one for one in verdicts._kinds(statistics, set(), LEVEL) if one.names("of") == ("scale bars",)]
+    assert len(found) == named
+    for one in found:
+        place = statistics.kinds.names.index("scale bars")
+        assert (
+            one.number("factor") == pytest.approx(statistics.kinds.sigma0[place]) and one.number("factor") > 5
+        )
+    others = verdicts._kinds(statistics, {"scale"}, LEVEL)
+    assert ("scale bars",) not in [one.names("of") for one in others]
