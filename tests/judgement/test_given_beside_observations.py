@@ -10,15 +10,18 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.judgement.given import free_network
 from sfm.judgement.given import judge as given
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.tables import Contradiction, Table
-from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars
+from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, values_of
+from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT
 from sfm.observations.point_pairs import HeightDifferences
 from sfm.remarks.remark import kinds_of
 from sfm.similarity import Similarity
+from tests.rigs import make_rig
 from tests.synthetic import make_network, observed_anew, seed_of
 
 UNCHANGED = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -162,3 +165,19 @@ def test_the_datum_stays_while_one_kind_of_given_points_is_used(
     assert (found.placing is None) == (control and centres) and found.checks_handedness
     of = [one.names("of")[0] for one in found.remarks if one.kind == "given_mirrored"]
     assert of == [name for name, wrong in (("control", control), ("centres", centres)) if wrong]
+
+
+@pytest.mark.parametrize("size", [0.5, 4.0])
+def test_motions_of_unknowns_are_those_of_a_similarity(size: float) -> None:
+    """A rotation turns image axes with the network, and a scale lengthens the bases of rigs."""
+    _, truth = make_rig(seed_of("motions"), moments=3)
+    assert truth.mounts is not None
+    values, centre = values_of(truth), np.array([1.0, -2.0, 0.5])
+    found = free_network._motions(values, truth, centre, size)
+    np.testing.assert_allclose(found[PHOTOGRAPH][:, 3:, 3:6] * size, values.M)
+    assert not found[PHOTOGRAPH][:, 3:, [0, 1, 2, 6]].any()
+    np.testing.assert_allclose(found[PHOTOGRAPH][:, :3, 6] * size, values.position - centre)
+    np.testing.assert_allclose(found[POINT][:, :, 6] * size, values.points - centre)
+    bases = np.where(truth.mounts.free[:, :3], values.mount_position, 0.0)
+    np.testing.assert_allclose(found[MOUNT][:, :3, 6] * size, bases)
+    assert not found[MOUNT][:, 3:].any() and not found[MOUNT][:, :, :6].any() and bases.any()

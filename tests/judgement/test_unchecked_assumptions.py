@@ -187,6 +187,14 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
         ]
         assert {one.pattern for one in found} == ({pattern} if pattern else set())
         assert all(np.flatnonzero(one.factor).tolist() == [7] for one in found)
+        assert all(one.search == pytest.approx(np.log(own)) for one in found)
+        others = [
+            one
+            for one in unchecked._typical(a, reduced)
+            if one.among is not None and one.among.sum() == 8 - own and one.family.of_camera
+        ]
+        assert {one.pattern for one in others} == {"split"}
+        assert all(one.search == pytest.approx(np.log(8 - own - 3)) for one in others)
 
 
 def test_cameras_too_many_to_test_are_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
