@@ -13,6 +13,7 @@ import sfm
 from sfm.adjustment.result import Adjustment
 from sfm.camera import tangents_from_pixel
 from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.estimate import Estimate
 from sfm.judgement.calibrated_cameras import (
     CalibratedCamera,
     calibrated_cameras,
@@ -23,7 +24,6 @@ from sfm.judgement.calibrated_cameras import (
     rigs_of,
 )
 from sfm.judgement.checks import precision_of
-from sfm.network import Estimate
 from sfm.remarks.remark import remark
 from sfm.result import SurveyResult
 from tests.rigs import make_rig

@@ -10,13 +10,14 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.estimate import Estimate, values_of
 from sfm.judgement.given import free_network
 from sfm.judgement.given import judge as given
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.tables import Contradiction, Table
-from sfm.network import Estimate, ExteriorObservations, Network, ScaleBars, values_of
+from sfm.network import ExteriorObservations, Network, ScaleBars
 from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT
 from sfm.observations.point_pairs import HeightDifferences
 from sfm.remarks.remark import kinds_of

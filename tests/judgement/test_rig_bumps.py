@@ -14,6 +14,7 @@ from sfm.adjustment.solve import adjust
 from sfm.camera import project
 from sfm.conventions import angles_from_rotation, rotation_from_angles
 from sfm.distributions import chi2_isf, chi2_sf, level_of_single
+from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.bumps import (
     Bump,
     _difference,
@@ -24,7 +25,7 @@ from sfm.judgement.hypotheses.bumps import (
     bump_remarks,
     find_bumps,
 )
-from sfm.network import Estimate, Network
+from sfm.network import Network
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 

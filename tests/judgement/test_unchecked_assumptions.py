@@ -19,7 +19,7 @@ from sfm.judgement.hypotheses.alternatives import count_alternatives, interiors,
 from sfm.judgement.hypotheses.columns import columns_of, interior_columns
 from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
-from sfm.remarks.remark import kinds_of, of_kind
+from sfm.remarks.remark import of_kind
 from sfm.similarity import fit_similarity, without_motions
 from sfm.survey.inputs.sources import TEXTURE
 from tests.synthetic import make_network, observed_anew, seed_of
