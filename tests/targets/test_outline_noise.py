@@ -28,6 +28,7 @@ from sfm.targets.fits.outline_noise import (
     harmonics,
     judge_outlines,
     moderate,
+    most_telling,
     rise_to_first,
 )
 from sfm.targets.fits.undamaged import _stands_out
@@ -99,14 +100,16 @@ def test_eight_targets_show_a_common_shape() -> None:
         np.testing.assert_allclose(common_shape(h, np.ones_like(h), np.ones(k, bool)), expected)
 
 
-def test_blobs_of_texture_do_not_make_their_shape_the_usual_one() -> None:
-    """A target of 10 px and full contrast tells some 600 times as much of an outline as a blob of 2.5 px."""
-    shape, other = 0.001 * harmonics(4, 4)[:, 0], 0.04 * harmonics(3, 3)[:, 0]
-    h = np.vstack([np.tile(shape, (10, 1)), np.tile(other, (40, 1))])
-    weight = np.repeat([600.0, 1.0], [10, 40])[:, None] * np.ones((1, RAYS))
-    np.testing.assert_allclose(common_shape(h, weight, np.ones(50, bool)), shape)
+def test_blobs_of_texture_do_not_make_their_outlines_the_usual_ones() -> None:
+    """A px of the edge of a target of full contrast tells some 50 times as much as one of a blob."""
+    information = np.concatenate([np.linspace(40, 60, 10), np.linspace(0.5, 2, 40)])
+    sound = np.arange(50) != 3
+    np.testing.assert_array_equal(most_telling(sound, information), sound & (np.arange(50) < 10))
     few = np.arange(50) >= 5  # five targets do not show what is usual, however many blobs there are
-    np.testing.assert_allclose(common_shape(h, weight, few), 0.0)
+    assert most_telling(few, information).sum() < MIN_POPULATION
+    alike = np.linspace(1, 8, 50)  # targets of one make in uneven light
+    assert most_telling(sound, alike) is sound
+    assert not most_telling(np.zeros(50, bool), information).any()
 
 
 def test_targets_are_found_among_texture() -> None:
@@ -122,6 +125,10 @@ def test_targets_are_found_among_texture() -> None:
         codes = sheet.scene.targets.code[truth.visible].tolist()
         off = [read[code] - shown[code] for code in codes if code in read]
         assert len(off) >= len(codes) - 1 >= 6 and np.abs(off).max() < 0.1
+        stated = dict(zip(found.code.tolist(), found.covariance, strict=True))
+        C = np.array([stated[code] for code in codes if code in read])
+        squares = np.einsum("ka,kab,kb->k", off, np.linalg.inv(C), off)
+        assert 0.5 < math.sqrt(squares.mean() / 2) < 2.0
 
 
 def test_a_common_shape_in_a_gap_shifts_the_centre() -> None:

@@ -241,28 +241,30 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
     return damaged
 
 
-def common_shape(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
-    """Return the median deviation of sound outlines in each sector, radii, (RAYS,); 0 if they are few.
+def most_telling(sound: BoolArray, information: FloatArray) -> BoolArray:
+    """Return which targets represent the usual, (k,): those that are sound, unless most tell next to nothing.
 
-    A photograph of texture shows more blobs than targets, each too small and faint to tell the shape of an
-    outline. They would make theirs the usual one, and all targets would seem damaged. The median bears
-    others up to half of all: where more than half tell next to nothing, it is weighted.
+    A photograph of texture shows more blobs than targets, whose faint edges tell little of an outline. They
+    would make theirs the usual one: all targets would seem damaged, or as rough as the blobs.
+    If all sound ones tell no more than half of them could, those below the mean do not count.
+
+    Args:
+        sound: targets that are not unlike targets, shape (k,).
+        information: of a px of their edges, shape (k,).
 
     Source: Kish (1965), Survey Sampling (number of equal weights that tell as much).
     """
-    common = np.zeros(h.shape[1])
-    for j in range(h.shape[1]):
-        seen = np.flatnonzero(sound & (weight[:, j] > 0))
-        w = weight[seen, j]
-        number = w.sum() ** 2 / max((w**2).sum(), 1e-300)
-        if number >= len(seen) / 2:
-            w, number = np.ones(len(seen)), len(seen)
-        if number >= MIN_POPULATION:
-            order = np.argsort(h[seen, j], kind="stable")
-            sums = np.cumsum(w[order]) / w.sum()
-            low, high = np.searchsorted(sums, [0.5 - 1e-12, 0.5 + 1e-12])
-            common[j] = np.mean(h[seen[order[[low, high]]], j])
-    return common
+    w = information[sound]
+    if w.sum() ** 2 >= len(w) / 2 * (w**2).sum():
+        return sound
+    return np.asarray(sound & (information >= w.mean()))
+
+
+def common_shape(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
+    """Return the median deviation of sound outlines in each sector, radii, (RAYS,); 0 if they are few."""
+    seen = sound[:, None] & (weight > 0)
+    enough = seen.sum(axis=0) >= MIN_POPULATION
+    return np.array([np.median(h[seen[:, j], j]) if enough[j] else 0.0 for j in range(RAYS)])
 
 
 def gap_shifts(common: FloatArray, weight: FloatArray, keep: BoolArray) -> FloatArray:

@@ -26,6 +26,7 @@ from sfm.targets.fits.outline_noise import (
     find_damage,
     gap_shifts,
     judge_outlines,
+    most_telling,
     outline_shape,
     rise_to_first,
 )
@@ -263,10 +264,13 @@ def _deviations(
     sound = fitted & keep.all(axis=1) & ~np.any([unlike for _, unlike in against], axis=0)
     if fitted.any():
         sound &= contrast > MIN_CONTRAST_SHARE * np.percentile(contrast[fitted], 90)
+    squares = fits.sectors[:, 1]
+    # of deviations in px for each px of the edge: seen as well, a large outline tells no more than a small one
+    of_edge = squares.sum(axis=1) / np.maximum(_radii(fits.theta), 1.0) ** 3
+    sound = most_telling(sound, of_edge / np.maximum(variance, max(variance_of_noise, 1e-12)))
     if sound.sum() >= MIN_POPULATION:
         variance = np.minimum(variance, np.median(variance[sound] / contrast[sound] ** 2) * contrast**2)
     variance = np.maximum(variance, variance_of_noise)
-    squares = fits.sectors[:, 1]
     weight = np.where(fitted[:, None], squares / np.maximum(variance, 1e-12)[:, None], 0.0)
     h = np.divide(fits.sectors[:, 0], squares, out=np.zeros_like(squares), where=weight > 0)
     common = common_shape(h, weight, sound)
