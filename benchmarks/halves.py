@@ -113,7 +113,7 @@ def _of_centres(
     covariance = np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
     if correlation is not None:
         relative = whole.usual_px * np.linalg.inv(np.linalg.cholesky(seen.covariance))
-        covariance += correlated_sum(seen.image, seen.xy, relative, Z, correlation)
+        covariance += correlated_sum(seen.image, seen.xy, relative, Z, correlation, network.may_correlate)
     predicted = np.diagonal(covariance).reshape(draws, -1).sum(axis=1)
     size = np.repeat(np.sqrt(predicted), 3 * m)
     sigma = np.sqrt(((covariance / np.outer(size, size)) ** 2).sum() / 2) / draws  # of a root near 1

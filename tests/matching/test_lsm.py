@@ -138,6 +138,33 @@ def test_shift_model_on_patches_that_are_only_shifted() -> None:
     assert (e**2 / matches.covariance[:, [0, 1], [0, 1]]).mean() == pytest.approx(1, abs=0.3)
 
 
+def test_a_window_of_a_plane_whose_tilt_is_wrong() -> None:
+    """Nothing else of its warp is estimated; windows that are only shifted take the tilt for a shift."""
+    pairs, left, right = _pairs()
+    rng = np.random.default_rng(3)
+    angle = rng.uniform(0, 2 * np.pi, PATCHES)
+    along = np.column_stack([np.cos(angle), np.sin(angle)])
+    wrong = np.eye(2) + along[:, :, None] * rng.uniform(-0.05, 0.05, (PATCHES, 1, 2))
+    start = pairs.linear @ wrong
+
+    def over_stated(matches: LsmMatches) -> float:
+        e = matches.xy - pairs.centre - pairs.shift
+        return float(np.sqrt(np.einsum("ki,kij,kj->k", e, np.linalg.inv(matches.covariance), e).mean() / 2))
+
+    shift, affine = (
+        match_lsm(left, right, pairs.centre, pairs.centre, start=start, model=model)
+        for model in ("shift", "affine")
+    )
+    tilt = match_lsm(
+        left, right, pairs.centre, pairs.centre, start=start, model="tilt", along=rng.uniform(1, 9) * along
+    )
+    assert over_stated(tilt) == pytest.approx(over_stated(affine), abs=3 * UNCERTAIN)
+    assert over_stated(shift) > 1.5 * over_stated(tilt)
+    assert tilt.warp[:, :2, :2] == pytest.approx(pairs.linear, abs=0.05)
+    variances = [np.trace(one.covariance, axis1=1, axis2=2) for one in (tilt, affine)]
+    assert (variances[0] < 1.02 * variances[1]).all() and variances[0].mean() < 0.97 * variances[1].mean()
+
+
 def test_without_noise_the_warp_itself_is_found() -> None:
     pairs = affine_pairs(4, 30, grain_px=3.0)
     matches = match_lsm(pairs.left, pairs.right, pairs.centre, pairs.centre, stop_px=1e-6)
@@ -192,6 +219,8 @@ def test_bad_input_is_refused_in_one_line() -> None:
         match_lsm(photograph, photograph, at, at, window_px=20)
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, model="helmert")
+    with pytest.raises(GeometryError, match=r"epipolar lines of shape \(\), needed \(1, 2\) for a tilt"):
+        match_lsm(photograph, photograph, at, at, model="tilt")
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, interpolation="sinc")
     with pytest.raises(GeometryError, match="1 point in the left photograph, 2 in the right"):

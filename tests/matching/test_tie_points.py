@@ -62,7 +62,7 @@ from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.covering_points import _returning, find_covering_points
+from sfm.survey.measuring.covering_points import _epipolar_lines, _returning, find_covering_points
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
 from sfm.textbook.matching import match_along_line
@@ -414,12 +414,14 @@ def test_matches_that_do_not_come_back_are_refused() -> None:
     there = project(truth.cameras[0], truth.position[1], truth.rotation[1], truth.points)
     match = match_lsm(left, right, at, there, window_px=15, blur=True)
     assert match.good.sum() > 15
-    good = _returning(left, right, at, match, Windows(15))
+    camera, warp = np.zeros(len(photographs), dtype=np.int64), match.warp
+    along = _epipolar_lines(truth, camera, 0, 1, truth.points, np.where(np.isfinite(warp), warp, np.eye(3)))
+    good = _returning(left, right, at, match, along, Windows(15))
     assert good.sum() >= match.good.sum() - 2
     first, *_ = np.flatnonzero(good).tolist()
     moved = match.xy.copy()
     moved[first] += [1.0, 0.0]
-    again = _returning(left, right, at, replace(match, xy=moved), Windows(15))
+    again = _returning(left, right, at, replace(match, xy=moved), along, Windows(15))
     assert not again[first] and again.sum() == good.sum() - 1
 
 

@@ -214,6 +214,7 @@ def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one
         ({15: (265, 0.359), 11: (274, 0.316), 21: (10, 0.01)}, Windows(11)),  # too few of 21 px
         ({15: (265, 0.359), 11: (274, 0.316), -15: (820, 0.28), -21: (610, 0.25)}, Windows(15, "shift")),
         ({15: (265, 0.359), -15: (320, 0.35), -21: (610, 0.15)}, Windows(21, "shift")),
+        ({15: (1000, 0.05), -15: (1050, 0.047), -21: (500, 0.05)}, Windows(15)),  # hardly better: not shown
         ({}, Windows(15)),
     ],
 )
@@ -223,7 +224,7 @@ def test_windows_are_taken_whose_rays_together_are_precise(
     """Rays and their spread on two photographs by side (negative: shifts), four sides apart in each case."""
 
     def trial(*_: object, windows: Windows, **__: object) -> CoveringPoints:
-        rays, spread = found.get(windows.side_px * (1 if windows.model == "affine" else -1), (0, 1.0))
+        rays, spread = found.get(windows.side_px * (1 if windows.model == "tilt" else -1), (0, 1.0))
         seen = ImagePoints(*(np.zeros((rays, *shape)) for shape in ((), (), (2,), (2, 2))))
         return CoveringPoints(seen, np.zeros((0, 3)), np.full((rays, 2), spread), rays)
 

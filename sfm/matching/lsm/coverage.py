@@ -29,7 +29,7 @@ class Windows:
     """Windows of least squares matching."""
 
     side_px: int  # odd
-    model: str = "affine"  # or shift, for which the linear part of the warp comes from the surface plane
+    model: str = "tilt"  # or shift, for which the tilt comes from the plane through the tie points
 
 
 def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:

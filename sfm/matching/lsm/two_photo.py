@@ -4,7 +4,7 @@ The patch T around a point of the left photograph is related to the right photog
 
     S(H x) = alpha + beta T(x) + noise
 
-for x in the window, with a geometric model H (shift, affine or projective) and two radiometric parameters.
+for x in the window, with a geometric model H (shift, tilt, affine or projective) and two radiometric ones.
 Gauss-Newton is written in its inverse form. The change dH of a step is applied to the template, whose
 gradients and normal equations then stay the same in all steps, and H is updated by H <- H dH^-1. The right
 photograph is resampled in every step. The gradients are symmetric differences of the resampled template. At
@@ -41,6 +41,7 @@ from sfm.matching.lsm.patch_equations import (
     BLUR_NOISE,
     MODELS,
     RADIOMETRIC,
+    SHIFT,
     SLOPE_NOISE,
     Workspace,
     area_ratio,
@@ -116,6 +117,7 @@ def match_lsm(
     min_correlation: float = 0.5,
     blur: bool = False,
     start: FloatArray | None = None,
+    along: FloatArray | None = None,
     threads: int = 1,
 ) -> LsmMatches:
     """Match points of the left photograph in the right one, from positions known to a pixel or two.
@@ -125,7 +127,8 @@ def match_lsm(
         right: the other photograph.
         xy_left: points in the left photograph, px, any fraction, (k, 2).
         xy_right: approximate positions of these points in the right photograph, px, (k, 2).
-        model: shift (2), affine (6) or projective (8 parameters), each with gain and offset.
+        model: shift (2), tilt (4), affine (6) or projective (8 parameters), each with gain and offset. The
+            tilt of a plane is all that is unknown of its warp in oriented photographs.
         window_px: odd side of the template.
         interpolation: kernel for the right photograph. On fine texture the standard deviation is 1.25 times
             that of six_tap with bilinear, and 1.06 times with bicubic. If the whole patch is shifted by the
@@ -140,13 +143,15 @@ def match_lsm(
             windows move by 0.01 px, in the same way in all matches of a template.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model keeps; by default the unit matrix.
+        along: for tilt: directions of the epipolar lines in the left photograph, of any length, (k, 2).
         threads: number of threads that share the patches.
 
     Returns:
         One match per point; the covariance assumes the same noise in both photographs, after the gain.
 
     Raises:
-        GeometryError: an unknown model or kernel, an even window, or different numbers of points.
+        GeometryError: an unknown model or kernel, an even window, different numbers of points, or a tilt
+            without epipolar lines.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
     Computer and Robot Vision II, ch. 16; the inverse form is Baker and Matthews (2004), IJCV 56(3).
@@ -169,6 +174,10 @@ def match_lsm(
     given = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
     if given.shape not in ((k, 2, 2), (k, 3, 3)):
         raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")
+    if model == "tilt" and (along is None or np.shape(along) != (k, 2)):
+        raise GeometryError(f"LSM: epipolar lines of shape {np.shape(along)}, needed ({k}, 2) for a tilt")
+    lines = np.zeros((k, 2)) if along is None else np.array(along, dtype=float)
+    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), np.finfo(float).tiny)
     warp = np.zeros((k, 3, 3))
     warp[:, : given.shape[1], : given.shape[1]] = given
     warp[:, 2, 2] = 1.0
@@ -178,7 +187,7 @@ def match_lsm(
     limits = Limits(float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
 
     def work(part: slice) -> None:
-        _match_all(*fixed, limits, a[part], warp[part], out[part])
+        _match_all(*fixed, limits, a[part], lines[part], warp[part], out[part])
 
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:
@@ -206,12 +215,14 @@ def _match_all(
     blurred: int,
     limits: Limits,
     xy: FloatArray,
+    along: FloatArray,
     warp: FloatArray,
     out: FloatArray,
 ) -> None:
     """Match the patches one by one; `warp` changes from start to solution, `out` receives the columns."""
     work = new_workspace(half, kind, geometric, blurred)
     for i in range(len(xy)):
+        work.along[:] = along[i]
         out[i, FLAG] = prepare_template(left, xy[i, 0], xy[i, 1], work)
         if out[i, FLAG] == MATCHED:
             out[i, FLAG] = _iterate(right, work, limits, warp[i], out[i])
@@ -234,7 +245,7 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         for a in range(len(q)):
             rhs[a] = q[a] = dot(work.J[a], work.patch)
         solve_factorised(work.L, q)
-        length = put_step(H, q, half, work.geometric)
+        length = put_step(H, q, half, work.geometric, work.along)
         if not length < np.inf:
             return DIVERGED
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
@@ -320,7 +331,7 @@ def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> Flo
     second = (half + 1.0) / (3.0 * half)  # mean squares of the window coordinates; below, their fourth powers
     fourth = second * (3.0 * half * half + 3.0 * half - 1.0) / (5.0 * half * half)
     for a in range(geometric):
-        if a < 2:
+        if a < SHIFT:
             clean[a, a] -= noise
         elif a < 6:
             clean[a, a] -= noise * second

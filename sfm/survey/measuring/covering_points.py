@@ -38,6 +38,7 @@ SCALES = (0.4, 2.5)  # smallest and largest scale of a window relative to the re
 BORDER_PX = 4  # between a window and the border of a photograph
 RETURN_FACTOR = 3.0  # largest return error of a match that is matched back, over the median error, in sigmas
 MIN_RAYS = 3  # of a point; two where only two photographs see the surface
+STEP = 1e-3  # towards the photograph, relative to the distance, that shows the direction of epipolar lines
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -211,6 +212,10 @@ def match_squares(
 ) -> SquareRays:
     """Measure the squares of a photograph in the others, those with the most similar direction first.
 
+    Position and tilt of a plane are unknown in oriented photographs, and nothing else of its warp. A tilt
+    that is assumed instead moves the depth of a window by the same in all photographs, which no residual
+    shows.
+
     Half of the noise of a match is that of the template, and is assigned to the reference, as in
     `tie_points`. If no third ray checks a match, it is also matched back.
     """
@@ -236,6 +241,7 @@ def match_squares(
         fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
         if not fits.any():
             return None
+        along = _epipolar_lines(estimate, camera, i, j, points[rows[fits]], warp[fits])
         match = match_lsm(
             template,
             photographs[j],
@@ -244,6 +250,7 @@ def match_squares(
             model=windows.model,
             window_px=windows.side_px,
             start=warp[fits],
+            along=along,
             max_shift_px=max_shift_px,
             min_correlation=MIN_CORRELATION,
             blur=True,
@@ -251,7 +258,7 @@ def match_squares(
         good = match.good
         if both_ways:
             at = squares.xy[rows[fits]]
-            good &= _returning(template, photographs[j], at, match, windows)
+            good &= _returning(template, photographs[j], at, match, along, windows)
         half = match.covariance[good] / 2
         back = np.linalg.inv(linear_part(match.warp[good]))
         seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
@@ -283,9 +290,31 @@ def match_squares(
     return SquareRays(seen.select(some), np.concatenate(scales)[some], np.concatenate(correlations)[some])
 
 
-def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, windows: Windows) -> BoolArray:
+def _epipolar_lines(
+    estimate: Estimate, camera: IntArray, i: int, j: int, points: FloatArray, warp: FloatArray
+) -> FloatArray:
+    """Return the directions in photograph i along which its windows move against photograph j, (k, 2).
+
+    Args:
+        estimate: interior and exterior orientation of all photographs.
+        camera: index of the camera of each photograph, (m,).
+        i: photograph of the windows.
+        j: the other photograph.
+        points: object points at the middles of the windows, (k, 3).
+        warp: homographies from i to j, (k, 3, 3).
+    """
+    nearer = points + STEP * (estimate.position[i] - points)
+    image = np.full(len(points), j)
+    moved = project_points(estimate, camera, image, nearer) - project_points(estimate, camera, image, points)
+    return np.asarray(np.linalg.solve(linear_part(warp), moved[:, :, None])[:, :, 0])
+
+
+def _returning(
+    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, along: FloatArray, windows: Windows
+) -> BoolArray:
     """Return which matches, matched back, return to their origin within the usual error, (k,)."""
     rows = np.flatnonzero(match.good)
+    linear = linear_part(match.warp[rows])
     back = match_lsm(
         other,
         template,
@@ -293,7 +322,8 @@ def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, w
         xy[rows],
         model=windows.model,
         window_px=windows.side_px,
-        start=np.asarray(np.linalg.inv(linear_part(match.warp[rows]))),
+        start=np.asarray(np.linalg.inv(linear)),
+        along=np.einsum("kab,kb->ka", linear, along[rows]),
         min_correlation=MIN_CORRELATION,
         blur=True,
     )

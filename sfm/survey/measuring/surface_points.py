@@ -44,12 +44,12 @@ from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 from sfm.targets.codes.plates import TargetFamily
 from sfm.targets.codes.rings import CodeFamily
 
-# Windows that are tried; the first of those with about the best precision is taken. Noise that is correlated
-# over several pixels hides the texture of small windows. Where texture is weak, the four parameters of an
-# affine warp weaken the shift, although the plane through the tie points gives them better: without them
-# varnished wood has three times as many matches with half the errors. Affine windows of 31 px measure the
-# mean depth of a curved surface, with the same error in all photographs; their standard deviation is 0.93 to
-# 1.8 times that of smaller ones.
+# Windows that are tried; the first of those with about the best precision is taken. Noise that is
+# correlated over several pixels hides the texture of small windows. Over large ones a surface is curved:
+# windows of 31 px measure its mean depth, with the same error in all photographs; their standard deviation
+# is 0.93 to 1.8 times that of smaller ones. Windows that are only shifted come last. They take the tilt of
+# the plane through the tie points, whose error is common to all rays and is shown by no residual. Where
+# texture is weak, an unknown tilt is worse: on varnished wood it leaves far fewer matches.
 TRIED_WINDOWS = (
     Windows(15),
     Windows(11),

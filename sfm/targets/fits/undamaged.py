@@ -265,7 +265,7 @@ def _deviations(
     if fitted.any():
         sound &= contrast > MIN_CONTRAST_SHARE * np.percentile(contrast[fitted], 90)
     squares = fits.sectors[:, 1]
-    # of deviations in px for each px of the edge: seen as well, a large outline tells no more than a small one
+    # of deviations in px, for a px of the edge: a large outline tells no more than a small one seen as well
     of_edge = squares.sum(axis=1) / np.maximum(_radii(fits.theta), 1.0) ** 3
     sound = most_telling(sound, of_edge / np.maximum(variance, max(variance_of_noise, 1e-12)))
     if sound.sum() >= MIN_POPULATION:
