@@ -219,7 +219,7 @@ def test_bad_input_is_refused_in_one_line() -> None:
         match_lsm(photograph, photograph, at, at, window_px=20)
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, model="helmert")
-    with pytest.raises(GeometryError, match=r"epipolar lines of shape \(\), needed \(1, 2\) for a tilt"):
+    with pytest.raises(GeometryError, match=r"epipolar lines of shape \(0,\), needed \(1, 2\) for a tilt"):
         match_lsm(photograph, photograph, at, at, model="tilt")
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, interpolation="sinc")

@@ -174,9 +174,9 @@ def match_lsm(
     given = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
     if given.shape not in ((k, 2, 2), (k, 3, 3)):
         raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")
-    if model == "tilt" and (along is None or np.shape(along) != (k, 2)):
-        raise GeometryError(f"LSM: epipolar lines of shape {np.shape(along)}, needed ({k}, 2) for a tilt")
-    lines = np.zeros((k, 2)) if along is None else np.array(along, dtype=float)
+    lines = np.zeros((k, 2)) if model != "tilt" else np.array([] if along is None else along, dtype=float)
+    if lines.shape != (k, 2):
+        raise GeometryError(f"LSM: epipolar lines of shape {lines.shape}, needed ({k}, 2) for a tilt")
     lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), np.finfo(float).tiny)
     warp = np.zeros((k, 3, 3))
     warp[:, : given.shape[1], : given.shape[1]] = given
