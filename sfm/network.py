@@ -312,7 +312,7 @@ class Network:
         return replace(self, scale_bars=added)
 
     def with_observations(self, *kinds: Kind) -> Network:
-        """Return the network with further observations, of the kinds of `sfm.observations` or of one's own.
+        """Return the network with further observations, of kinds of `sfm.observations` or one's own.
 
         Args:
             kinds: observations of one kind each, by index of the points and photographs of the network.
