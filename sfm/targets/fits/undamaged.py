@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -185,11 +185,12 @@ def _repaired(
     judged = _least_curvature(fits.theta) > MIN_CURVATURE_BLURS * fits.theta[:, BLUR]
     usual: list[FloatArray] = []
     for _ in range(ROUNDS):
-        h, weight, _, sound, _ = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+        seen = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+        weight, sound = seen.weight, seen.sound
         # Those of whole targets: a cross in the middle of every dot is usual, though most are left out.
         usual = usual or [values[sound] for values in _unexplained(fits, sound, least_variance)]
         skirt = np.ceil(SKIRT_BLURS * fits.theta[:, BLUR] * RAYS / (2 * math.pi * _radii(fits.theta)))
-        damaged = find_damage(h, weight, sound, skirt)
+        damaged = find_damage(seen.h, weight, sound, skirt)
         shallow = goodness.HALO_PX + goodness.EDGE_ENDS_BLURS * fits.theta[:, BLUR]
         deep = np.isinf(depth) & (shallow < _radii(fits.theta))
         deep &= _has_marks_inside(fits, sound)
@@ -203,9 +204,8 @@ def _repaired(
         repaired = fit(begin, sign[again], keep[again], depth[again])
         for whole, part in zip(fits, repaired, strict=True):
             whole[again] = part
-    h, weight, common, sound, outlines = _deviations(
-        fits, keep, variance_of_noise + least_variance, least_variance
-    )
+    seen = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+    weight, sound, telling = seen.weight, seen.sound, seen.telling
     cut = ~keep.all(axis=1)
     small = _radii(fits.theta) < MIN_RADIUS_PX
     fits.flag[cut | np.isfinite(depth)] |= Flag.DAMAGED.value
@@ -219,7 +219,7 @@ def _repaired(
         )
         marks &= (unexplained[2] > 1) & np.isinf(depth)
         fits.flag[((more & relative & judged) | marks) & weight.any(axis=1)] |= Flag.POOR_FIT.value
-    shift = gap_shifts(common, weight, keep)
+    shift = gap_shifts(seen.common, weight, keep)
     p, q, r = fits.theta[:, P : R + 1].T
     with np.errstate(divide="ignore", invalid="ignore"):
         px = np.array([r * shift[:, 0] - q * shift[:, 1], p * shift[:, 1] - q * shift[:, 0]]) / (
@@ -229,8 +229,9 @@ def _repaired(
     # A mark inside that was left out may reach the edge, where it pulls the centre as far as it stands out.
     rest = np.where(np.isfinite(depth), np.maximum(_marks(fits, goodness.TOGETHER, sound), 1.0), 1.0)
     softness = fits.theta[:, BLUR] / _radii(fits.theta)
-    rise = rise_to_first(h[sound], weight[sound], float(np.median(softness[sound])) if sound.any() else 0.0)
-    noise = judge_outlines(outlines, variance, sound, softness, rise)
+    usual_softness = float(np.median(softness[telling])) if telling.any() else 0.0
+    rise = rise_to_first(seen.h[telling], weight[telling], usual_softness)
+    noise = judge_outlines(seen.outlines, variance, telling, softness, rise)
     return fits, variance, noise._replace(factor=noise.factor * rest**2)
 
 
@@ -240,13 +241,24 @@ def _variances(fits: EllipseFits, least: float) -> FloatArray:
     return np.asarray(np.maximum(squares / np.maximum(pixels - UNKNOWNS, 1), least))
 
 
+class _Deviations(NamedTuple):
+    """Outlines of targets, and which of them are usual."""
+
+    h: FloatArray  # deviation in each sector without the common shape, radii, (k, RAYS)
+    weight: FloatArray  # of each deviation, (k, RAYS)
+    common: FloatArray  # common shape, radii, (RAYS,)
+    sound: BoolArray  # targets that are not unlike targets, (k,)
+    telling: BoolArray  # those of them that tell what an outline is, (k,)
+    outlines: OutlineShape
+
+
 def _deviations(
     fits: EllipseFits, keep: BoolArray, variance_of_noise: float, least_variance: float
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, OutlineShape]:
-    """Return deviations of outlines without the common shape, weights, the common shape, sound targets.
+) -> _Deviations:
+    """Return the deviations of outlines.
 
-    The harmonics of the outlines are returned last. Damage that was not left out increases the variance of a
-    target; the variance is therefore limited to the usual one.
+    Damage that was not left out increases the variance of a target; the variance is therefore limited to the
+    usual one.
     """
     fitted, contrast = np.isfinite(fits.cofactor[:, 0, 0]), np.abs(fits.theta[:, CONTRAST])
     variance = _variances(fits, least_variance)
@@ -267,14 +279,14 @@ def _deviations(
     squares = fits.sectors[:, 1]
     # of deviations in px, for a px of the edge: a large outline tells no more than a small one seen as well
     of_edge = squares.sum(axis=1) / np.maximum(_radii(fits.theta), 1.0) ** 3
-    sound = most_telling(sound, of_edge / np.maximum(variance, max(variance_of_noise, 1e-12)))
+    telling = most_telling(sound, of_edge / np.maximum(variance, max(variance_of_noise, 1e-12)))
     if sound.sum() >= MIN_POPULATION:
         variance = np.minimum(variance, np.median(variance[sound] / contrast[sound] ** 2) * contrast**2)
     variance = np.maximum(variance, variance_of_noise)
     weight = np.where(fitted[:, None], squares / np.maximum(variance, 1e-12)[:, None], 0.0)
     h = np.divide(fits.sectors[:, 0], squares, out=np.zeros_like(squares), where=weight > 0)
-    common = common_shape(h, weight, sound)
-    return h - common, weight, common, sound, outlines
+    common = common_shape(h, weight, telling)
+    return _Deviations(h - common, weight, common, sound, telling, outlines)
 
 
 def _unexplained(
