@@ -135,7 +135,7 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
     Raises:
         BackendError: a group is free in part, or in some of the cameras that are not fixed as a whole.
     """
-    found: set[tuple[bool, bool, bool]] = set()
+    settings: set[tuple[bool, bool, bool]] = set()
     for camera in cameras:
         if not camera.free.any():
             continue
@@ -145,10 +145,10 @@ def colmap_free(cameras: tuple[Camera, ...]) -> tuple[bool, bool, bool]:
                 raise BackendError(
                     f"camera {camera.name}: its {name} is partly free; COLMAP frees all of it or nothing"
                 )
-        found.add((bool(groups[0].any()), bool(groups[1].any()), bool(groups[2].any())))
-    if len(found) > 1:
+        settings.add((bool(groups[0].any()), bool(groups[1].any()), bool(groups[2].any())))
+    if len(settings) > 1:
         raise BackendError("cameras with different free parameters: COLMAP frees the same in all of them")
-    return found.pop() if found else (False, False, False)
+    return settings.pop() if settings else (False, False, False)
 
 
 def load_pycolmap() -> ModuleType:
@@ -170,8 +170,8 @@ def load_pycolmap() -> ModuleType:
         raise BackendError(
             f"pycolmap cannot be imported ({one_line(error)}): pip install 'pycolmap=={needed}.*'"
         ) from error
-    found = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
-    if found != NEEDED_VERSION:
+    installed = tuple(int(part) for part in pycolmap.__version__.split(".")[:2])
+    if installed != NEEDED_VERSION:
         raise BackendError(
             f"pycolmap {pycolmap.__version__} is installed, {needed} is needed: "
             f"pip install 'pycolmap=={needed}.*'"
@@ -288,16 +288,18 @@ def covariance_with_colmap(
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, scene)
         wanted = pycolmap.BACovarianceOptions()
         wanted.damping = 0.0
-        found = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
-        if found is None:
+        covariances = pycolmap.estimate_ba_covariance(wanted, scene, adjuster)
+        if covariances is None:
             return None
         interior = []
         for k, camera in enumerate(estimate.cameras):
-            block = found.get_other_params_cov(scene.camera(k + 1).params) if camera.free.any() else None
+            block = (
+                covariances.get_other_params_cov(scene.camera(k + 1).params) if camera.free.any() else None
+            )
             interior.append(np.zeros((0, 0)) if block is None else np.array(block))
         points = np.zeros((len(network.points), 3, 3))  # held points have none
         for j in range(len(network.points)):
-            block = found.get_point_cov(j + 1)
+            block = covariances.get_point_cov(j + 1)
             if block is not None:
                 points[j] = block
     return ColmapCovariance(tuple(interior), points)
@@ -308,9 +310,9 @@ def adjust_with_covariance(network: Network, start: Estimate, *, threads: int = 
 
     Args, Raises: as `adjust_with_colmap`.
     """
-    found = adjust_with_colmap(network, start, threads=threads)
-    covariance = covariance_with_colmap(network, found.estimate)
-    return replace(found, point_covariance=None if covariance is None else covariance.points)
+    adjusted = adjust_with_colmap(network, start, threads=threads)
+    covariance = covariance_with_colmap(network, adjusted.estimate)
+    return replace(adjusted, point_covariance=None if covariance is None else covariance.points)
 
 
 @dataclass(frozen=True)

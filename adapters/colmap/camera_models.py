@@ -22,7 +22,7 @@ from pydantic import Field
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
-from sfm.conventions import BoolArray
+from sfm.conventions import BoolArray, IntArray
 from sfm.errors import OutputError, SurveyFileError
 from sfm.estimate import Estimate, Mounts
 from sfm.files.open_folders import disk_errors, refuse_links_out
@@ -98,7 +98,7 @@ def _refuse_incomplete(pycolmap: ModuleType, folder: Path, scene: Any, *, text: 
     try:
         check_model_files(folder, text=text)
         written = _opened(pycolmap, folder, text=text)
-        whole = all(
+        complete = all(
             getattr(written, count)() == getattr(scene, count)()
             for count in ("num_images", "num_points3D", "compute_num_observations")
         )
@@ -106,8 +106,8 @@ def _refuse_incomplete(pycolmap: ModuleType, folder: Path, scene: Any, *, text: 
         refuse_full(folder)
         raise OutputError(str(error)) from error
     except (ValueError, RuntimeError, IndexError, OSError):
-        whole = False
-    if not whole:
+        complete = False
+    if not complete:
         refuse_full(folder)
         raise OSError(errno.EIO, "what COLMAP wrote cannot be read back")
 
@@ -218,24 +218,27 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     image_ids = sorted(scene.images)
     images = [scene.image(i) for i in image_ids]
     point_ids = sorted(scene.point3D_ids())
-    names = side.points
-    index = {j: k for k, j in enumerate(point_ids)}
-    seen = [np.zeros((0, 4))]  # an array for each photograph takes less memory than lists of all
-    for i, image in enumerate(images):
-        try:
-            rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
-        except KeyError as error:
-            raise SurveyFileError(
-                f"image {image_ids[i]} has a key point of point {error}, which is not in the model"
-            ) from error
-        seen.append(np.array(rows, dtype=float).reshape(-1, 4))
-    table = np.concatenate(seen)
     poses = [
         image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
     ]
     M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
-    # COLMAP's text format loses the part of a photograph's name after a space.
+    network = Network(
+        _labels_of(image_ids, images, side),
+        np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),
+        tuple(side.points.get(str(j), str(j)) for j in point_ids),
+        _image_points_of(image_ids, images, point_ids),
+    )
+    points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
+    if mounts is not None:
+        moment = _moments_of(images, network, mounts)
+        refuse_moments("frames", [camera.name for camera in cameras], network, mounts, moment)
+        network = replace(network, moment=moment)
+    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points, mounts)
+
+
+def _labels_of(image_ids: list[int], images: list[Any], side: Names) -> tuple[str, ...]:
+    """Return the names of photographs, of which COLMAP's text format loses the part after a space."""
     full = {i: side.images.get(str(i), "") for i in image_ids}
     short = [image.name for image in images]
     labels = tuple(
@@ -249,29 +252,39 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     duplicate = next((name for name, count in Counter(labels).items() if count > 1), None)
     if duplicate is not None:
         raise SurveyFileError(f"more than one photograph has the name '{shorten(duplicate)}'")
-    network = Network(
-        labels,
-        np.searchsorted(camera_ids, [image.camera_id for image in images]).astype(np.int64),
-        tuple(names.get(str(j), str(j)) for j in point_ids),
-        ImagePoints(
-            table[:, 0].astype(np.int64),
-            table[:, 1].astype(np.int64),
-            table[:, 2:] - HALF_PIXEL,
-            np.tile(np.eye(2), (len(table), 1, 1)),
-            np.zeros(len(table), dtype=bool),
-        ),
+    return labels
+
+
+def _image_points_of(image_ids: list[int], images: list[Any], point_ids: list[int]) -> ImagePoints:
+    """Return the key points of photographs that belong to a point."""
+    index = {j: k for k, j in enumerate(point_ids)}
+    seen = [np.zeros((0, 4))]  # an array for each photograph takes less memory than lists of all
+    for i, image in enumerate(images):
+        try:
+            rows = [(i, index[p.point3D_id], p.x(), p.y()) for p in image.points2D if p.has_point3D()]
+        except KeyError as error:
+            raise SurveyFileError(
+                f"image {image_ids[i]} has a key point of point {error}, which is not in the model"
+            ) from error
+        seen.append(np.array(rows, dtype=float).reshape(-1, 4))
+    table = np.concatenate(seen)
+    return ImagePoints(
+        table[:, 0].astype(np.int64),
+        table[:, 1].astype(np.int64),
+        table[:, 2:] - HALF_PIXEL,
+        np.tile(np.eye(2), (len(table), 1, 1)),
+        np.zeros(len(table), dtype=bool),
     )
-    points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
-    if mounts is not None:
-        frames = [
-            (image.frame_id,) if mounts.rig[a] else ("", i)
-            for i, (image, a) in enumerate(zip(images, network.camera, strict=True))
-        ]
-        number = {frame: t for t, frame in enumerate(dict.fromkeys(frames))}
-        moment = np.array([number[frame] for frame in frames], dtype=np.int64)
-        refuse_moments("frames", [camera.name for camera in cameras], network, mounts, moment)
-        network = replace(network, moment=moment)
-    return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points, mounts)
+
+
+def _moments_of(images: list[Any], network: Network, mounts: Mounts) -> IntArray:
+    """Return the moment of each photograph: its frame, or its own for a camera without a rig."""
+    frames = [
+        (image.frame_id,) if mounts.rig[a] else ("", i)
+        for i, (image, a) in enumerate(zip(images, network.camera, strict=True))
+    ]
+    number = {frame: t for t, frame in enumerate(dict.fromkeys(frames))}
+    return np.array([number[frame] for frame in frames], dtype=np.int64)
 
 
 def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
@@ -286,7 +299,7 @@ def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:
     for number, rig in sorted(scene.rigs.items()):
         at_rig = rig.ref_sensor_id
         poses = {at_rig.id: pycolmap.Rigid3d()} if at_rig.type == pycolmap.SensorType.CAMERA else {}
-        for sensor, pose in sorted(rig.non_ref_sensors.items(), key=lambda one: one[0].id):
+        for sensor, pose in sorted(rig.non_ref_sensors.items(), key=lambda entry: entry[0].id):
             if sensor.type == pycolmap.SensorType.CAMERA:
                 poses[sensor.id] = pose
         if len(poses) < 2:

@@ -198,7 +198,7 @@ def read_rows(path: Path) -> DatabaseRows:
         index = {number: i for i, number in enumerate(numbers)}
         keypoints = reader.keypoints(images, index)
         pairs = reader.matches("two_view_geometries", index, keypoints)
-        if not any(len(found) for _, _, found in pairs):
+        if not any(len(matches) for _, _, matches in pairs):
             pairs = reader.matches("matches", index, keypoints)
     return DatabaseRows(cameras, images, owners, keypoints, pairs)
 
@@ -247,10 +247,10 @@ def _refuse_other_files(path: Path) -> int:
     if header[:16] != b"SQLite format 3\0" or len(header) < HEADER_BYTES:
         raise SurveyFileError(f"{path}, line 1: not a COLMAP database (not an SQLite file)")
     page = int.from_bytes(header[16:18], "big")
-    whole = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
-    if size < whole:
+    stated = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if size < stated:
         raise SurveyFileError(
-            f"{path}: the file is cut off, it has {size} of the {whole} bytes stated in its header"
+            f"{path}: the file is cut off, it has {size} of the {stated} bytes stated in its header"
         )
     return size
 
@@ -280,7 +280,7 @@ class _Reader:
         Raises:
             SurveyFileError: an impossible size, or impossible parameters.
         """
-        found, names = [], tuple(MODELS)
+        cameras, names = [], tuple(MODELS)
         for where, row in self._rows("cameras", "camera_id, model, width, height, params"):
             number = self._whole(where, "camera_id", row[0], MAX_ID)
             model = names[self._whole(where, "model", row[1], len(names) - 1)]
@@ -293,8 +293,8 @@ class _Reader:
             params = self._array(where, row[4], "<f8", 1, MODELS[model]).ravel()
             if not ((np.abs(params) <= MAX_NUMBER).all() and params[0] > 0):
                 raise self._error(where, "params are not the parameters of a camera")
-            found.append(DatabaseCamera(number, model, width, height, params))
-        return tuple(found)
+            cameras.append(DatabaseCamera(number, model, width, height, params))
+        return tuple(cameras)
 
     def images(self, camera: dict[int, int]) -> tuple[list[int], tuple[str, ...], IntArray]:
         """Return numbers and names of the photographs, and the index of the camera of each.
@@ -321,7 +321,7 @@ class _Reader:
         Raises:
             SurveyFileError: keypoints of an unknown photograph, too many, or not finite.
         """
-        found: list[FloatArray] = [np.zeros((0, 2))] * len(images)
+        keypoints: list[FloatArray] = [np.zeros((0, 2))] * len(images)
         count = 0
         for where, (number, rows, columns, data) in self._rows("keypoints", "image_id, rows, cols, data"):
             if number not in index:
@@ -337,8 +337,8 @@ class _Reader:
                     f"{self.path}: a keypoint of {images[index[number]]} is not a finite number of at most "
                     f"{MAX_NUMBER:g}"
                 )
-            found[index[number]] = xy
-        return tuple(found)
+            keypoints[index[number]] = xy
+        return tuple(keypoints)
 
     def matches(
         self, table: str, index: dict[int, int], keypoints: tuple[FloatArray, ...]
@@ -348,7 +348,7 @@ class _Reader:
         Raises:
             SurveyFileError: a pair of unknown photographs, a missing keypoint, or too many matches.
         """
-        found, count = [], 0
+        pairs, count = [], 0
         for where, (number, rows, columns, data) in self._rows(table, "pair_id, rows, cols, data"):
             first, second = divmod(self._whole(where, "pair_id", number, PAIRS**2), PAIRS)
             if first not in index or second not in index:
@@ -362,8 +362,8 @@ class _Reader:
                 raise self._error(where, f"more than {MAX_ROWS} matches, no more are read")
             if (matches >= (len(keypoints[a]), len(keypoints[b]))).any():
                 raise SurveyFileError(f"{self.path}: a match names a keypoint that is not there ({where})")
-            found.append((a, b, matches))
-        return tuple(found)
+            pairs.append((a, b, matches))
+        return tuple(pairs)
 
     def _rows(self, table: str, columns: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
         """Yield the location and the content of each row, in the order of the first column."""

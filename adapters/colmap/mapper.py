@@ -81,10 +81,10 @@ def map_photographs(
                     extraction_options=extraction,
                 )
             pycolmap.match_exhaustive(database, matching_options=matching)
-            found = pycolmap.incremental_mapping(database, folder, work, pipeline)
-            if not found:
+            models = pycolmap.incremental_mapping(database, folder, work, pipeline)
+            if not models:
                 raise BackendError("COLMAP's mapper found no model: too few matches between the photographs")
-            best = max(found.values(), key=lambda scene: scene.num_reg_images())
+            best = max(models.values(), key=lambda scene: scene.num_reg_images())
             (work / "best").mkdir()
             best.write_binary(str(work / "best"))
             network, estimate = read_model(work / "best")

@@ -82,14 +82,14 @@ def _add_cameras(
 ) -> dict[int, tuple[int, Any]]:
     """Add cameras and rigs to a scene; return the rig of each rigged camera, and the camera from the rig."""
     names = ("",) * len(estimate.cameras) if mounts is None else mounts.rig
-    found: dict[int, tuple[int, Any]] = {}
+    rigs: dict[int, tuple[int, Any]] = {}
     for k, camera in enumerate(estimate.cameras):
         if names[k]:
             scene.add_camera(colmap_camera(pycolmap, camera, k + 1))
         else:
             scene.add_camera_with_trivial_rig(colmap_camera(pycolmap, camera, k + 1))
     if mounts is None:
-        return found
+        return rigs
     for number, on in enumerate(mounts.by_rig().values()):
         rig = pycolmap.Rig(rig_id=len(names) + number + 1)
         for k in on:
@@ -99,9 +99,9 @@ def _add_cameras(
                 rig.add_ref_sensor(sensor)
             else:
                 rig.add_sensor(sensor, from_rig)
-            found[k] = rig.rig_id, from_rig
+            rigs[k] = rig.rig_id, from_rig
         scene.add_rig(rig)
-    return found
+    return rigs
 
 
 def _add_frame(
@@ -156,21 +156,21 @@ def with_colmap_parameters(camera: Camera, params: Any) -> Camera:
     return camera.with_parameters(np.array(params) - HALF_PIXEL * camera.plays(Role.X0, Role.Y0))
 
 
-def camera_of(found: Any) -> Camera:
+def camera_of(scene_camera: Any) -> Camera:
     """Return a COLMAP camera as a Kolinear camera in the same model, with pixel size 1.
 
     Raises:
         BackendError: a COLMAP model that Kolinear does not read.
     """
-    model = str(found.model_name).lower()
+    model = str(scene_camera.model_name).lower()
     if model not in COLMAP_NAMES:
         raise BackendError(
-            f"camera {found.camera_id}: COLMAP's model {found.model_name} is not read, expected one of "
-            f"{', '.join(COLMAP_NAMES.values())}; make perspective photographs of it first"
+            f"camera {scene_camera.camera_id}: COLMAP's model {scene_camera.model_name} is not read, "
+            f"expected one of {', '.join(COLMAP_NAMES.values())}; make perspective photographs of it first"
         )
-    size = int(found.width), int(found.height)
-    camera = Camera(str(found.camera_id), model, size, np.ones(2), np.zeros(len(MODELS[model].names)))
-    return with_colmap_parameters(camera, found.params)
+    size = int(scene_camera.width), int(scene_camera.height)
+    camera = Camera(str(scene_camera.camera_id), model, size, np.ones(2), np.zeros(len(MODELS[model].names)))
+    return with_colmap_parameters(camera, scene_camera.params)
 
 
 def as_opencv(camera: Camera) -> Camera:

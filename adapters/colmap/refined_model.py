@@ -58,8 +58,8 @@ def open_model(folder: Path) -> OpenModel:
     camera_ids, image_ids = sorted(scene.cameras), sorted(scene.images)
     same = [camera_of(scene.camera(i)) for i in camera_ids]
     cameras = tuple(
-        camera if camera.model == one.model else replace(one, name=camera.name)
-        for one, camera in zip(same, estimate.cameras, strict=True)
+        camera if camera.model == original.model else replace(original, name=camera.name)
+        for original, camera in zip(same, estimate.cameras, strict=True)
     )
     slots = [
         np.array([k for k, p in enumerate(scene.image(i).points2D) if p.has_point3D()], dtype=np.int64)
@@ -79,7 +79,8 @@ def open_model(folder: Path) -> OpenModel:
 def place_model(model: OpenModel, object_from_model: Similarity) -> OpenModel:
     """Return a model in another frame and scale, including its rigs; its scene is changed in place."""
     pycolmap = load_pycolmap()
-    model.scene.transform(_sim3d(pycolmap, object_from_model))
+    rotation = pycolmap.Rotation3d(object_from_model.rotation)
+    model.scene.transform(pycolmap.Sim3d(object_from_model.scale, rotation, object_from_model.translation))
     return replace(model, estimate=object_from_model.apply_estimate(model.estimate))
 
 
@@ -164,13 +165,8 @@ def interior_rows(
         sigma = np.full(len(camera.names), np.nan)
         if len(covariance[k]):  # none without photographs
             sigma[camera.free] = np.sqrt(np.diagonal(covariance[k]))
-        values = (colmap_parameters(one.cameras[k]).tolist() for one in (before, after))
+        values = (colmap_parameters(estimate.cameras[k]).tolist() for estimate in (before, after))
         rows += [
-            (number, model.models[k], *one) for one in zip(camera.names, *values, sigma.tolist(), strict=True)
+            (number, model.models[k], *row) for row in zip(camera.names, *values, sigma.tolist(), strict=True)
         ]
     return tuple(rows)
-
-
-def _sim3d(pycolmap: Any, similarity: Similarity) -> Any:
-    """Return a similarity as a pycolmap.Sim3d."""
-    return pycolmap.Sim3d(similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation)

@@ -21,8 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adapters.reading.text_lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray
+from sfm.camera import camera_from_values
 from sfm.distortion.models import Role
 from sfm.errors import OutputError
 from sfm.estimate import Estimate
@@ -83,13 +82,19 @@ def read_bal(path: Path, *, size_px: tuple[int, int] | None = None) -> tuple[Net
     width, height = 2 * np.ceil(np.abs(xy).max(axis=0) + 1).astype(int)
     size = (int(width), int(height)) if size_px is None else size_px
     M = Rotation.from_rotvec(cams[:, :3]).as_matrix()
-    cameras = tuple(_camera(f"{i}", cams[i, 6:], size) for i in range(m))
+    cameras = tuple(
+        camera_from_values(
+            f"{i}", "radial", size, (1.0, 1.0), c_mm=f, free=FREE, values=(("k1", k1), ("k2", k2))
+        )
+        for i, (f, k1, k2) in enumerate(cams[:, 6:].tolist())
+    )
+    centre = (np.asarray(size, dtype=float) - 1) / 2
     network = Network(
         tuple(f"{i}" for i in range(m)),
         np.arange(m, dtype=np.int64),
         tuple(f"{j}" for j in range(n)),
         ImagePoints(
-            image, point, _centre(size) + xy * (1, -1), np.tile(np.eye(2), (k, 1, 1)), np.zeros(k, dtype=bool)
+            image, point, centre + xy * (1, -1), np.tile(np.eye(2), (k, 1, 1)), np.zeros(k, dtype=bool)
         ),
     )
     position = -np.einsum("iba,ib->ia", M, cams[:, 3:6])
@@ -135,14 +140,3 @@ def write_bal(path: Path, network: Network, estimate: Estimate) -> None:
         lines += [f"{value:.16e}" for value in values]
     lines += [f"{value:.16e}" for value in estimate.points.ravel()]
     write_lines(path, lines)
-
-
-def _centre(size_px: tuple[int, int]) -> FloatArray:
-    return (np.asarray(size_px, dtype=float) - 1) / 2
-
-
-def _camera(name: str, values: FloatArray, size_px: tuple[int, int]) -> Camera:
-    f, k1, k2 = (float(value) for value in values)
-    return camera_from_values(
-        name, "radial", size_px, (1.0, 1.0), c_mm=f, free=FREE, values=(("k1", k1), ("k2", k2))
-    )

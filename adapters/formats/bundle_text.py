@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from array import array
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,6 +50,20 @@ INTERIOR = "interior.txt"
 OF_SIGMAS = "re"  # end of the name of their file in the thesis
 PIXEL_MM = 0.005  # nominal size of a pixel, since the files state none
 BORDER = 1.1  # sensor over the extent of the image points
+
+
+class _Stated(NamedTuple):
+    """What the files of both programs state."""
+
+    interior: tuple[float, float, float]  # c, x0, y0, mm
+    images: list[str]
+    exterior: list[list[float]]  # omega, phi, kappa (deg), XL, YL, ZL of each photograph
+    points: tuple[str, ...]
+    xyz: array[float]  # of the points
+    image: IntArray | array[int]  # photograph of each image point
+    point: IntArray | array[int]  # point of each image point
+    xy_mm: array[float]
+    sigma_mm: array[float] | None
 
 
 def read_bundle_matlab(
@@ -103,9 +118,10 @@ def read_bundle_matlab(
                 )
             sigma.extend(_positive(text, values))
         text.end()
-    interior = (c_mm, x0_mm, y0_mm)
     labels = tuple(f"{j + 1}" for j in range(len(ends) - 1))
-    return _network(names, exterior, labels, xyz, image, point, xy, sigma, interior)
+    return _network(
+        _Stated((c_mm, x0_mm, y0_mm), names, exterior, labels, xyz, image, point, xy_mm=xy, sigma_mm=sigma)
+    )
 
 
 def write_bundle_matlab(
@@ -168,9 +184,9 @@ def matlab_files(folder: Path) -> tuple[Path, Path, Path | None, Path]:
         SurveyFileError: one is missing.
     """
     cameras, points, sigmas = (folder / name for name in ("cams.txt", "pts.txt", "sigmas.txt"))
-    found = sorted(folder.glob(f"*_*{OF_SIGMAS}.txt"))
-    if not cameras.is_file() and len(found) == 1:
-        (sigmas,) = found
+    sigma_files = sorted(folder.glob(f"*_*{OF_SIGMAS}.txt"))
+    if not cameras.is_file() and len(sigma_files) == 1:
+        (sigmas,) = sigma_files
         points = sigmas.with_name(f"{sigmas.stem.removesuffix(OF_SIGMAS)}.txt")
         others = sorted(set(folder.glob(f"{points.stem.rpartition('_')[0]}_*.txt")) - {points, sigmas})
         cameras = others[0] if len(others) == 1 else cameras
@@ -198,8 +214,8 @@ def write_bundle_matlab_folder(folder: Path, network: Network, estimate: Estimat
     sigmas = folder / "sigmas.txt" if stated else None
     write_bundle_matlab(cameras, points, sigmas, network, estimate)
     camera = estimate.cameras[0]
-    values = _text(*(camera.value(name) for name in ("c", "x0", "y0")))
-    write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", values])
+    interior = _text(camera.value("c"), camera.value("x0"), camera.value("y0"))
+    write_lines(folder / INTERIOR, ["# c x0 y0 (mm), which the program asks for", interior])
 
 
 def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
@@ -253,7 +269,9 @@ def read_bundle_csharp(path: Path) -> tuple[Network, Estimate]:
         sigma.extend(_positive(text, values))
     text.end()
     image, point = np.tile(np.arange(m), n), np.repeat(np.arange(n), m)
-    return _network(names, exterior, tuple(labels), xyz, image, point, xy, sigma, (c, x0, y0))
+    return _network(
+        _Stated((c, x0, y0), names, exterior, tuple(labels), xyz, image, point, xy_mm=xy, sigma_mm=sigma)
+    )
 
 
 def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> None:
@@ -275,7 +293,7 @@ def write_bundle_csharp(path: Path, network: Network, estimate: Estimate) -> Non
         )
     camera = estimate.cameras[0]
     lines = [
-        _text(m, *(camera.value(name) for name in ("c", "x0", "y0"))),
+        _text(m, camera.value("c"), camera.value("x0"), camera.value("y0")),
         *_exterior_lines(network, estimate),
     ]
     lines.append(f"{n}")
@@ -325,41 +343,33 @@ def _positive(text: Lines, values: list[float]) -> list[float]:
     return values
 
 
-def _network(
-    names: list[str],
-    exterior: list[list[float]],
-    points: tuple[str, ...],
-    xyz: array[float],
-    image: IntArray | array[int],
-    point: IntArray | array[int],
-    xy_mm: array[float],
-    sigma_mm: array[float] | None,
-    interior: tuple[float, float, float],
-) -> tuple[Network, Estimate]:
-    xy = np.array(xy_mm).reshape(-1, 2)
+def _network(stated: _Stated) -> tuple[Network, Estimate]:
+    """Return what is stated as a network and its start values, with pixels of a nominal size."""
+    xy = np.array(stated.xy_mm).reshape(-1, 2)
     pixel = np.array([PIXEL_MM, PIXEL_MM])
     width, height = 2 * np.ceil(BORDER * np.abs(xy).max(axis=0) / pixel).astype(int)
     size = (int(width), int(height))
+    sigma_mm = stated.sigma_mm
     sigma = np.tile(pixel, (len(xy), 1)) if sigma_mm is None else np.array(sigma_mm).reshape(-1, 2)
-    c, x0, y0 = interior
+    c, x0, y0 = stated.interior
     camera = camera_from_values(
         "camera", "brown", size, (PIXEL_MM, PIXEL_MM), c_mm=c, values=(("x0", x0), ("y0", y0))
     )
-    table = np.array(exterior)
+    exterior = np.array(stated.exterior)
     network = Network(
-        tuple(names),
-        np.zeros(len(names), dtype=np.int64),
-        points,
+        tuple(stated.images),
+        np.zeros(len(stated.images), dtype=np.int64),
+        stated.points,
         ImagePoints(
-            np.array(image, dtype=np.int64),
-            np.array(point, dtype=np.int64),
+            np.array(stated.image, dtype=np.int64),
+            np.array(stated.point, dtype=np.int64),
             pixel_from_image(xy, size, pixel),
             np.eye(2) * (sigma / pixel)[:, None, :] ** 2,
             None if sigma_mm is not None else np.zeros(len(xy), dtype=bool),
         ),
     )
-    rotation = np.array([rotation_from_angles(*np.deg2rad(row[:3])) for row in table])
-    return network, Estimate((camera,), table[:, 3:].copy(), rotation, np.array(xyz).reshape(-1, 3))
+    rotation = np.array([rotation_from_angles(*np.deg2rad(row[:3])) for row in exterior])
+    return network, Estimate((camera,), exterior[:, 3:].copy(), rotation, np.array(stated.xyz).reshape(-1, 3))
 
 
 def _millimetres(network: Network, estimate: Estimate) -> tuple[FloatArray, FloatArray]:

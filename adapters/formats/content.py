@@ -42,12 +42,15 @@ class Content:
     notes: tuple[str, ...] = ()  # remarks on content that is read but not used unchanged
 
 
+Rows = Callable[[Content], FloatArray]
+
+
 class Kind(NamedTuple):
     """Content that a survey may have and a format may lack."""
 
     name: str  # as in the list of a format
     words: str  # for people, in the plural
-    rows: Callable[[Content], FloatArray]  # all its numbers, one row per item, (n, d)
+    rows: Rows  # all its numbers, one row per item, (n, d)
 
 
 def _points_of(known: ObjectPoints) -> FloatArray:
@@ -57,74 +60,15 @@ def _points_of(known: ObjectPoints) -> FloatArray:
     return np.asarray(rows[np.argsort(known.point, kind="stable")])
 
 
-def _control(content: Content) -> FloatArray:
-    return _points_of(content.result.network.control.complete)
-
-
-def _partial(content: Content) -> FloatArray:
-    control = content.result.network.control
-    rows = _points_of(control)
-    return np.asarray(rows[~np.isin(rows[:, 0], control.complete.point)])
-
-
-def _correlated(content: Content) -> FloatArray:
-    control = content.result.network.control
-    between = np.stack([control.covariance[:, row, column] for row, column in PAIRS], axis=1)
-    rows = np.concatenate([control.point[:, None], between], axis=1)[between.any(axis=1)]
-    return np.asarray(rows[np.argsort(rows[:, 0], kind="stable")])
-
-
-def _bars(content: Content) -> FloatArray:
-    bars = content.result.network.scale_bars
-    return np.stack([bars.start, bars.end, bars.length, bars.sigma], axis=1)
-
-
-def _exterior(content: Content) -> FloatArray:
-    seen = content.result.network.exterior
-    variance = np.einsum("eii->ei", seen.covariance)
-    value = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
-    return np.concatenate([seen.image[:, None], value, np.sqrt(variance)], axis=1)
-
-
-def _exterior_correlations(content: Content) -> FloatArray:
-    C = content.result.network.exterior.covariance
-    return _correlations(np.where(np.isfinite(C), C, 0.0))
-
-
 def _correlations(C: FloatArray) -> FloatArray:
     """Return matrix number, row, column and value of the nonzero elements above the diagonals, (n, 4)."""
     e, r, c = np.nonzero(np.triu(np.nan_to_num(C), 1))
     return np.stack([e, r, c, C[e, r, c]], axis=1)
 
 
-def _interior(content: Content) -> FloatArray:
-    seen = content.result.network.interior
-    return np.stack([seen.camera, seen.parameter, seen.value, seen.sigma], axis=1)
-
-
-def _interior_correlations(content: Content) -> FloatArray:
-    R = content.result.network.interior.correlation
-    return np.zeros((0, 4)) if R is None else _correlations(R[None])
-
-
-def _rejected(content: Content) -> FloatArray:
-    seen = content.rejected
-    return np.column_stack([seen.image, seen.point, seen.xy])
-
-
 def _by_image(content: Content) -> ImagePoints:
     seen = content.result.network.image_points
     return seen.select(np.lexsort((seen.point, seen.image)))
-
-
-def _image_sigmas(content: Content) -> FloatArray:
-    sigma = _by_image(content).stated_sigma
-    return np.asarray(sigma[np.isfinite(sigma).all(axis=1)])
-
-
-def _image_covariances(content: Content) -> FloatArray:
-    between = _by_image(content).stated_covariance
-    return np.asarray(between[between != 0][:, None])
 
 
 def _sigmas(covariance: FloatArray | None) -> FloatArray:
@@ -135,17 +79,142 @@ def _sigmas(covariance: FloatArray | None) -> FloatArray:
     return np.column_stack([np.flatnonzero(known), sigma[known]])
 
 
+def _names(names: tuple[str, ...], identify: bool) -> FloatArray:
+    kept = [name for name in names if identify and UNCODED.fullmatch(name) is None]
+    return np.array([crc32(name.encode()) for name in kept], dtype=float)[:, None]
+
+
+def _word(word: str) -> FloatArray:
+    return _names((word,) if word and word != NO_SCALE else (), True)
+
+
+KINDS: list[Kind] = []  # in the order in which losses are reported
+
+
+def _kind(name: str, words: str) -> Callable[[Rows], Rows]:
+    """Declare the numbers of a kind of content: a row of KINDS above the function that returns them."""
+
+    def declare(rows: Rows) -> Rows:
+        KINDS.append(Kind(name, words, rows))
+        return rows
+
+    return declare
+
+
+@_kind("exterior orientations", "exterior orientations")
+def _oriented(content: Content) -> FloatArray:
+    return np.flatnonzero(content.result.estimate.oriented)[:, None].astype(float)
+
+
+@_kind("object points", "coordinates of points")
+def _determined(content: Content) -> FloatArray:
+    return np.flatnonzero(content.result.estimate.determined)[:, None].astype(float)
+
+
+@_kind("control", "control points")
+def _control(content: Content) -> FloatArray:
+    return _points_of(content.result.network.control.complete)
+
+
+@_kind("partial control", "control points with coordinates that are not known")
+def _partial(content: Content) -> FloatArray:
+    control = content.result.network.control
+    rows = _points_of(control)
+    return np.asarray(rows[~np.isin(rows[:, 0], control.complete.point)])
+
+
+@_kind("control correlations", "correlations of control")
+def _correlated(content: Content) -> FloatArray:
+    control = content.result.network.control
+    between = np.stack([control.covariance[:, row, column] for row, column in PAIRS], axis=1)
+    rows = np.concatenate([control.point[:, None], between], axis=1)[between.any(axis=1)]
+    return np.asarray(rows[np.argsort(rows[:, 0], kind="stable")])
+
+
+@_kind("scale bars", "scale bars")
+def _bars(content: Content) -> FloatArray:
+    bars = content.result.network.scale_bars
+    return np.stack([bars.start, bars.end, bars.length, bars.sigma], axis=1)
+
+
+@_kind("exterior", "observed exterior orientations")
+def _exterior(content: Content) -> FloatArray:
+    seen = content.result.network.exterior
+    variance = np.einsum("eii->ei", seen.covariance)
+    value = np.where(np.isfinite(variance), np.hstack([seen.position, seen.angles]), np.nan)
+    return np.concatenate([seen.image[:, None], value, np.sqrt(variance)], axis=1)
+
+
+@_kind("exterior correlations", "covariances of observed exterior orientations")
+def _exterior_correlations(content: Content) -> FloatArray:
+    C = content.result.network.exterior.covariance
+    return _correlations(np.where(np.isfinite(C), C, 0.0))
+
+
+@_kind("interior", "weighted interior parameters")
+def _interior(content: Content) -> FloatArray:
+    seen = content.result.network.interior
+    return np.stack([seen.camera, seen.parameter, seen.value, seen.sigma], axis=1)
+
+
+@_kind("interior correlations", "correlations of weighted interior parameters")
+def _interior_correlations(content: Content) -> FloatArray:
+    R = content.result.network.interior.correlation
+    return np.zeros((0, 4)) if R is None else _correlations(R[None])
+
+
+@_kind("checks", "check points")
+def _checks(content: Content) -> FloatArray:
+    return _points_of(content.checks)
+
+
+@_kind("rejected", "rejected image points")
+def _rejected(content: Content) -> FloatArray:
+    seen = content.rejected
+    return np.column_stack([seen.image, seen.point, seen.xy])
+
+
+@_kind("image sigmas", "standard deviations of image points")
+def _image_sigmas(content: Content) -> FloatArray:
+    sigma = _by_image(content).stated_sigma
+    return np.asarray(sigma[np.isfinite(sigma).all(axis=1)])
+
+
+@_kind("image covariances", "covariances of x and y of image points")
+def _image_covariances(content: Content) -> FloatArray:
+    between = _by_image(content).stated_covariance
+    return np.asarray(between[between != 0][:, None])
+
+
+@_kind("point sigmas", "standard deviations of points")
+def _point_sigmas(content: Content) -> FloatArray:
+    return _sigmas(content.result.point_covariance)
+
+
+@_kind("position sigmas", "standard deviations of projection centres")
+def _position_sigmas(content: Content) -> FloatArray:
+    return _sigmas(content.result.position_covariance)
+
+
+@_kind("interior sigmas", "standard deviations of interior parameters")
+def _interior_sigmas(content: Content) -> FloatArray:
+    sigmas = content.result.interior_sigma or ()
+    rows = [
+        (k, s, v)
+        for k, of_camera in enumerate(sigmas)
+        for s, v in enumerate(of_camera.tolist())
+        if np.isfinite(v)
+    ]
+    return np.array(rows, dtype=float).reshape(-1, 3)
+
+
+@_kind("joint covariance", "rows of the covariance of all coordinates")
 def _joint(content: Content) -> FloatArray:
     Q = content.result.covariance
     return np.zeros((0, 3)) if Q is None else np.asarray(Q)
 
 
-def _interior_sigmas(content: Content) -> FloatArray:
-    sigmas = content.result.interior_sigma or ()
-    rows = [(k, s, v) for k, one in enumerate(sigmas) for s, v in enumerate(one.tolist()) if np.isfinite(v)]
-    return np.array(rows, dtype=float).reshape(-1, 3)
-
-
+@_kind("covariances", "covariances of exterior and interior orientation")
 def _full(content: Content) -> FloatArray:
     Q = content.result.exterior_covariance
     parts = [] if Q is None else [Q.reshape(len(Q), -1)]
@@ -153,6 +222,7 @@ def _full(content: Content) -> FloatArray:
     return np.concatenate([part.ravel() for part in parts])[:, None] if parts else np.zeros((0, 1))
 
 
+@_kind("rigs", "cameras on rigs")
 def _rigs(content: Content) -> FloatArray:
     estimate = content.result.estimate
     if estimate.mounts is None or content.result.network.moment is None:
@@ -165,6 +235,7 @@ def _rigs(content: Content) -> FloatArray:
     return np.asarray(rows[on])
 
 
+@_kind("moments", "photographs of one moment with others")
 def _moments(content: Content) -> FloatArray:
     """Return photographs taken at one moment, and the first photograph of that moment, (n, 2)."""
     moment = content.result.network.moment
@@ -175,37 +246,53 @@ def _moments(content: Content) -> FloatArray:
     return np.column_stack([together, first[of[together]]]).astype(float)
 
 
+@_kind("rig covariance", "rows of the covariance of mounts and interior orientation")
 def _rig_covariance(content: Content) -> FloatArray:
     Q = content.result.rig_covariance
     return np.zeros((0, 1)) if Q is None else np.asarray(Q)
 
 
+@_kind("statistics", "values of redundancy and sigma0")
 def _statistics(content: Content) -> FloatArray:
-    found = (content.result.redundancy, content.sigma0, content.sigma0_px)
-    return np.array([value for value in found if value is not None], dtype=float)[:, None]
+    statistics = (content.result.redundancy, content.sigma0, content.sigma0_px)
+    return np.array([value for value in statistics if value is not None], dtype=float)[:, None]
 
 
-def _names(names: tuple[str, ...], identify: bool) -> FloatArray:
-    kept = [name for name in names if identify and UNCODED.fullmatch(name) is None]
-    return np.array([crc32(name.encode()) for name in kept], dtype=float)[:, None]
+@_kind("datum", "kind of datum")
+def _datum(content: Content) -> FloatArray:
+    return _word(content.result.datum)
 
 
+@_kind("unit", "unit of lengths")
+def _unit(content: Content) -> FloatArray:
+    return _word(content.result.unit)
+
+
+@_kind("point names", "names of points")
+def _point_names(content: Content) -> FloatArray:
+    return _names(content.result.network.points, content.result.points_named)
+
+
+@_kind("uncoded", "marks of points as uncoded, which get numbers,")
 def _uncoded(content: Content) -> FloatArray:
     result = content.result
     rows = [j for j, name in enumerate(result.network.points) if UNCODED.fullmatch(name)]
     return np.array(rows if result.points_named else [], dtype=float)[:, None]
 
 
-def _word(word: str) -> FloatArray:
-    return _names((word,) if word and word != NO_SCALE else (), True)
+@_kind("image names", "names of photographs")
+def _image_names(content: Content) -> FloatArray:
+    return _names(content.result.network.images, content.result.images_named)
 
 
+@_kind("free", "settings of interior parameters as free")
 def _free(content: Content) -> FloatArray:
     cameras = content.result.estimate.cameras
     rows = [(k, s) for k, camera in enumerate(cameras) for s in np.flatnonzero(camera.free)]
     return np.array(rows, dtype=float).reshape(-1, 2)
 
 
+@_kind("shared", "interior parameters shared by cameras")
 def _shared(content: Content) -> FloatArray:
     """Return camera, parameter and the first camera of the group that shares it."""
     first: dict[tuple[str, int], int] = {}
@@ -217,57 +304,13 @@ def _shared(content: Content) -> FloatArray:
     return np.array(rows, dtype=float).reshape(-1, 3)
 
 
+@_kind("unplaced", "photographs and points without coordinates")
 def _unplaced(content: Content) -> FloatArray:
     estimate = content.result.estimate
     images, points = np.flatnonzero(~estimate.oriented), np.flatnonzero(~estimate.determined)
     return np.array([(0, i) for i in images] + [(1, j) for j in points], dtype=float).reshape(-1, 2)
 
 
-KINDS = (
-    Kind(
-        *("exterior orientations", "exterior orientations"),
-        lambda content: np.flatnonzero(content.result.estimate.oriented)[:, None].astype(float),
-    ),
-    Kind(
-        *("object points", "coordinates of points"),
-        lambda content: np.flatnonzero(content.result.estimate.determined)[:, None].astype(float),
-    ),
-    Kind("control", "control points", _control),
-    Kind("partial control", "control points with coordinates that are not known", _partial),
-    Kind("control correlations", "correlations of control", _correlated),
-    Kind("scale bars", "scale bars", _bars),
-    Kind("exterior", "observed exterior orientations", _exterior),
-    Kind("exterior correlations", "covariances of observed exterior orientations", _exterior_correlations),
-    Kind("interior", "weighted interior parameters", _interior),
-    Kind("interior correlations", "correlations of weighted interior parameters", _interior_correlations),
-    Kind("checks", "check points", lambda content: _points_of(content.checks)),
-    Kind("rejected", "rejected image points", _rejected),
-    Kind("image sigmas", "standard deviations of image points", _image_sigmas),
-    Kind("image covariances", "covariances of x and y of image points", _image_covariances),
-    Kind("point sigmas", "standard deviations of points", lambda c: _sigmas(c.result.point_covariance)),
-    Kind(
-        *("position sigmas", "standard deviations of projection centres"),
-        lambda content: _sigmas(content.result.position_covariance),
-    ),
-    Kind("interior sigmas", "standard deviations of interior parameters", _interior_sigmas),
-    Kind("joint covariance", "rows of the covariance of all coordinates", _joint),
-    Kind("covariances", "covariances of exterior and interior orientation", _full),
-    Kind("rigs", "cameras on rigs", _rigs),
-    Kind("moments", "photographs of one moment with others", _moments),
-    Kind("rig covariance", "rows of the covariance of mounts and interior orientation", _rig_covariance),
-    Kind("statistics", "values of redundancy and sigma0", _statistics),
-    Kind("datum", "kind of datum", lambda content: _word(content.result.datum)),
-    Kind("unit", "unit of lengths", lambda content: _word(content.result.unit)),
-    Kind("point names", "names of points", lambda c: _names(c.result.network.points, c.result.points_named)),
-    Kind("uncoded", "marks of points as uncoded, which get numbers,", _uncoded),
-    Kind(
-        *("image names", "names of photographs"),
-        lambda content: _names(content.result.network.images, content.result.images_named),
-    ),
-    Kind("free", "settings of interior parameters as free", _free),
-    Kind("shared", "interior parameters shared by cameras", _shared),
-    Kind("unplaced", "photographs and points without coordinates", _unplaced),
-)
 ALL = frozenset(kind.name for kind in KINDS)
 
 
@@ -290,7 +333,7 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
     result = content.result
     before, after = result.estimate.cameras, estimate.cameras
     gone: frozenset[str] = frozenset()
-    if any(one.model != other.model for one, other in zip(before, after, strict=True)):
+    if any(former.model != other.model for former, other in zip(before, after, strict=True)):
         gone |= CONVERTED
     if network.image_points is not result.network.image_points:
         gone |= CONVERTED | {"rejected"}
@@ -385,10 +428,11 @@ def _numbers(content: Content) -> Iterator[tuple[str, FloatArray]]:
         ("row of the correlations of interior parameters", network.interior.correlation),
         ("row of the covariance of the points", result.covariance),
         ("row of the covariance of mounts", result.rig_covariance),
-        *(("row of the covariance of a camera", Q) for Q in result.interior_covariance),
     ):
         if matrix is not None:
             yield what, matrix
+    for Q in result.interior_covariance:
+        yield "row of the covariance of a camera", Q
 
 
 def losses(content: Content, held: frozenset[str]) -> tuple[tuple[Kind, int], ...]:

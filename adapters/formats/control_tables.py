@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -65,68 +65,47 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     summary = read_json(folder / "summary.json", Statistics, "the summary of a result")
     if not path.is_file() or not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return GivenValues(
-            *(ScaleBars(), ObjectPoints(), (), ExteriorObservations()),
-            *(summary.sigma0 or 1.0, summary.sigma0_px),
+            ScaleBars(),
+            ObjectPoints(),
+            interior=(),
+            sigma0=summary.sigma0 or 1.0,
+            sigma0_px=summary.sigma0_px,
         )
     table = GIVEN.read(folder)
     table.refuse(table.values[:, 1:], table.values[:, 1:] < 0, ("sigma",), "0 or more, or nothing")
-    index = {name: j for j, name in enumerate(network.points)}
-    bars: list[tuple[int, int, float, float]] = []
-    control: dict[int, tuple[FloatArray, FloatArray]] = {}
-    interior = []
-    image = {name: i for i, name in enumerate(network.images)}
-    exterior: dict[int, tuple[FloatArray, FloatArray]] = {}
-    for kind, name, coordinate, (given, sigma) in zip(*table.texts, table.values.tolist(), strict=True):
-        if kind == "scale bar":
-            ends = _ends(name, index)
-            if ends is not None:
-                bars.append((*ends, given, sigma))
-        elif kind == "control point" and name in index and coordinate in ("X", "Y", "Z"):
-            xyz, C = control.setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
-            k = "XYZ".index(coordinate)
-            xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else np.inf
-        elif kind == CONTROL_COVARIANCE and index.get(name) in control and coordinate in COVARIANCE_PAIRS:
-            C, (row, column) = control[index[name]][1], map("XYZ".index, coordinate)
-            C[row, column] = C[column, row] = given
-        elif kind == "interior orientation":
-            parameter, _, camera = name.partition(" of camera ")
-            interior.append((camera, parameter, given, sigma))
-        elif kind in ("projection centre", "rotation") and name in image and coordinate in ORIENTATION:
-            value, variance = exterior.setdefault(image[name], (np.zeros(6), np.full(6, np.inf)))
-            k = ORIENTATION.index(coordinate)
-            factor = 1.0 if k < 3 else np.radians(1.0)
-            value[k], variance[k] = factor * given, (factor * sigma) ** 2
-    rows = np.array(bars, dtype=float).reshape(-1, 4)
+    given = [
+        _GivenValue(kind, name, coordinate, value, sigma)
+        for kind, name, coordinate, (value, sigma) in zip(*table.texts, table.values.tolist(), strict=True)
+    ]
     return GivenValues(
-        ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
-        object_points(control),
-        tuple(interior),
-        ExteriorObservations(
-            np.array(list(exterior), dtype=np.int64),
-            np.array([value[:3] for value, _ in exterior.values()]).reshape(-1, 3),
-            np.array([value[3:] for value, _ in exterior.values()]).reshape(-1, 3),
-            np.array([np.diag(variance) for _, variance in exterior.values()]).reshape(-1, 6, 6),
-        ),
+        _scale_bars(given, network),
+        _control(given, network),
+        _interior(given),
+        _exterior(given, network),
         summary.sigma0 or 1.0,
         summary.sigma0_px,
     )
 
 
-def object_points(found: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:
-    """Return points from their coordinates (3,) and covariances (3, 3), by their index in a network."""
-    return ObjectPoints(
-        np.array(list(found), dtype=np.int64),
-        np.array([xyz for xyz, _ in found.values()]).reshape(-1, 3),
-        np.array([C for _, C in found.values()]).reshape(-1, 3, 3),
-    )
+class _GivenValue(NamedTuple):
+    """A row of given.csv."""
+
+    kind: str
+    name: str
+    coordinate: str
+    value: float
+    sigma: float
 
 
-def write_given(folder: Path, network: Network, estimate: Estimate, unit: str) -> None:
-    """Write the given values of a network with standard deviations, without tests; no file without any."""
-    kinds = [kind for _, kind in given_residuals(network, estimate, unit)]
-    rows = list(given_rows(kinds, network, unit))
-    if rows:
-        GIVEN.write_rows(folder, rows)
+def _scale_bars(given: list[_GivenValue], network: Network) -> ScaleBars:
+    index = {name: j for j, name in enumerate(network.points)}
+    bars = [
+        (*ends, bar.value, bar.sigma)
+        for bar in given
+        if bar.kind == "scale bar" and (ends := _ends(bar.name, index)) is not None
+    ]
+    rows = np.array(bars, dtype=float).reshape(-1, 4)
+    return ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:
@@ -137,6 +116,65 @@ def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:
         if first in index and second in index:
             return index[first], index[second]
     return None
+
+
+def _control(given: list[_GivenValue], network: Network) -> ObjectPoints:
+    """Return the control points; the rows of covariances follow those of their points."""
+    index = {name: j for j, name in enumerate(network.points)}
+    control: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for kind, name, coordinate, value, sigma in given:
+        if kind == "control point" and name in index and coordinate in AXES:
+            xyz, C = control.setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
+            k = AXES.index(coordinate)
+            xyz[k], C[k, k] = value, sigma**2 if np.isfinite(sigma) else np.inf
+        elif kind == CONTROL_COVARIANCE and index.get(name) in control and coordinate in COVARIANCE_PAIRS:
+            C, (row, column) = control[index[name]][1], map(AXES.index, coordinate)
+            C[row, column] = C[column, row] = value
+    return object_points(control)
+
+
+def _interior(given: list[_GivenValue]) -> tuple[tuple[str, str, float, float], ...]:
+    """Return camera, parameter, value and sigma of the weighted interior parameters."""
+    weighted = []
+    for kind, name, _, value, sigma in given:
+        if kind == "interior orientation":
+            parameter, _, camera = name.partition(" of camera ")
+            weighted.append((camera, parameter, value, sigma))
+    return tuple(weighted)
+
+
+def _exterior(given: list[_GivenValue], network: Network) -> ExteriorObservations:
+    index = {name: i for i, name in enumerate(network.images)}
+    exterior: dict[int, tuple[FloatArray, FloatArray]] = {}  # values and variances by photograph
+    for kind, name, coordinate, value, sigma in given:
+        if kind in ("projection centre", "rotation") and name in index and coordinate in ORIENTATION:
+            values, variances = exterior.setdefault(index[name], (np.zeros(6), np.full(6, np.inf)))
+            k = ORIENTATION.index(coordinate)
+            factor = 1.0 if k < 3 else np.radians(1.0)
+            values[k], variances[k] = factor * value, (factor * sigma) ** 2
+    return ExteriorObservations(
+        np.array(list(exterior), dtype=np.int64),
+        np.array([values[:3] for values, _ in exterior.values()]).reshape(-1, 3),
+        np.array([values[3:] for values, _ in exterior.values()]).reshape(-1, 3),
+        np.array([np.diag(variances) for _, variances in exterior.values()]).reshape(-1, 6, 6),
+    )
+
+
+def object_points(values: dict[int, tuple[FloatArray, FloatArray]]) -> ObjectPoints:
+    """Return points from their coordinates (3,) and covariances (3, 3), by their index in a network."""
+    return ObjectPoints(
+        np.array(list(values), dtype=np.int64),
+        np.array([xyz for xyz, _ in values.values()]).reshape(-1, 3),
+        np.array([C for _, C in values.values()]).reshape(-1, 3, 3),
+    )
+
+
+def write_given(folder: Path, network: Network, estimate: Estimate, unit: str) -> None:
+    """Write the given values of a network with standard deviations, without tests; no file without any."""
+    kinds = [kind for _, kind in given_residuals(network, estimate, unit)]
+    rows = list(given_rows(kinds, network, unit))
+    if rows:
+        GIVEN.write_rows(folder, rows)
 
 
 def read_known_points(
@@ -159,17 +197,17 @@ def read_known_points(
         return control, ObjectPoints()
     table = CONTROL_POINTS.read(folder)
     index = {name: j for j, name in enumerate(network.points)}
-    found: dict[str, dict[int, tuple[FloatArray, FloatArray]]] = {"control": {}, "check": {}}
+    values: dict[str, dict[int, tuple[FloatArray, FloatArray]]] = {"control": {}, "check": {}}
     for use, name, axis, (given, sigma) in zip(*table.texts, table.values.tolist(), strict=True):
-        if use in found and name in index and axis in AXES and np.isfinite(given):
-            xyz, C = found[use].setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
+        if use in values and name in index and axis in AXES and np.isfinite(given):
+            xyz, C = values[use].setdefault(index[name], (np.zeros(3), np.diag(np.full(3, np.inf))))
             k = AXES.index(axis)
             xyz[k], C[k, k] = given, sigma**2 if np.isfinite(sigma) else 0.0
-    points = object_points(found["control"])
+    points = object_points(values["control"])
     covariance = points.covariance.copy()
     for j, C in zip(control.point, control.covariance, strict=True):  # correlations of what took part
         covariance[points.point == j] += np.where(np.eye(3, dtype=bool), 0.0, C)
-    return replace(points, covariance=covariance), object_points(found["check"])
+    return replace(points, covariance=covariance), object_points(values["check"])
 
 
 def _of_control(path: Path, network: Network) -> tuple[ObjectPoints, ObjectPoints]:
@@ -203,25 +241,24 @@ def write_known_points(
     path: Path, points: tuple[str, ...], control: ObjectPoints, checks: ObjectPoints
 ) -> None:
     """Write the table of control and check points, with empty cells for unknown coordinates."""
-    found: dict[int, tuple[FloatArray, FloatArray, BoolArray]] = {}
-    for one, flag in ((control, False), (checks, True)):
-        for j, xyz, C in zip(one.point.tolist(), one.xyz, one.covariance, strict=True):
+    cells: dict[int, tuple[FloatArray, FloatArray, BoolArray]] = {}
+    for known_points, flag in ((control, False), (checks, True)):
+        for j, xyz, C in zip(
+            known_points.point.tolist(), known_points.xyz, known_points.covariance, strict=True
+        ):
             known = np.isfinite(np.diagonal(C))
             unknown = (np.full(6, np.nan), np.zeros(3), np.zeros(3, dtype=bool))
-            row, between, check = found.setdefault(j, unknown)
+            row, between, check = cells.setdefault(j, unknown)
             row[:3][known], row[3:][known] = xyz[known], np.sqrt(np.diagonal(C)[known])
             between += [C[r, c] if known[r] and known[c] else 0.0 for r, c in PAIRS]
             check |= known & flag
-    correlated = any(between.any() for _, between, _ in found.values())
-    checked = any(check.any() for _, _, check in found.values())
-    rows = [
-        (
-            points[j],
-            *("" if np.isnan(v) else v for v in row.tolist()),
-            *(between.tolist() if correlated else ()),
-            *(check.astype(int).tolist() if checked else ()),
-        )
-        for j, (row, between, check) in found.items()
-    ]
+    correlated = any(between.any() for _, between, _ in cells.values())
+    checked = any(check.any() for _, _, check in cells.values())
+    rows = []
+    for j, (row, between, check) in cells.items():
+        values = ["" if np.isnan(value) else value for value in row.tolist()]
+        values += between.tolist() if correlated else []
+        values += check.astype(int).tolist() if checked else []
+        rows.append((points[j], *values))
     header = ("id", *AXES, *SIGMAS, *(COVARIANCES if correlated else ()), *(CHECKS if checked else ()))
     path.write_text(csv_text(header, rows), encoding="utf-8", newline="")

@@ -66,10 +66,12 @@ def write_dxf(
     Raises:
         OutputError: the file cannot be written.
     """
-    places = np.vstack([xyz, *(one.centre[None] for one in circles), *(one.start[None] for one in lines)])
+    centres = [circle.centre[None] for circle in circles]
+    places = np.vstack([xyz, *centres, *(line.start[None] for line in lines)])
     size = float(np.linalg.norm(np.ptp(places, axis=0))) if len(places) > 1 else 1.0
     height = TEXT_HEIGHT * (size or 1.0)
-    drawn = (*(one.layer for one in lines), *(one.layer for one in circles), *(one[0] for one in texts))
+    drawn = [line.layer for line in lines] + [circle.layer for circle in circles]
+    drawn += [layer for layer, _, _ in texts]
     used = dict.fromkeys(_layer(name) for name in ("0", *layers, *drawn))
     out: list[str] = []
 

@@ -53,7 +53,9 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
         elif path.suffix.lower() == ".stl":
             count = int.from_bytes(first[80:84], "little")
             binary = size == STL_HEADER + STL_RECORD * count and size > STL_HEADER
-            vertices, triangles = _binary_stl(path) if binary else _text_stl(path)
+            corners = _binary_corners(path) if binary else _text_corners(path)
+            vertices = corners.reshape(-1, 3)  # shared by no two triangles
+            triangles = np.arange(len(vertices), dtype=np.int64).reshape(-1, 3)
         else:
             raise SurveyFileError(f"{path}: unknown ending {path.suffix!r:.40}, a mesh is .stl or .ply")
     except OSError as error:
@@ -69,17 +71,14 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
     return vertices, triangles
 
 
-def _unconnected(corners: FloatArray) -> tuple[FloatArray, IntArray]:
-    return corners.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int64).reshape(-1, 3)
-
-
-def _binary_stl(path: Path) -> tuple[FloatArray, IntArray]:
+def _binary_corners(path: Path) -> FloatArray:
+    """Return the corners of the triangles of a binary STL file, (t, 3, 3)."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    table = np.fromfile(path, dtype=record, offset=STL_HEADER)
-    return _unconnected(table["corners"].astype(float))
+    return np.asarray(np.fromfile(path, dtype=record, offset=STL_HEADER)["corners"].astype(float))
 
 
-def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
+def _text_corners(path: Path) -> FloatArray:
+    """Return the corners of the triangles of a text STL file, (t, 3, 3)."""
     text = Lines.of(path)
     first = (text.maybe_line() or "").split()
     if first[:1] != ["solid"]:
@@ -96,7 +95,7 @@ def _text_stl(path: Path) -> tuple[FloatArray, IntArray]:
             corners += [text.number_of(word) for word in words[1:]]
     if len(corners) % 9:
         raise text.error(f"{len(corners) // 3} vertices, each triangle needs three")
-    return _unconnected(np.array(corners).reshape(-1, 3, 3))
+    return np.array(corners).reshape(-1, 3, 3)
 
 
 def _read_ply(path: Path, data: bytes) -> tuple[FloatArray, IntArray]:
@@ -152,13 +151,13 @@ class _Values:
         Raises:
             SurveyFileError: vertices without x, y and z.
         """
-        names = [one[-1] for one in properties]
-        if not {"x", "y", "z"} <= set(names) or any(one[0] == "list" for one in properties):
+        names = [entry[-1] for entry in properties]
+        if not {"x", "y", "z"} <= set(names) or any(entry[0] == "list" for entry in properties):
             raise SurveyFileError(f"{self.path}: the vertices lack x, y and z, or have lists")
         if self.form == "ascii":
             rows = self._words(count * len(names)).reshape(count, len(names))
             return rows[:, [names.index(axis) for axis in "xyz"]]
-        record = np.dtype([(f"{k}", self.order + TYPES[one[0]]) for k, one in enumerate(properties)])
+        record = np.dtype([(f"{k}", self.order + TYPES[entry[0]]) for k, entry in enumerate(properties)])
         packed = np.frombuffer(self._bytes(count * record.itemsize), dtype=record)
         return np.stack([packed[f"{names.index(axis)}"] for axis in "xyz"], axis=1).astype(float)
 
@@ -168,23 +167,23 @@ class _Values:
         Raises:
             SurveyFileError: a polygon has too few or too many corners, or elements outnumber bytes.
         """
-        found: list[tuple[int, int, int]] = []
+        triangles: list[tuple[int, int, int]] = []
         if count * max(len(properties), 1) > len(self.data):
             raise SurveyFileError(f"{self.path}: {count} elements do not fit in {len(self.data)} bytes")
         for _ in range(count if properties else 0):
             polygon: list[int] | None = None
-            for one in properties:
+            for entry in properties:
                 many = 1
-                if one[0] == "list":
-                    many = int(self._numbers(1, one[1])[0])
+                if entry[0] == "list":
+                    many = int(self._numbers(1, entry[1])[0])
                     if not 0 <= many <= MAX_CORNERS:
                         raise SurveyFileError(f"{self.path}: a polygon of {many} corners")
-                values = self._numbers(many, one[2] if one[0] == "list" else one[0])
-                if one[0] == "list" and polygon is None:
+                values = self._numbers(many, entry[2] if entry[0] == "list" else entry[0])
+                if entry[0] == "list" and polygon is None:
                     polygon = [int(value) for value in values]
             if keep and polygon is not None:
-                found += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
-        return np.array(found, dtype=np.int64).reshape(-1, 3)
+                triangles += [(polygon[0], polygon[k], polygon[k + 1]) for k in range(1, len(polygon) - 1)]
+        return np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
     def _numbers(self, count: int, kind: str) -> FloatArray:
         if self.form == "ascii":

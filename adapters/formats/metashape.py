@@ -32,6 +32,7 @@ from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_P
 from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.camera import Camera, camera_from_values
 from sfm.conventions import FloatArray
+from sfm.distortion.models import MODELS
 from sfm.errors import OutputError, SurveyFileError
 from sfm.estimate import Estimate
 from sfm.files.plain_text import MAX_PIXEL_MM, shorten
@@ -45,6 +46,25 @@ LOCATION = ["frames", "frame", "markers", "marker", "location"]
 
 AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in Kolinear's
 CALIBRATION = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+OPENCV_PARAMETERS: dict[str, tuple[str, ...]] = {  # that are free where one of a calibration is
+    "f": ("fx", "fy"),
+    "cx": ("cx",),
+    "cy": ("cy",),
+    "b1": ("fx",),
+    "k1": ("k1",),
+    "k2": ("k2",),
+    "k3": ("k3",),
+    "p1": ("p2",),
+    "p2": ("p1",),
+}
+BROWN_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "f": ("c",),
+    "cx": ("x0",),
+    "cy": ("y0",),
+    "b1": ("b1",),
+    "b2": ("b2",),
+}
+BROWN_PARAMETERS |= {name: (name.upper(),) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
 
 
 def read_metashape(path: Path) -> tuple[Network, Estimate]:
@@ -173,47 +193,63 @@ def _camera(sensor: Node) -> Camera:
     )
     if not all(0 < side <= MAX_PIXEL_MM for side in pixel):
         raise sensor.error(f"pixels of {pixel[0]:g} x {pixel[1]:g} mm, needed 0 to {MAX_PIXEL_MM:g}")
+    p, free = _calibration(sensor)
+    if p["k4"] == 0 and p["b2"] == 0:
+        model = "opencv" if p["k3"] == 0 else "full_opencv"
+        values = _opencv_values(p, size)
+        names = OPENCV_PARAMETERS
+    else:
+        model, values, names = "brown_forward_affine", _brown_values(p, pixel), BROWN_PARAMETERS
+    freed = [name for tag in CALIBRATION if tag in free for name in names.get(tag, ())]
+    has = MODELS[model].names
+    return camera_from_values(
+        sensor.name("label" if "label" in sensor.attributes else "id"),
+        model,
+        size,
+        (float(pixel[0]), float(pixel[1])),
+        c_mm=p["f"] * pixel[1],
+        free=tuple(name for name in freed if name in has),
+        values=tuple((name, float(value)) for name, value in values.items() if name in has),
+    )
+
+
+def _calibration(sensor: Node) -> tuple[dict[str, float], set[str]]:
+    """Return the values of CALIBRATION, adjusted if the sensor has them, and which of them are stated."""
     calibrations = sensor.all("calibration")
     if not calibrations:
         raise sensor.error("sensor without calibration")
     adjusted = [node for node in calibrations if node.attributes.get("class") == "adjusted"]
     node = (adjusted or calibrations)[0]
-    p = dict.fromkeys(CALIBRATION, 0.0)
-    listed = [child for child in node.children if child.tag in p]
-    p |= {child.tag: float(child.numbers(1)[0]) for child in listed}
-    f = p["f"]
-    if not (f > 0 and f + p["b1"] > 0):
-        raise node.error(f"f = {f:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
-    centre = (np.array(size) - 1) / 2
-    free = {child.tag for child in listed}
-    label = sensor.name("label" if "label" in sensor.attributes else "id")
-    if p["k4"] == 0 and p["b2"] == 0:
-        model = "opencv" if p["k3"] == 0 else "full_opencv"
-        values = {"fx": f + p["b1"], "fy": f, "cx": centre[0] + p["cx"], "cy": centre[1] + p["cy"]}
-        values |= {"k1": p["k1"], "k2": p["k2"], "p1": p["p2"], "p2": p["p1"]}
-        values |= {"k3": p["k3"]} if model == "full_opencv" else {}
-        names = {"f": ("fx", "fy"), "b1": ("fx",), "p1": ("p2",), "p2": ("p1",)}
-        names |= {name: (name,) for name in ("cx", "cy", "k1", "k2")}
-        names |= {"k3": ("k3",)} if model == "full_opencv" else {}
-    else:
-        model = "brown_forward_affine"
-        c = f * pixel[1]
-        values = {"x0": p["cx"] * pixel[0], "y0": -p["cy"] * pixel[1]}
-        values |= {"b1": (f + p["b1"]) * pixel[0] / c - 1, "b2": -p["b2"] * pixel[0] / c}
-        values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
-        values |= {"P1": p["p1"] / c, "P2": -p["p2"] / c}
-        names = {"f": ("c",), "cx": ("x0",), "cy": ("y0",)}
-        names |= {name: (name.upper(),) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
-        names |= {"b1": ("b1",), "b2": ("b2",)}
-    return camera_from_values(
-        label,
-        model,
-        size,
-        (float(pixel[0]), float(pixel[1])),
-        c_mm=f * pixel[1],
-        free=tuple(name for tag in CALIBRATION if tag in free for name in names.get(tag, ())),
-        values=tuple((name, float(value)) for name, value in values.items()),
-    )
+    stated = {child.tag: float(child.numbers(1)[0]) for child in node.children if child.tag in CALIBRATION}
+    p = dict.fromkeys(CALIBRATION, 0.0) | stated
+    if not (p["f"] > 0 and p["f"] + p["b1"] > 0):
+        raise node.error(f"f = {p['f']:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
+    return p, set(stated)
+
+
+def _opencv_values(p: dict[str, float], size_px: tuple[int, int]) -> dict[str, float]:
+    """Return the parameters of the OpenCV models from a calibration without k4 and b2, with k3."""
+    centre = (np.array(size_px) - 1) / 2
+    return {
+        "fx": p["f"] + p["b1"],
+        "fy": p["f"],
+        "cx": centre[0] + p["cx"],
+        "cy": centre[1] + p["cy"],
+        "k1": p["k1"],
+        "k2": p["k2"],
+        "k3": p["k3"],
+        "p1": p["p2"],
+        "p2": p["p1"],
+    }
+
+
+def _brown_values(p: dict[str, float], pixel_mm: tuple[float, ...]) -> dict[str, float]:
+    """Return the parameters of `brown_forward_affine` from a calibration, except c."""
+    c = p["f"] * pixel_mm[1]
+    values = {"x0": p["cx"] * pixel_mm[0], "y0": -p["cy"] * pixel_mm[1]}
+    values |= {"b1": (p["f"] + p["b1"]) * pixel_mm[0] / c - 1, "b2": -p["b2"] * pixel_mm[0] / c}
+    values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
+    return values | {"P1": p["p1"] / c, "P2": -p["p2"] / c}
 
 
 def _sensor_lines(number: int, camera: Camera) -> list[str]:
@@ -247,6 +283,9 @@ def _sensor_lines(number: int, camera: Camera) -> list[str]:
             f"camera {camera.name}: Metashape has no model {camera.model}, convert it to brown_forward_affine"
         )
     resolution = f'<resolution width="{width}" height="{height}"/>'
+    calibration = [
+        f"          <{name}>{float(value)!r}</{name}>" for name, value in p.items() if value or name == "f"
+    ]
     return [
         f'      <sensor id="{number}" label={quoteattr(camera.name)} type="frame">',
         f"        {resolution}",
@@ -254,11 +293,7 @@ def _sensor_lines(number: int, camera: Camera) -> list[str]:
         f'        <property name="pixel_height" value="{float(camera.pixel_mm[1])!r}"/>',
         '        <calibration type="frame" class="adjusted">',
         f"          {resolution}",
-        *(
-            f"          <{name}>{float(value)!r}</{name}>"
-            for name, value in p.items()
-            if value or name == "f"
-        ),
+        *calibration,
         "        </calibration>",
         "      </sensor>",
     ]
@@ -331,19 +366,19 @@ class Markers:
             SurveyFileError: an image point of an unknown camera or marker, or two of a marker in one camera.
         """
         seen = np.array(self._seen, dtype=np.int64).reshape(-1, 3)
-        found = []
+        indices = []
         for column, what, numbers, known in (
             (1, "marker", self._markers, self._index),
             (0, "camera", self._cameras, images),
         ):
             table = np.array([known.get(name, -1) for name in numbers], dtype=np.int64)
-            found.append(table[seen[:, column]])
-            for k in np.flatnonzero(found[-1] < 0)[:1]:
+            indices.append(table[seen[:, column]])
+            for k in np.flatnonzero(indices[-1] < 0)[:1]:
                 name = list(numbers)[seen[k, column]]
                 raise SurveyFileError(
                     f"{self.path}, line {seen[k, 2]}: {what}_id {name}, there is no such {what}"
                 )
-        point, image = found
+        point, image = indices
         if len(np.unique(image * len(self.labels) + point)) < len(point):
             raise SurveyFileError(f"{self.path}: a marker is a duplicate in one camera")
         covariance = np.tile(MARKER_SIGMA_PX**2 * np.eye(2), (len(seen), 1, 1))

@@ -34,6 +34,7 @@ checked on its camcal and Strasbourg data.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,6 +55,8 @@ INNER = 10  # c xp yp xs ys K1 K2 K3 P1 P2
 FREE = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1")  # adjusted by a calibration project
 ROUNDING = 1e-12  # of the ratio of two equal sides
 CALIBRATION = "calibration project"  # in the title of a project that adjusts its camera
+
+Row = tuple[str, str, FloatArray]  # of a block: file and line, key, numbers
 
 
 def read_photomodeler(
@@ -98,84 +101,29 @@ def read_export(
     by_hand_px = by_hand_px if by_hand_px > 0 else 1.0
     default = text.numbers(INNER, INNER)
     text.numbers(INNER, INNER)
-    names: list[str] = []
-    outer: list[FloatArray] = []
-    outer_sigma: list[FloatArray] = []
-    inner: list[FloatArray] = []
-    while True:
-        line = text.line()
-        if not line.strip():
-            break
-        number, _, name = line.strip().partition(" ")
-        if number != str(len(names)) or not name.strip():
-            raise text.error(
-                f"'{shorten(line.strip())}' where photograph {len(names)} and its file were expected"
-            )
-        text.refuse_more(len(names) + 1, MAX_PHOTOGRAPHS, "photographs")
-        file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]
-        names.append(text.name_of(file, "the file of a photograph"))
-        outer.append(text.numbers(7, 7, photograph=number)[1:])
-        outer_sigma.append(text.numbers(7, 7, photograph=number)[1:4])
-        text.numbers(0, 4)
-        inner.append(text.numbers(INNER + 1, INNER + 1, photograph=number)[1:])
-        text.numbers(INNER + 1, INNER + 1, photograph=number)
-    control_rows = text.block(7)
-    object_rows = text.block(7)
-    mark_rows = text.block(6)
+    photographs = _read_photographs(text)
+    control_rows, object_rows, mark_rows = text.block(7), text.block(7), text.block(6)
     adjusted = {(key, *row.tolist()) for _, key, row in object_rows if (row[3:] > 0).all()}
     if control is not None:
         control_rows, adjusted = _read_control(control), set()
-    known: dict[str, FloatArray] = {}
-    controls = {key for _, key, _ in control_rows}
-    for where, key, row in (*object_rows, *control_rows):
-        if key in known and key not in controls:
-            raise SurveyFileError(f"{where}: point {key} is a duplicate")
-        known.setdefault(key, row[:3])
-    points = list(known)
-    index = {key: j for j, key in enumerate(points)}
-    image, point, xy, covariance, stated = [], [], [], [], []
-    measured: set[tuple[int, str, float, float]] = set()
-    for where, key, row in mark_rows:
-        photograph, point_name = int(key), f"{row[0]:.0f}"
-        if not 0 <= photograph < len(names):
-            raise SurveyFileError(f"{where}: photograph {key}, expected 0 to {len(names) - 1}")
-        if (photograph, point_name, *row[1:3].tolist()) in measured:  # the same row again
-            continue
-        measured.add((photograph, point_name, *row[1:3].tolist()))
-        if point_name not in index:
-            index[point_name] = len(points)
-            points.append(point_name)
-        image.append(photograph)
-        point.append(index[point_name])
-        xy.append(row[1:3] - HALF_PIXEL)
-        stated.append(bool((row[3:5] > 0).all()))
-        covariance.append(np.diag(np.where(row[3:5] > 0, row[3:5], by_hand_px) ** 2))
+    known = _coordinates(object_rows, control_rows)
+    points, image_points = _image_points(mark_rows, len(photographs.names), tuple(known), by_hand_px)
+    index = {name: j for j, name in enumerate(points)}
     observed = [(key, row) for _, key, row in control_rows if (key, *row.tolist()) not in adjusted]
     lost = len(control_rows) - len(observed)
     free = FREE if calibrates else ()
-    cameras, camera_index = _cameras(np.array(inner).reshape(-1, INNER), default, size_px, free)
-    exterior = np.array(outer).reshape(-1, 6)
+    cameras, camera_index = _cameras(photographs.inner, default, size_px, free)
+    exterior = photographs.exterior
     kappa, phi, omega = np.deg2rad(exterior[:, 3:]).T
     rotation = [rotation_from_angles(o, p, k) for o, p, k in zip(omega, phi, kappa, strict=True)]
     xyz = np.full((len(points), 3), np.nan)
     xyz[: len(known)] = np.array(list(known.values())).reshape(-1, 3)
-    network = Network(
-        tuple(names),
-        camera_index,
-        tuple(points),
-        ImagePoints(
-            np.array(image, dtype=np.int64),
-            np.array(point, dtype=np.int64),
-            np.array(xy).reshape(-1, 2),
-            np.array(covariance).reshape(-1, 2, 2),
-            np.full(len(stated), any(stated)),
-        ),
-        ObjectPoints(
-            np.array([index[key] for key, _ in observed], dtype=np.int64),
-            np.array([row[:3] for _, row in observed]).reshape(-1, 3),
-            np.array([np.diag(np.maximum(row[3:6], 0.0) ** 2) for _, row in observed]).reshape(-1, 3, 3),
-        ),
+    control_points = ObjectPoints(
+        np.array([index[key] for key, _ in observed], dtype=np.int64),
+        np.array([row[:3] for _, row in observed]).reshape(-1, 3),
+        np.array([np.diag(np.maximum(row[3:6], 0.0) ** 2) for _, row in observed]).reshape(-1, 3, 3),
     )
+    network = Network(photographs.names, camera_index, points, image_points, control_points)
     point_sigma = np.full((len(points), 3), np.nan)
     for _, key, row in object_rows:
         point_sigma[index[key]] = np.where(row[3:] > 0, row[3:], np.nan)
@@ -188,11 +136,84 @@ def read_export(
         )
     estimate = Estimate(cameras, exterior[:, :3].copy(), np.array(rotation).reshape(-1, 3, 3), xyz)
     result = Solution(
-        *(path.name, network, estimate),
+        path.name,
+        network,
+        estimate,
         point_covariance=_covariance_of(point_sigma),
-        position_covariance=_covariance_of(np.array(outer_sigma).reshape(-1, 3)),
+        position_covariance=_covariance_of(photographs.position_sigma),
     )
     return Content(result, notes=tuple(notes))
+
+
+class _Photographs(NamedTuple):
+    """The photographs of an export."""
+
+    names: tuple[str, ...]
+    exterior: FloatArray  # X Y Z kappa phi omega, degrees, (m, 6)
+    position_sigma: FloatArray  # (m, 3)
+    inner: FloatArray  # c xp yp xs ys K1 K2 K3 P1 P2, (m, 10)
+
+
+def _read_photographs(text: Lines) -> _Photographs:
+    """Read the photographs and the empty line after them."""
+    names: list[str] = []
+    exterior, position_sigma, inner = [], [], []
+    while (line := text.line()).strip():
+        number, _, name = line.strip().partition(" ")
+        if number != str(len(names)) or not name.strip():
+            raise text.error(
+                f"'{shorten(line.strip())}' where photograph {len(names)} and its file were expected"
+            )
+        text.refuse_more(len(names) + 1, MAX_PHOTOGRAPHS, "photographs")
+        file = name.strip().replace("\\", "/").rsplit("/", 1)[-1]
+        names.append(text.name_of(file, "the file of a photograph"))
+        exterior.append(text.numbers(7, 7, photograph=number)[1:])
+        position_sigma.append(text.numbers(7, 7, photograph=number)[1:4])
+        text.numbers(0, 4)
+        inner.append(text.numbers(INNER + 1, INNER + 1, photograph=number)[1:])
+        text.numbers(INNER + 1, INNER + 1, photograph=number)
+    return _Photographs(
+        tuple(names),
+        np.array(exterior).reshape(-1, 6),
+        np.array(position_sigma).reshape(-1, 3),
+        np.array(inner).reshape(-1, INNER),
+    )
+
+
+def _coordinates(object_rows: list[Row], control_rows: list[Row]) -> dict[str, FloatArray]:
+    """Return coordinates by the name of the point: adjusted ones, and else those of control."""
+    known: dict[str, FloatArray] = {}
+    controls = {key for _, key, _ in control_rows}
+    for where, key, row in (*object_rows, *control_rows):
+        if key in known and key not in controls:
+            raise SurveyFileError(f"{where}: point {key} is a duplicate")
+        known.setdefault(key, row[:3])
+    return known
+
+
+def _image_points(
+    mark_rows: list[Row], photographs: int, known: tuple[str, ...], by_hand_px: float
+) -> tuple[tuple[str, ...], ImagePoints]:
+    """Return the names of the points, first those with coordinates, and the image points."""
+    index = {name: j for j, name in enumerate(known)}
+    marks: dict[tuple[int, str, float, float], FloatArray] = {}  # without rows that are repeated
+    for where, key, row in mark_rows:
+        photograph, name = int(key), f"{row[0]:.0f}"
+        if not 0 <= photograph < photographs:
+            raise SurveyFileError(f"{where}: photograph {key}, expected 0 to {photographs - 1}")
+        index.setdefault(name, len(index))
+        marks.setdefault((photograph, name, float(row[1]), float(row[2])), row)
+    table = np.array(list(marks.values())).reshape(-1, 5)
+    sigma = np.where(table[:, 3:] > 0, table[:, 3:], by_hand_px)
+    stated = (table[:, 3:] > 0).all(axis=1)
+    image_points = ImagePoints(
+        np.array([photograph for photograph, *_ in marks], dtype=np.int64),
+        np.array([index[name] for _, name, *_ in marks], dtype=np.int64),
+        table[:, 1:3] - HALF_PIXEL,
+        np.eye(2) * sigma[:, None, :] ** 2,
+        np.full(len(marks), stated.any()),
+    )
+    return tuple(index), image_points
 
 
 def _covariance_of(sigma: FloatArray) -> FloatArray | None:
@@ -217,22 +238,17 @@ def _cameras(
         side = float(ys / size_px[1])
         stretch = float(xs / size_px[0]) / side  # as DBAT: square pixels of this height, and an affinity
         stretch = 1.0 if abs(stretch - 1) < ROUNDING else stretch
-        given = [
-            ("x0", (xp - xs / 2) / stretch),
-            ("y0", ys / 2 - yp),
-            ("b1", stretch - 1),
-            *zip(("K1", "K2", "K3", "P1", "P2"), values[5:], strict=True),
-        ]
-        name = "camera" if len(kinds) == 1 else f"camera{k + 1}"
+        given = {"x0": (xp - xs / 2) / stretch, "y0": ys / 2 - yp, "b1": stretch - 1}
+        given |= zip(("K1", "K2", "K3", "P1", "P2"), values[5:], strict=True)
         cameras.append(
             camera_from_values(
-                name,
+                "camera" if len(kinds) == 1 else f"camera{k + 1}",
                 "brown_dbat",
                 size_px,
                 (side, side),
                 c_mm=float(c),
                 free=free,
-                values=tuple((n, float(v)) for n, v in given),
+                values=tuple((name, float(value)) for name, value in given.items()),
             )
         )
     return tuple(cameras), index.astype(np.int64).reshape(-1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,7 +38,7 @@ from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
 from adapters.formats.rig_files import write_rig_files
-from adapters.formats.sba_text import read_sba_text, sba_files, write_sba_text
+from adapters.formats.sba_text import read_sba, write_sba_folder
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
 from sfm.camera import Camera
@@ -61,9 +62,9 @@ class FileFormat:
 
     name: str  # as for --from and --to
     models: tuple[str, ...]  # camera models that it can store, most capable first; empty: no cameras
-    read: Reader | None  # of a file or folder; None: `read_all`, or the format is write-only
-    write: Writer | None  # to a new file, or into an empty folder; None: `write_all`
     keeps: frozenset[str]  # the kinds of `content` that are unchanged when read again
+    read: Reader | None = None  # of a file or folder; None: `read_all`, or the format is write-only
+    write: Writer | None = None  # to a new file, or into an empty folder; None: `write_all`
     folder: bool = False  # whether it is a folder of files
     placed: bool = False  # whether it omits what has no coordinates in the object
     lacks: tuple[str, ...] = ()  # parameters of these models that it cannot store, but can approximate
@@ -80,9 +81,9 @@ class FileFormat:
         """Return the kinds of content that are unchanged when a survey is read again."""
         cameras = content.result.estimate.cameras
         frees = all(
-            {name for name, free in zip(one.names, one.free, strict=True) if free}
-            in (set(), set(one.names) & set(self.frees))
-            for one in cameras
+            {name for name, free in zip(camera.names, camera.free, strict=True) if free}
+            in (set(), set(camera.names) & set(self.frees))
+            for camera in cameras
         )
         return self.keeps | {"free"} if frees else self.keeps
 
@@ -97,23 +98,10 @@ def _read_database(path: Path) -> tuple[Network, Estimate]:
     return network, empty_estimate(network, cameras)
 
 
-def _write_database(path: Path, network: Network, estimate: Estimate) -> None:
-    write_database(path, network, estimate.cameras)
-
-
 def _write_tables(folder: Path, content: Content) -> None:
-    there = select_placed(content)
-    write_content_tables(folder, there)
-    write_survey_file(folder, there, title=content.result.name)
-
-
-def _read_sba(path: Path) -> tuple[Network, Estimate]:
-    files = sba_files(path)
-    return read_sba_text(*files[:3], sigmas=files[3])
-
-
-def _write_sba(folder: Path, network: Network, estimate: Estimate) -> None:
-    write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)
+    placed = select_placed(content)
+    write_content_tables(folder, placed)
+    write_survey_file(folder, placed, title=content.result.name)
 
 
 def _write_ply(path: Path, content: Content) -> None:
@@ -133,86 +121,114 @@ _NAMED = _SOLVED | {"point names", "image names"}
 _SIDE = _NAMED | {"free", "rigs", "moments"}  # stored beside a COLMAP model
 FORMATS = (
     FileFormat(
-        *("colmap", _COLMAP, partial(read_model, text=False), partial(write_model, text=False), _SIDE),
+        name="colmap",
+        models=_COLMAP,
+        read=partial(read_model, text=False),
+        write=partial(write_model, text=False),
+        keeps=_SIDE,
         folder=True,
         placed=True,
     ),
     FileFormat(
-        *("colmap-text", _COLMAP, partial(read_model, text=True), partial(write_model, text=True), _SIDE),
+        name="colmap-text",
+        models=_COLMAP,
+        read=partial(read_model, text=True),
+        write=partial(write_model, text=True),
+        keeps=_SIDE,
         folder=True,
         placed=True,
     ),
     FileFormat(
-        "colmap-database",
-        _COLMAP,
-        _read_database,
-        _write_database,
-        frozenset({"image names", "uncoded"}),
+        name="colmap-database",
+        models=_COLMAP,
+        read=_read_database,
+        write=lambda path, network, estimate: write_database(path, network, estimate.cameras),
+        keeps=frozenset({"image names", "uncoded"}),
         names=(False, True),
     ),
     FileFormat(
-        *("tables", tuple(MODELS), None, None),
-        ALL - {"exterior correlations", "interior correlations", "unplaced"},
-        folder=True,
-        placed=True,
+        name="tables",
+        models=tuple(MODELS),
         read_all=read_tables,
         write_all=_write_tables,
+        keeps=ALL - {"exterior correlations", "interior correlations", "unplaced"},
+        folder=True,
+        placed=True,
     ),
     FileFormat(
-        *("metashape", ("brown_forward_affine", "full_opencv", "opencv"), read_metashape, write_metashape),
-        _NAMED | {"control", "unplaced"},
+        name="metashape",
+        models=("brown_forward_affine", "full_opencv", "opencv"),
+        read=read_metashape,
+        write=write_metashape,
+        keeps=_NAMED | {"control", "unplaced"},
         lacks=("k4", "k5", "k6"),
     ),
     FileFormat(
-        *("photomodeler", PHOTOMODELER_MODELS, None, None),
-        (_NAMED - {"uncoded"}) | {"control", "point sigmas", "position sigmas", "image sigmas"},
-        lacks=("b1", "b2"),
-        frees=PHOTOMODELER_FREE,
+        name="photomodeler",
+        models=PHOTOMODELER_MODELS,
         read_all=read_export,
         write_all=write_export,
+        keeps=(_NAMED - {"uncoded"}) | {"control", "point sigmas", "position sigmas", "image sigmas"},
+        lacks=("b1", "b2"),
+        frees=PHOTOMODELER_FREE,
         control=True,
         adjusts=True,
     ),
     FileFormat(
-        *("bal", ("opencv", "radial"), read_bal, write_bal, _SOLVED),
+        name="bal",
+        models=("opencv", "radial"),
+        read=read_bal,
+        write=write_bal,
+        keeps=_SOLVED,
         frees=("f", "fx", "fy", "k1", "k2"),
         straight=("p1", "p2"),
         one_focal=True,
         names=NUMBERS,
     ),
     FileFormat(
-        *("bundle-csharp", ("brown",), read_bundle_csharp, write_bundle_csharp),
-        _NAMED | {"image sigmas"},
+        name="bundle-csharp",
+        models=("brown",),
+        read=read_bundle_csharp,
+        write=write_bundle_csharp,
+        keeps=_NAMED | {"image sigmas"},
         straight=_BROWN_DISTORTION,
         adjusts=True,
     ),
     FileFormat(
-        *("bundle-matlab", ("brown",), read_bundle_matlab_folder, write_bundle_matlab_folder),
-        _SOLVED | {"image names", "image sigmas"},
+        name="bundle-matlab",
+        models=("brown",),
+        read=read_bundle_matlab_folder,
+        write=write_bundle_matlab_folder,
+        keeps=_SOLVED | {"image names", "image sigmas"},
         folder=True,
         straight=_BROWN_DISTORTION,
         names=(False, True),
         adjusts=True,
     ),
     FileFormat(
-        *("sba", ("opencv",), _read_sba, _write_sba),
-        _SOLVED | {"image sigmas", "image covariances"},
+        name="sba",
+        models=("opencv",),
+        read=read_sba,
+        write=write_sba_folder,
+        keeps=_SOLVED | {"image sigmas", "image covariances"},
         folder=True,
         straight=_OPENCV_DISTORTION,
         names=NUMBERS,
         adjusts=True,
     ),
     FileFormat(
-        *("rig", ("opencv",), None, None, frozenset({"rigs", "unit"})), folder=True, write_all=write_rig_files
+        name="rig",
+        models=("opencv",),
+        write_all=write_rig_files,
+        keeps=frozenset({"rigs", "unit"}),
+        folder=True,
     ),
     FileFormat(
-        "ply",
-        (),
-        None,
-        None,
-        frozenset({"object points", "point sigmas", "point names", "uncoded"}),
-        placed=True,
+        name="ply",
+        models=(),
         write_all=_write_ply,
+        keeps=frozenset({"object points", "point sigmas", "point names", "uncoded"}),
+        placed=True,
     ),
 )
 ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
@@ -224,10 +240,10 @@ def format_named(name: str) -> FileFormat:
     Raises:
         SurveyFileError: no format has that name.
     """
-    found = next((one for one in FORMATS if one.name == name), None)
-    if found is None:
-        raise SurveyFileError(f"format '{name}', expected one of {', '.join(one.name for one in FORMATS)}")
-    return found
+    form = next((form for form in FORMATS if form.name == name), None)
+    if form is None:
+        raise SurveyFileError(f"format '{name}', expected one of {', '.join(form.name for form in FORMATS)}")
+    return form
 
 
 def format_of(path: Path) -> FileFormat:
@@ -362,18 +378,11 @@ def write_content(path: Path, name: str, content: Content) -> None:
                 f"{path}: format {name} needs coordinates in the object, but no "
                 f"{'point' if points_only else 'photograph or no point'} has coordinates"
             )
-    if form.folder:
-        with whole_folder(path) as folder:
-            _write(form, folder, content)
-    else:
-        _write(form, path, content)
-
-
-def _write(form: FileFormat, path: Path, content: Content) -> None:
-    if form.write_all is not None:
-        form.write_all(path, content)
-    elif form.write is not None:
-        form.write(path, content.result.network, content.result.estimate)
+    with whole_folder(path) if form.folder else nullcontext(path) as target:
+        if form.write_all is not None:
+            form.write_all(target, content)
+        elif form.write is not None:
+            form.write(target, content.result.network, estimate)
 
 
 def losses_in_words(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:

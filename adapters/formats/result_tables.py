@@ -65,14 +65,14 @@ def read_result(folder: Path) -> Solution:
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
     table = tables.POINTS.read(folder)
     points = table.keys("id")
-    sources = tuple(one.content for one in summary.sources) or Network.sources
+    sources = tuple(source.content for source in summary.sources) or Network.sources
     seen, rejected = _image_points(folder, images, points, sources)
     network = Network(images, camera, points, seen.select(~rejected), sources=sources)
     mounts, moment = read_rigs(folder, names, network)
     network = replace(network, moment=moment)
     known = table.values.shape[1] > 3
     joint, of_points = read_covariance(folder, points, table.values[:, 3:]) if known else (None, None)
-    found = Solution(
+    result = Solution(
         summary.survey or folder.name,
         network,
         Estimate(cameras, position, rotation, table.values[:, :3].copy(), mounts),
@@ -86,7 +86,7 @@ def read_result(folder: Path) -> Solution:
         covariance_points=of_points,
         judged=None if summary.verdict is None else summary.verdict.content,
     )
-    return read_covariances(folder, found)
+    return read_covariances(folder, result)
 
 
 def read_image_points(folder: Path, network: Network) -> tuple[ImagePoints, BoolArray, FloatArray]:
@@ -132,11 +132,11 @@ def read_scale_sources(folder: Path) -> tuple[tuple[str, ...] | None, tuple[str,
     if not path.read_text(encoding="utf-8").strip().partition("\n")[2]:
         return (), ()
     kinds, names, _ = tables.GIVEN.read(folder).texts
-    found = {
+    named = {
         kind: tuple(dict.fromkeys(n for k, n in zip(kinds, names, strict=True) if k == kind))
         for kind in ("scale bar", "control point")
     }
-    return found["scale bar"], found["control point"]
+    return named["scale bar"], named["control point"]
 
 
 def write_tables(folder: Path, result: Solution) -> None:
@@ -174,7 +174,7 @@ def write_content(folder: Path, content: Content) -> None:
         "sigma0_px": None if content.sigma0_px is None else or_none(content.sigma0_px),
         "verdict": None if result.verdict is None else result.verdict.entry,
         "sources": [
-            {name: getattr(one, name) for name in _SourceEntry.model_fields} for one in network.sources
+            {name: getattr(source, name) for name in _SourceEntry.model_fields} for source in network.sources
         ],
         "cameras": [
             {
@@ -264,10 +264,10 @@ def _with_shared(result: Solution) -> tuple[Camera, ...]:
         if len(members) < 2 or len(models) > 1:
             continue
         values = np.array([cameras[k].parameters for k in members])
-        one = (values == values[0]).all(axis=0)
-        if not one.any() or one.all():
+        equal = (values == values[0]).all(axis=0)
+        if not equal.any() or equal.all():
             continue
-        shared = tuple(name if same else "" for same in one)
+        shared = tuple(name if same else "" for same in equal)
         for k in members:
             made[k] = replace(cameras[k], shared=shared)
     return tuple(made)
@@ -311,8 +311,10 @@ class _RemarkEntry(Json):
             self.kind,
             {role: tuple(map(as_plain, names)) for role, names in self.subjects.items()},
             {
-                name: Quantity(math.nan if one.value is None else one.value, as_plain(one.unit))
-                for name, one in self.numbers.items()
+                name: Quantity(
+                    math.nan if quantity.value is None else quantity.value, as_plain(quantity.unit)
+                )
+                for name, quantity in self.numbers.items()
             },
             self.severity,
         )
@@ -329,8 +331,8 @@ class _VerdictEntry(Json):
     @property
     def content(self) -> Verdict | None:
         """The verdict; None if a remark has a kind or parts that this version does not know."""
-        remarks, tests = (tuple(one.content for one in kind) for kind in (self.remarks, self.tests))
-        if not all(one.is_known for one in (*remarks, *tests)):
+        remarks, tests = (tuple(remark.content for remark in kind) for kind in (self.remarks, self.tests))
+        if not all(remark.is_known for remark in (*remarks, *tests)):
             return None
         return Verdict(self.level, as_plain(self.headline), remarks, tests)
 
@@ -441,9 +443,9 @@ def _image_points(
     covariance += (1 - np.eye(2)) * mixed[:, :, None]
     source = None
     if len(table.texts) > 2:
-        source = table.places("source", [one.name for one in sources], "summary.json")
-    found = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated, source)
-    return found, rejected[:, 0] == 1
+        source = table.places("source", [declared.name for declared in sources], "summary.json")
+    image_points = ImagePoints(image, point, table.values[:, :2].copy(), covariance, stated, source)
+    return image_points, rejected[:, 0] == 1
 
 
 def _covariance(table: CsvTable, sigma: FloatArray) -> FloatArray | None:

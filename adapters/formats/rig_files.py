@@ -58,6 +58,12 @@ class _Mounted:
     R: FloatArray  # (3, 3)
     T: FloatArray  # (3,)
 
+    @classmethod
+    def of(cls, camera: Camera, mounts: Mounts, a: int) -> _Mounted:
+        """Return camera a as it is mounted."""
+        R = AXES @ mounts.rotation[a].T @ AXES
+        return cls(camera, R, -R @ AXES @ mounts.position[a])
+
     @property
     def pose(self) -> FloatArray:
         """The pose as one matrix, (4, 4)."""
@@ -89,32 +95,27 @@ def write_rig_files(folder: Path, content: Content) -> None:
         files[path] = text
 
     for rig, on in mounts.by_rig().items():
-        cameras = [_mounted(result.estimate.cameras[a], mounts, a) for a in on]
+        cameras = [_Mounted.of(result.estimate.cameras[a], mounts, a) for a in on]
         if len(on) < 2:
             raise OutputError(f"{folder}: rig {rig} has one camera, needed at least 2")
-        configs.append(_colmap(cameras, _prefixes(network, on, [one.camera.name for one in cameras])))
-        for one in cameras[1:]:
-            pair = f"{cameras[0].camera.name}-{one.camera.name}"
-            add(f"opencv-{pair}.yml", "\n".join(_opencv(cameras[0].camera, one, unit)) + "\n")
-            add(f"dice-{pair}.xml", "\n".join(_dice([cameras[0], one], unit)) + "\n")
+        configs.append(_colmap(cameras, _prefixes(network, on, [camera.camera.name for camera in cameras])))
+        for second in cameras[1:]:
+            pair = f"{cameras[0].camera.name}-{second.camera.name}"
+            add(f"opencv-{pair}.yml", "\n".join(_opencv(cameras[0].camera, second, unit)) + "\n")
+            add(f"dice-{pair}.xml", "\n".join(_dice([cameras[0], second], unit)) + "\n")
             if metres:
-                text = "\n".join(_matchid([cameras[0], one.scaled(1000.0 * metres)]))
+                text = "\n".join(_matchid([cameras[0], second.scaled(1000.0 * metres)]))
                 add(f"matchid-{pair}.caldat", text + "\n")
-        scaled = [one.scaled(metres or 1.0) for one in cameras]
+        scaled = [mounted.scaled(metres or 1.0) for mounted in cameras]
         add(f"kalibr-{rig}.yaml", "\n".join(_kalibr(scaled, in_metres)) + "\n")
-        for k, one in enumerate(scaled):
-            add(f"ros-{one.camera.name}.yaml", "\n".join(_ros(scaled, k, in_metres)) + "\n")
-            add(f"mrcal-{one.camera.name}.cameramodel", "\n".join(_mrcal(one, in_metres)) + "\n")
+        for k, mounted in enumerate(scaled):
+            add(f"ros-{mounted.camera.name}.yaml", "\n".join(_ros(scaled, k, in_metres)) + "\n")
+            add(f"mrcal-{mounted.camera.name}.cameramodel", "\n".join(_mrcal(mounted, in_metres)) + "\n")
     add("rig_config.json", json.dumps(configs, indent=1) + "\n")
     with disk_errors(f"{folder}: the files of the rig cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8", newline="")
-
-
-def _mounted(camera: Camera, mounts: Mounts, a: int) -> _Mounted:
-    R = AXES @ mounts.rotation[a].T @ AXES
-    return _Mounted(camera, R, -R @ AXES @ mounts.position[a])
 
 
 def _matrix(camera: Camera) -> FloatArray:
@@ -133,9 +134,9 @@ def _numbers(values: FloatArray | Sequence[float]) -> str:
     return ", ".join(text if "." in text else text.replace("e", ".0e") for text in texts)
 
 
-def _opencv(first: Camera, one: _Mounted, unit: str) -> Iterator[str]:
+def _opencv(first: Camera, mounted: _Mounted, unit: str) -> Iterator[str]:
     """Yield the lines of a pair of cameras."""
-    R, T, second = one.R, one.T, one.camera
+    R, T, second = mounted.R, mounted.T, mounted.camera
     K1, K2 = _matrix(first), _matrix(second)
     E = skew(T) @ R
     F = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
@@ -167,18 +168,18 @@ def _dice(pair: list[_Mounted], unit: str) -> Iterator[str]:
     yield "  " + entry("xml_file_format", "string", "DICe_xml_camera_system_file")
     yield "  " + entry("system_type_3D", "string", "OPENCV")
     yield "  " + entry("extrinsics_relative_camera_to_camera", "bool", "true")
-    for k, one in enumerate(pair):
-        K, size = _matrix(one.camera), one.camera.size_px
+    for k, mounted in enumerate(pair):
+        K, size = _matrix(mounted.camera), mounted.camera.size_px
         values = dict(zip(("CX", "CY", "FX", "FY"), (K[0, 2], K[1, 2], K[0, 0], K[1, 1]), strict=True))
-        values |= zip(("K1", "K2", "P1", "P2"), _distortion(one.camera), strict=True)
-        values |= zip(("TX", "TY", "TZ"), one.T.tolist(), strict=True)
+        values |= zip(("K1", "K2", "P1", "P2"), _distortion(mounted.camera), strict=True)
+        values |= zip(("TX", "TY", "TZ"), mounted.T.tolist(), strict=True)
         yield f'  <ParameterList name="CAMERA {k}">'
-        yield "    " + entry("CAMERA_ID", "string", one.camera.name)
+        yield "    " + entry("CAMERA_ID", "string", mounted.camera.name)
         yield from ("    " + entry(name, "double", repr(float(value))) for name, value in values.items())
         yield "    " + entry("LENS_DISTORTION_MODEL", "string", "OPENCV_LENS_DISTORTION")
         yield "    " + entry("IMAGE_HEIGHT_WIDTH", "string", f"{{ {size[1]}, {size[0]} }}")
         yield '    <ParameterList name="rotation_3x3_matrix">'
-        for r, row in enumerate(one.R):
+        for r, row in enumerate(mounted.R):
             yield "      " + entry(f"ROW {r}", "string", f"{{ {_numbers(row)} }}")
         yield from ("    </ParameterList>", "  </ParameterList>")
     yield "</ParameterList>"
@@ -186,8 +187,8 @@ def _dice(pair: list[_Mounted], unit: str) -> Iterator[str]:
 
 def _matchid(pair: list[_Mounted]) -> Iterator[str]:
     """Yield the lines of two cameras; T in mm, R = Rz(Psi) Ry(Phi) Rx(Theta)."""
-    for k, one in enumerate(pair):
-        K, (k1, k2, p1, p2) = _matrix(one.camera), _distortion(one.camera)
+    for k, mounted in enumerate(pair):
+        K, (k1, k2, p1, p2) = _matrix(mounted.camera), _distortion(mounted.camera)
         values = {"Fx [pixels]": K[0, 0], "Fy [pixels]": K[1, 1], "Fs [pixels]": 0.0}
         values |= {"Kappa 1": k1, "Kappa 2": k2, "Kappa 3": 0.0, "P1": p1, "P2": p2}
         values |= {"Cx [pixels]": K[0, 2], "Cy [pixels]": K[1, 2]}
@@ -201,18 +202,18 @@ def _matchid(pair: list[_Mounted]) -> Iterator[str]:
 def _colmap(cameras: list[_Mounted], prefixes: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Return a rig in COLMAP's configuration."""
     entries: list[dict[str, Any]] = []
-    for k, (one, prefix) in enumerate(zip(cameras, prefixes, strict=True)):
+    for k, (mounted, prefix) in enumerate(zip(cameras, prefixes, strict=True)):
         entry: dict[str, Any] = {"image_prefix": prefix}
         if k == 0:
             entry["ref_sensor"] = True
         else:
-            quaternion = Rotation.from_matrix(one.R).as_quat(scalar_first=True)
+            quaternion = Rotation.from_matrix(mounted.R).as_quat(scalar_first=True)
             entry |= {
                 "cam_from_rig_rotation": quaternion.tolist(),
-                "cam_from_rig_translation": one.T.tolist(),
+                "cam_from_rig_translation": mounted.T.tolist(),
             }
-        entry["camera_model_name"] = COLMAP_NAMES[one.camera.model]
-        entry["camera_params"] = colmap_parameters(one.camera).tolist()
+        entry["camera_model_name"] = COLMAP_NAMES[mounted.camera.model]
+        entry["camera_params"] = colmap_parameters(mounted.camera).tolist()
         entries.append(entry)
     return {"cameras": entries}
 
@@ -229,19 +230,22 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
     for name, t, a in zip(network.images, network.moment.tolist(), network.camera.tolist(), strict=True):
         if a in on:
             moments[t][a] = name
-    found: dict[int, set[str]] = {a: set() for a in on}
+    starts: dict[int, set[str]] = {a: set() for a in on}
     for together in moments.values():
         if len(together) > 1:
-            same = zip(*(name[::-1] for name in together.values()), strict=False)
+            backwards = [name[::-1] for name in together.values()]
+            same = zip(*backwards, strict=False)
             end = "".join(c[0] for c in takewhile(lambda c: len(set(c)) == 1, same))[::-1]
             end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # from the end of the word in which it begins
             for a, name in together.items():
-                found[a].add(name.removesuffix(end))
-    if any(len(one) != 1 for one in found.values()):
+                starts[a].add(name.removesuffix(end))
+    if any(len(starts) != 1 for starts in starts.values()):
         return folders
-    prefixes = [next(iter(found[a])) for a in on]
+    prefixes = [next(iter(starts[a])) for a in on]
     mixed = any(
-        one.startswith(other) for k, one in enumerate(prefixes) for other in prefixes[:k] + prefixes[k + 1 :]
+        prefix.startswith(other)
+        for k, prefix in enumerate(prefixes)
+        for other in prefixes[:k] + prefixes[k + 1 :]
     )
     return folders if mixed else prefixes
 
@@ -249,12 +253,12 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
 def _kalibr(cameras: list[_Mounted], unit: str) -> Iterator[str]:
     """Yield the lines of a camera chain, each camera relative to the one before."""
     yield f"# translations are in {unit}"
-    for k, one in enumerate(cameras):
-        camera, K = one.camera, _matrix(one.camera)
+    for k, mounted in enumerate(cameras):
+        camera, K = mounted.camera, _matrix(mounted.camera)
         yield f"cam{k}:  # {json.dumps(camera.name)}"
         if k:
             yield "  T_cn_cnm1:"
-            pose = one.pose @ np.linalg.inv(cameras[k - 1].pose)
+            pose = mounted.pose @ np.linalg.inv(cameras[k - 1].pose)
             yield from (f"  - [{_numbers(row)}]" for row in pose)
         yield f"  cam_overlaps: [{', '.join(str(o) for o in range(len(cameras)) if o != k)}]"
         yield "  camera_model: pinhole"
@@ -290,15 +294,15 @@ def _ros(cameras: list[_Mounted], k: int, unit: str) -> Iterator[str]:
         yield from (f"  rows: {M.shape[0]}", f"  cols: {M.shape[1]}", f"  data: [{_numbers(M)}]")
 
 
-def _mrcal(one: _Mounted, unit: str) -> Iterator[str]:
+def _mrcal(mounted: _Mounted, unit: str) -> Iterator[str]:
     """Yield the lines of a camera model, in the coordinates of the reference camera."""
-    K, pose = _matrix(one.camera), _numbers([*Rotation.from_matrix(one.R).as_rotvec(), *one.T])
-    intrinsics = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_distortion(one.camera)])
-    yield f"# {json.dumps(one.camera.name)}, translations are in {unit}"
+    K, pose = _matrix(mounted.camera), _numbers([*Rotation.from_matrix(mounted.R).as_rotvec(), *mounted.T])
+    intrinsics = _numbers([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_distortion(mounted.camera)])
+    yield f"# {json.dumps(mounted.camera.name)}, translations are in {unit}"
     yield from ("{", "    'lensmodel':  'LENSMODEL_OPENCV4',", f"    'intrinsics': [ {intrinsics} ],")
     yield f"    'rt_cam_ref': [ {pose} ],"
     yield f"    'extrinsics': [ {pose} ],  # the same for mrcal before 2.5"
-    yield from (f"    'imagersize': [ {one.camera.size_px[0]}, {one.camera.size_px[1]} ],", "}")
+    yield from (f"    'imagersize': [ {mounted.camera.size_px[0]}, {mounted.camera.size_px[1]} ],", "}")
 
 
 class Rectification(NamedTuple):

@@ -120,6 +120,25 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
     write_lines(points, point_lines)
 
 
+def read_sba(path: Path) -> tuple[Network, Estimate]:
+    """Read a problem by the file of its cameras, or from the folder of a single problem; see `sba_files`.
+
+    Raises:
+        SurveyFileError: what is missing or wrong, with file and line number.
+    """
+    cameras, points, calibration, sigmas = sba_files(path)
+    return read_sba_text(cameras, points, calibration, sigmas=sigmas)
+
+
+def write_sba_folder(folder: Path, network: Network, estimate: Estimate) -> None:
+    """Write cams.txt and pts.txt.
+
+    Raises:
+        OutputError: the files cannot store the network, or they cannot be written.
+    """
+    write_sba_text(folder / "cams.txt", folder / "pts.txt", network, estimate)
+
+
 def sba_files(path: Path) -> tuple[Path, Path, Path | None, Path | None]:
     """Return the files of cameras, points, calibration and sigmas; the last two are None if missing.
 
@@ -131,11 +150,11 @@ def sba_files(path: Path) -> tuple[Path, Path, Path | None, Path | None]:
     """
     cameras = path
     if path.is_dir():
-        found = sorted(path.glob("*cams*.txt"))
-        if len(found) != 1:
-            names = ", ".join(file.name for file in found) or "none"
+        camera_files = sorted(path.glob("*cams*.txt"))
+        if len(camera_files) != 1:
+            names = ", ".join(file.name for file in camera_files) or "none"
             raise SurveyFileError(f"{path}: needed one file *cams*.txt, found: {names}")
-        cameras = found[0]
+        cameras = camera_files[0]
     points = cameras.with_name(cameras.name.replace("cams", "pts"))
     if "cams" not in cameras.name or not points.is_file():
         raise SurveyFileError(f"{cameras}: sba's cameras are in a file *cams*.txt beside one *pts*.txt")

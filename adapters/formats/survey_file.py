@@ -113,7 +113,7 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
     ]
     groups: dict[str, list[int]] = {}
     for k, camera in enumerate(estimate.cameras):
-        group = next((one for one in camera.shared if one), "")
+        group = next((owner for owner in camera.shared if owner), "")
         alone = group and len(images[k]) == 1 and camera.name == f"{group} {images[k][0]}"
         groups.setdefault(group if alone else f"{camera.name}\n{k}", []).append(k)
     for group, members in groups.items():
@@ -121,7 +121,7 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
         varying: tuple[str, ...] = ()
         if "\n" not in group:
             pairs = zip(camera.names, camera.shared, camera.free, strict=True)
-            varying = tuple(name for name, one, free in pairs if free and not one)
+            varying = tuple(name for name, owner, free in pairs if free and not owner)
             camera = replace(camera, name=group)
         names = [name for k in members for name in images[k]]
         if names:
@@ -130,12 +130,12 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
 
 def _weighted(network: Network, estimate: Estimate, camera: Camera) -> dict[str, tuple[float, float]]:
     """Return value and standard deviation of the weighted parameters of a camera."""
-    seen, found = network.interior, {}
+    seen, weighted = network.interior, {}
     for k, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
-        one = estimate.cameras[k]
-        if camera.name in (one.name, one.owner_of(s)) and camera.model == one.model:
-            found[one.names[s]] = (float(value), float(sigma))
-    return found
+        observed = estimate.cameras[k]
+        if camera.name in (observed.name, observed.owner_of(s)) and camera.model == observed.model:
+            weighted[observed.names[s]] = (float(value), float(sigma))
+    return weighted
 
 
 def _exterior(network: Network) -> str:

@@ -58,10 +58,10 @@ class Node:
         Raises:
             SurveyFileError: there is none.
         """
-        found = self.maybe(tag)
-        if found is None:
+        child = self.maybe(tag)
+        if child is None:
             raise self.error(f"<{self.tag}> without <{tag}>")
-        return found
+        return child
 
     def attribute(self, name: str) -> str:
         """Return an attribute, which must exist.
@@ -79,10 +79,10 @@ class Node:
         Raises:
             SurveyFileError: empty, too long or not plain text.
         """
-        found = self.attribute(name)
-        if not is_name(found):
-            raise self.error(f"{name} is '{shorten(found)}', needed plain text of 1 to {MAX_NAME} characters")
-        return found
+        value = self.attribute(name)
+        if not is_name(value):
+            raise self.error(f"{name} is '{shorten(value)}', needed plain text of 1 to {MAX_NAME} characters")
+        return value
 
     def number(self, name: str) -> float:
         """Return an attribute that is a finite number."""
@@ -96,8 +96,8 @@ class Node:
         """
         words = self.text.split(maxsplit=count)
         if len(words) != count:
-            found = f"more than {count}" if len(words) > count else f"{len(words)}"
-            raise self.error(f"<{self.tag}> with {found} numbers, needed {count}")
+            count_found = f"more than {count}" if len(words) > count else f"{len(words)}"
+            raise self.error(f"<{self.tag}> with {count_found} numbers, needed {count}")
         return np.array([self._number(word) for word in words])
 
     def _number(self, text: str) -> float:
