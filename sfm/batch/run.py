@@ -126,7 +126,11 @@ def run_batch(
         try:
             with engine as running:
                 rows = _run(
-                    *(plans, out, running, comparers, watch),
+                    plans,
+                    out,
+                    running,
+                    comparers,
+                    watch,
                     resume=resume,
                     allow_outside=allow_outside,
                     pictures_mb=pictures_mb,
@@ -271,7 +275,7 @@ def _run(
                 refuse_foreign_folder(out / plan.folder)
                 inputs = fingerprint(plan.survey)
                 job = SurveyJob(
-                    *(plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK)), pictures_mb
+                    plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK), pictures_mb
                 )
                 earlier = finished_row(job) if resume else None
                 if earlier is not None and not was_finished(out / plan.folder):

@@ -290,9 +290,15 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
 def _table_of_results(rows: Sequence[SurveyRow], above: str) -> Table:
     """Return the table of surveys with their results."""
     columns = (
-        *(Column("survey"), Column("file"), Column("result"), Column("photographs", format=str)),
-        *(Column("points", format="z.0f"), Column("sigma0, px", format="z.4f")),
-        *(Column("RMS, px", format="z.4f"), Column("COLMAP"), Column("seconds", format="z.1f")),
+        Column("survey"),
+        Column("file"),
+        Column("result"),
+        Column("photographs", format=str),
+        Column("points", format="z.0f"),
+        Column("sigma0, px", format="z.4f"),
+        Column("RMS, px", format="z.4f"),
+        Column("COLMAP"),
+        Column("seconds", format="z.1f"),
     )
     cells = []
     for row in rows:
@@ -304,7 +310,11 @@ def _table_of_results(rows: Sequence[SurveyRow], above: str) -> Table:
                 _below(row.file, above),
                 Mark(row.verdict if done else row.status, row.verdict or "bad"),
                 f"{row.photographs} / {row.photographs_total}" if done else None,
-                *(row.points, row.sigma0_px, row.rms_px, compared, row.seconds),
+                row.points,
+                row.sigma0_px,
+                row.rms_px,
+                compared,
+                row.seconds,
             )
         )
     return Table(columns, cells)
@@ -314,7 +324,10 @@ def _table_of_failures(rows: Sequence[SurveyRow], above: str) -> Table:
     """Return the table of surveys without a result, with the reasons."""
     cells = [
         (
-            *(row.survey, _below(row.file, above), Mark(row.status, "bad"), row.reason),
+            row.survey,
+            _below(row.file, above),
+            Mark(row.status, "bad"),
+            row.reason,
             Link(f"{row.folder}.jsonl", f"{LOGS}/{row.folder}.jsonl"),
         )
         for row in rows

@@ -100,7 +100,9 @@ def find_displacements(
         GeometryError: fewer than four reference points, or a covariance that is singular beyond its datum.
     """
     tested = congruency(
-        *(found.difference, found.covariance, found.xyz),
+        found.difference,
+        found.covariance,
+        found.xyz,
         motion=found.motion,
         redundancy=found.redundancy,
         reference=reference,

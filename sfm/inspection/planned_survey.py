@@ -118,7 +118,10 @@ class PlannedSurvey:
         C = np.tile(self.sigma_px**2 * np.eye(2), (len(i), 1, 1))
         stations = self.stations
         network = Network(
-            *(stations.names, stations.camera, self.points, ImagePoints(i, j, np.zeros((len(i), 2)), C)),
+            stations.names,
+            stations.camera,
+            self.points,
+            ImagePoints(i, j, np.zeros((len(i), 2)), C),
             moment=stations.taken_at,
         )
         for start, end, sigma in self.bars:

@@ -234,7 +234,10 @@ def predict_network(
         moment=None if stations.taken_at is None else stations.taken_at[photographs],
     )
     estimate = Estimate(
-        *(cameras, stations.position[photographs], stations.rotation[photographs], planned.xyz[points]),
+        cameras,
+        stations.position[photographs],
+        stations.rotation[photographs],
+        planned.xyz[points],
         stations.rig,
     )
     if given is not None:

@@ -36,188 +36,198 @@ PICTURE = (
 VALUES = (Column(), Column("value", format=str), Column("unit"))
 
 
-def page(found: ResultComparison, *, xyz: FloatArray) -> Page:
+def page(comparison: ResultComparison, *, xyz: FloatArray) -> Page:
     """Return the page of a comparison: verdict, key figures, picture and tables.
 
     Args:
-        found: the comparison.
+        comparison: the comparison.
         xyz: coordinates of the common points in the first result, object unit, (n, 3).
     """
-    first, second = found.names
-    known = list(compress(found.names, found.has_sigma))
-    tested = int(np.isfinite(found.statistic).sum())
+    first, second = comparison.names
+    known = list(compress(comparison.names, comparison.has_sigma))
+    tested = int(np.isfinite(comparison.statistic).sum())
     one_sided = len(known) == 1 and tested
     words = "The other result has no standard deviations; the test treats it as free of error."
     note = Note(words) if one_sided else None
     picture = None
-    if len(found.points) >= 3 and _longest(found.point_difference) > 0:
-        figure = difference_figure(xyz, found.point_difference, found.significant, found.unit)
+    if len(comparison.points) >= 3 and _longest(comparison.point_difference) > 0:
+        figure = difference_figure(xyz, comparison.point_difference, comparison.significant, comparison.unit)
         picture = plot("differences", PICTURE, figure)
     columns = (
         Column("point", "id"),
-        *axes("d", found.unit),
-        *axes("sd", found.unit),
+        *axes("d", comparison.unit),
+        *axes("sd", comparison.unit),
         Column("T", "T", format=significant),
         Column("significant", "significant", flag=YES),
     )
     rows = [
         (name, *d, *s, t, flag)
         for name, d, s, t, flag in zip(
-            *(found.points, found.point_difference, found.point_sigma, found.statistic, found.significant),
+            comparison.points,
+            comparison.point_difference,
+            comparison.point_sigma,
+            comparison.statistic,
+            comparison.significant,
             strict=True,
         )
     ]
-    verdict = verdict_of_comparison(found)
+    cameras = [
+        Section(f"Camera {interior.camera}", *_camera(interior, second)) for interior in comparison.interior
+    ]
+    verdict = verdict_of_comparison(comparison)
     return Page(
         "comparison",
         "Comparison",
         f"{second} minus {first}",
         verdict,
         (
-            Section("Figures", _figures(found, known), note),
-            Section("Test", *_test(found, tested)),
+            Section("Figures", _figures(comparison, known), note),
+            Section("Test", *_test(comparison, tested)),
             Section("Picture", picture),
-            *(Section(f"Camera {one.camera}", *_camera(one, second)) for one in found.interior),
+            *cameras,
             tested_section(verdict),
             Section("Points", FoldedParts(counted(len(rows), "point"), Table(columns, rows, "differences"))),
         ),
-        summary=_summary(found, tested),
+        summary=_summary(comparison, tested),
     )
 
 
-def _figures(found: ResultComparison, known: list[str]) -> Table:
+def _figures(comparison: ResultComparison, known: list[str]) -> Table:
     """Return how the two results were aligned, and how far apart they are."""
 
     def length(name: str, value: float) -> tuple[str, str, str]:
-        factor, unit = finer_unit(found.unit, value)
+        factor, unit = finer_unit(comparison.unit, value)
         return name, significant(value * factor), unit or "object units"
 
     aligned = {
-        "points": counted(len(found.points), "common point"),
-        "cameras": counted(len(found.images), "projection centre"),
+        "points": counted(len(comparison.points), "common point"),
+        "cameras": counted(len(comparison.images), "projection centre"),
         "control": "control points",
         "none": "nothing: both are compared as they are",
-    }[found.alignment]
+    }[comparison.alignment]
     rows = (
         ("aligned by", aligned, ""),
-        ("scale", describe_scale(found), ""),
-        ("common points", describe_pairing(found), ""),
-        length("RMS difference of a point coordinate", _rms(found.point_difference)),
-        length("largest difference of a point", _longest(found.point_difference)),
-        ("common photographs", len(found.images), ""),
-        length("RMS difference of a projection centre coordinate", _rms(found.position_difference)),
-        ("largest difference of a rotation", significant(_largest(found.rotation_deg)), "deg"),
+        ("scale", describe_scale(comparison), ""),
+        ("common points", describe_pairing(comparison), ""),
+        length("RMS difference of a point coordinate", _rms(comparison.point_difference)),
+        length("largest difference of a point", _longest(comparison.point_difference)),
+        ("common photographs", len(comparison.images), ""),
+        length("RMS difference of a projection centre coordinate", _rms(comparison.position_difference)),
+        ("largest difference of a rotation", significant(_largest(comparison.rotation_deg)), "deg"),
         ("standard deviations known for", " and ".join(known) or "neither", ""),
     )
     return Table(VALUES, rows)
 
 
-def _test(found: ResultComparison, tested: int) -> tuple[Part, ...]:
+def _test(comparison: ResultComparison, tested: int) -> tuple[Part, ...]:
     if not tested:
         return ()
-    largest = _largest(found.statistic[np.isfinite(found.statistic)])
-    moved = f"{found.significant.sum()} of {tested}" if found.majority else "not known"
+    largest = _largest(comparison.statistic[np.isfinite(comparison.statistic)])
+    moved = f"{comparison.significant.sum()} of {tested}" if comparison.majority else "not known"
     columns = (Column(), *(Column(name, format=significant) for name in ("value", "critical value")))
     rows = (
-        ("all points together", found.global_statistic, found.global_critical),
-        ("largest of a single point", largest, found.critical),
+        ("all points together", comparison.global_statistic, comparison.global_critical),
+        ("largest of a single point", largest, comparison.critical),
         ("points that moved", moved, ""),
     )
-    datum = "the points that did not move" if found.majority else "all common points"
+    datum = "the points that did not move" if comparison.majority else "all common points"
     words = (
         "T = d' (Qa + Qb)^-1 d / 3 for a difference d, with the covariance of each point alone"
-        if found.approximate
+        if comparison.approximate
         else f"Both results refer to the datum of {datum}. T of a point is a third of the decrease in the "
         "weighted square sum of all differences when that point is left out"
     )
     return Table(columns, rows), Note(f"{words}; chance alone gives about 1.")
 
 
-def _camera(one: InteriorDifference, second: str) -> tuple[Part | None, ...]:
+def _camera(interior: InteriorDifference, second: str) -> tuple[Part | None, ...]:
     columns = (
         Column("parameter"),
         Column("difference", format=".4g"),
         Column("sigma", format=".2g", unknown="not known"),
         Column("unit"),
     )
-    converted = one.conversion
+    converted = interior.conversion
     note = (
         None
         if converted is None
         else Note(
-            f"{second}: {converted.source_model} written as {one.model} differs by "
+            f"{second}: {converted.source_model} written as {interior.model} differs by "
             f"{fixed(converted.rms_px, 4)} px RMS, {fixed(converted.max_px, 4)} px at most. Parameters of a "
             "converted camera have no sigma here."
         )
     )
-    return Table(columns, list(zip(one.names, one.difference, one.sigma, one.units, strict=True))), note
+    return Table(
+        columns, list(zip(interior.names, interior.difference, interior.sigma, interior.units, strict=True))
+    ), note
 
 
-def _summary(found: ResultComparison, tested: int) -> dict[str, Any]:
+def _summary(comparison: ResultComparison, tested: int) -> dict[str, Any]:
     """Return the content of comparison.json."""
-    verdict = verdict_of_comparison(found)
+    verdict = verdict_of_comparison(comparison)
     return {
-        "results": found.names,
-        "length_unit": found.unit,
-        "standard_deviations": found.has_sigma,
-        "same_image_points": found.same_share,
+        "results": comparison.names,
+        "length_unit": comparison.unit,
+        "standard_deviations": comparison.has_sigma,
+        "same_image_points": comparison.same_share,
         "paired": values_of(
-            found.pairing, "points_by_name points_by_image_points points_by_place images_by_name"
+            comparison.pairing, "points_by_name points_by_image_points points_by_place images_by_name"
         ),
-        **values_of(found, "alignment scale_estimated"),
-        "scale": found.a_from_b.scale,
-        "points": len(found.points),
-        "images": len(found.images),
-        "rms_point": _rms(found.point_difference),
-        "max_point": _longest(found.point_difference),
-        "rms_position": _rms(found.position_difference),
-        "max_rotation_deg": _largest(found.rotation_deg),
-        "changed": found.changed,
+        **values_of(comparison, "alignment scale_estimated"),
+        "scale": comparison.a_from_b.scale,
+        "points": len(comparison.points),
+        "images": len(comparison.images),
+        "rms_point": _rms(comparison.point_difference),
+        "max_point": _longest(comparison.point_difference),
+        "rms_position": _rms(comparison.position_difference),
+        "max_rotation_deg": _largest(comparison.rotation_deg),
+        "changed": comparison.changed,
         **verdict.as_dict(),
-        "untested": found.untested and found.untested.kind,
-        "approximate": found.approximate,
+        "untested": comparison.untested and comparison.untested.kind,
+        "approximate": comparison.approximate,
         "tested": tested,
-        "global_test": {"statistic": found.global_statistic, "critical": found.global_critical},
-        "significant": list(compress(found.points, found.significant)),
+        "global_test": {"statistic": comparison.global_statistic, "critical": comparison.global_critical},
+        "significant": list(compress(comparison.points, comparison.significant)),
         "cameras": [
             {
-                "name": one.camera,
-                "model": one.model,
-                "difference": dict(zip(one.names, one.difference, strict=True)),
-                "sigma": dict(zip(one.names, one.sigma, strict=True)),
-                "conversion": one.conversion
-                and {"from": one.conversion.source_model} | values_of(one.conversion, "rms_px max_px"),
+                "name": interior.camera,
+                "model": interior.model,
+                "difference": dict(zip(interior.names, interior.difference, strict=True)),
+                "sigma": dict(zip(interior.names, interior.sigma, strict=True)),
+                "conversion": interior.conversion
+                and {"from": interior.conversion.source_model}
+                | values_of(interior.conversion, "rms_px max_px"),
             }
-            for one in found.interior
+            for interior in comparison.interior
         ],
     }
 
 
-def describe_pairing(found: ResultComparison) -> str:
+def describe_pairing(comparison: ResultComparison) -> str:
     """Return in words how many points are common and how they were matched."""
-    pairing = found.pairing
+    pairing = comparison.pairing
     ways = [
         (pairing.points_by_name, "by name"),
         (pairing.points_by_image_points, "by their image points"),
         (pairing.points_by_place, "by position"),
     ]
     said = ", ".join(f"{count} {way}" for count, way in ways if count)
-    return f"{counted(len(found.points), 'common point')}{f' ({said})' if said else ''}"
+    return f"{counted(len(comparison.points), 'common point')}{f' ({said})' if said else ''}"
 
 
-def describe_scale(found: ResultComparison) -> str:
+def describe_scale(comparison: ResultComparison) -> str:
     """Return in words how the alignment treated the scale."""
-    if found.alignment == "none":
+    if comparison.alignment == "none":
         return "not aligned"
-    if not found.scale_estimated:
+    if not comparison.scale_estimated:
         return "scale kept: both results are scaled"
-    return f"scale estimated, {found.a_from_b.scale:.9g}: not both results are scaled"
+    return f"scale estimated, {comparison.a_from_b.scale:.9g}: not both results are scaled"
 
 
-def largest_difference(found: ResultComparison) -> str:
+def largest_difference(comparison: ResultComparison) -> str:
     """Return the largest difference of a point with its unit."""
-    longest = _longest(found.point_difference)
-    return length_of(longest, found.unit, of_unknown=f"object units of {found.names[0]}")
+    longest = _longest(comparison.point_difference)
+    return length_of(longest, comparison.unit, of_unknown=f"object units of {comparison.names[0]}")
 
 
 def _largest(values: FloatArray) -> float:

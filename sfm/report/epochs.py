@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import compress
+from itertools import chain, compress
 from typing import Any
 
 import numpy as np
@@ -48,43 +48,48 @@ STEPS = (
     Column("removed then", "removed"),
 )
 SERIES = (
-    *(Column(name="id"), Column(name="epoch"), *axes("d"), *axes("sd"), Column(name="moved", flag=YES)),
+    Column(name="id"),
+    Column(name="epoch"),
+    *axes("d"),
+    *axes("sd"),
+    Column(name="moved", flag=YES),
 )
 MICRO, DEGREES = 1e6, float(np.rad2deg(1.0))
 
 
-def page(found: EpochSeries) -> Page:
+def page(series: EpochSeries) -> Page:
     """Return the page: verdict, pairs of epochs with their tests, displacements and groups."""
-    displacements = [row for pair in found.pairs for row in _rows(pair.displacements)]
-    since = [row for pair in found.since_first for row in _rows(pair.displacements)]
+    displacements = [row for pair in series.pairs for row in _rows(pair.displacements)]
+    since = [row for pair in series.since_first for row in _rows(pair.displacements)]
     moved_on = [(row[2], row[1], *row[3:9], row[-2]) for row in since]
-    verdict = verdict_of_epochs(found)
+    verdict = verdict_of_epochs(series)
+    sections = [_section(pair, k) for k, pair in enumerate(series.pairs)]
     return Page(
         "epochs",
         "Epochs",
-        " - ".join((found.names[0], found.names[-1])),
+        " - ".join((series.names[0], series.names[-1])),
         verdict,
         (
-            Section("Series", plot_series(found)),
-            *(_section(pair, k) for k, pair in enumerate(found.pairs)),
+            Section("Series", plot_series(series)),
+            *sections,
             tested_section(verdict),
         ),
-        viewer=displacements_viewer(found),
+        viewer=displacements_viewer(series),
         summary={
-            "epochs": found.names,
-            "changed": found.changed,
+            "epochs": series.names,
+            "changed": series.changed,
             **verdict.as_dict(),
             "adjusted_together": [
                 {
-                    "camera": one.name,
-                    "epochs": one.epochs,
-                    "parameters": one.parameters,
-                    "T": one.statistic,
-                    "critical": one.critical,
+                    "camera": camera.name,
+                    "epochs": camera.epochs,
+                    "parameters": camera.parameters,
+                    "T": camera.statistic,
+                    "critical": camera.critical,
                 }
-                for one in found.cameras
+                for camera in series.cameras
             ],
-            "pairs": [_pair(pair) for pair in found.pairs],
+            "pairs": [_pair(pair) for pair in series.pairs],
         },
         files=(
             Table(_columns(), displacements, "displacements"),
@@ -96,50 +101,65 @@ def page(found: EpochSeries) -> Page:
 def _columns(factor: float = 1.0, unit: str = "") -> tuple[Column, ...]:
     """Return the columns of displacements."""
     return (
-        *(Column(None, "first"), Column(None, "second"), Column("point", "id")),
+        Column(None, "first"),
+        Column(None, "second"),
+        Column("point", "id"),
         *axes("d", unit, factor=factor),
         *axes("sd", unit, factor=factor),
         Column(None, "length"),
         Column("T", "T", format=significant),
         Column("critical", "critical", format=significant),
-        *(Column(), Column(None, "stable", flag=YES), Column(None, "moved", flag=YES)),
+        Column(),
+        Column(None, "stable", flag=YES),
+        Column(None, "moved", flag=YES),
         Column("detectable", "detectable", unit, significant, factor),
     )
 
 
-def _rows(found: Displacements) -> list[tuple[Any, ...]]:
+def _rows(displacements: Displacements) -> list[tuple[Any, ...]]:
     """Return a row for each displacement, in the object unit."""
-    states = ["moved" if m else "stable" if s else "" for m, s in zip(found.moved, found.stable, strict=True)]
-    length = np.linalg.norm(found.displacement, axis=1)
+    states = [
+        "moved" if m else "stable" if s else ""
+        for m, s in zip(displacements.moved, displacements.stable, strict=True)
+    ]
+    length = np.linalg.norm(displacements.displacement, axis=1)
     return [
-        (*found.differences.names, name, *d, *s, *others)
+        (*displacements.differences.names, name, *d, *s, *others)
         for name, d, s, *others in zip(
-            *(found.differences.points, found.displacement, found.sigma, length),
-            *(found.congruency.statistic, found.congruency.critical, states, found.stable, found.moved),
-            found.detectable,
+            displacements.differences.points,
+            displacements.displacement,
+            displacements.sigma,
+            length,
+            displacements.congruency.statistic,
+            displacements.congruency.critical,
+            states,
+            displacements.stable,
+            displacements.moved,
+            displacements.detectable,
             strict=True,
         )
     ]
 
 
-def _steps(found: Displacements) -> Table:
+def _steps(displacements: Displacements) -> Table:
     """Return the steps of the search for stable points."""
-    names = found.differences.points
+    names = displacements.differences.points
     return Table(
         STEPS,
         [
-            (one.points, one.omega, one.freedom, one.statistic, one.critical,
-             None if one.removed is None else names[one.removed])
-            for one in found.congruency.search.steps
+            (step.points, step.omega, step.freedom, step.statistic, step.critical,
+             None if step.removed is None else names[step.removed])
+            for step in displacements.congruency.search.steps
         ],
     )  # fmt: skip
 
 
 def _section(pair: EpochPair, number: int) -> Section:
     """Return the section of a pair of epochs."""
-    found = pair.displacements
-    d = found.differences
-    factor, unit = finer_unit(d.unit, _typical(found))
+    displacements = pair.displacements
+    d = displacements.differences
+    lengths: FloatArray = np.linalg.norm(displacements.displacement, axis=1)
+    factor, unit = finer_unit(d.unit, float(max(np.median(displacements.detectable), lengths.max())))
     unit = unit or "object units"
     kept = "translation and rotation" if d.motion == "rigid" else (
         "translation, rotation and scale: not both epochs are scaled"
@@ -160,23 +180,23 @@ def _section(pair: EpochPair, number: int) -> Section:
     test = Note(
         "T is the weighted square sum of the differences over its degrees of freedom, after the "
         "S-transformation to the remaining points; chance alone gives about 1. The level of "
-        f"{general(100 * found.alpha, 2)} % is shared between this test and those of single points."
+        f"{general(100 * displacements.alpha, 2)} % is shared between this test and those of single points."
     )
     limits = Note(
         "sd: standard deviations. Detectable: the smallest displacement, in its worst direction, that would "
         f"be detected with a probability of {general(100 * POWER, 2)} %."
     )
-    points = (Table(_columns(factor, unit), _rows(found)), limits)
+    points = (Table(_columns(factor, unit), _rows(displacements)), limits)
     return Section(
         " to ".join(d.names),
         Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
         shared if d.shared else None,
-        Paragraph(describe_stable(found)),
-        _steps(found),
+        Paragraph(describe_stable(displacements)),
+        _steps(displacements),
         test,
-        _picture(found, number),
-        FoldedParts(counted(len(d.points), "point"), *points, open=bool(found.moved.any())),
-        *(part for block in pair.blocks for part in _block(block, factor, unit)),
+        _picture(displacements, number),
+        FoldedParts(counted(len(d.points), "point"), *points, open=bool(displacements.moved.any())),
+        *chain.from_iterable(_block(block, factor, unit) for block in pair.blocks),
         *_mounts(pair, factor, unit),
     )
 
@@ -190,12 +210,11 @@ def _block(block: BlockMotion, factor: float, unit: str) -> tuple[Part, ...]:
             scale, of = DEGREES, "deg"
         rows.append((name, scale * value, scale * sigma, of))
     tests = [
-        *(
-            (part.name, part.statistic, part.critical, "significant" if part.significant else "")
-            for part in block.parts
-        ),
-        ("remaining displacements", block.statistic, block.critical, "" if block.fits else "significant"),
+        (part.name, part.statistic, part.critical, "significant" if part.significant else "")
+        for part in block.parts
     ]
+    remaining = "" if block.fits else "significant"
+    tests.append(("remaining displacements", block.statistic, block.critical, remaining))
     numbers = [Column(name, format=significant) for name in ("value", "sigma")]
     limits = [Column(name, format=significant, unknown="") for name in ("T", "critical value")]
     return (
@@ -211,38 +230,38 @@ def _mounts(pair: EpochPair, factor: float, unit: str) -> tuple[Part, ...]:
     if not pair.mounts:
         return ()
     scale = np.repeat([factor, DEGREES], 3)
-    rows = [
-        (one.camera, *(scale * one.difference), one.statistic, one.critical, "moved" if one.changed else "")
-        for one in pair.mounts
-    ]
-    columns = (
-        *(Column("camera"), *axes("d", unit)),
-        *(Column(f"d{name}", "", "deg", significant) for name in ("omega", "phi", "kappa")),
-        *(Column(name, format=significant) for name in ("T", "critical value")),
-        Column(),
-    )
+    rows = []
+    for mount in pair.mounts:
+        moved = "moved" if mount.changed else ""
+        rows.append((mount.camera, *scale * mount.difference, mount.statistic, mount.critical, moved))
+    angles = [Column(f"d{name}", "", "deg", significant) for name in ("omega", "phi", "kappa")]
+    test = [Column(name, format=significant) for name in ("T", "critical value")]
+    columns = (Column("camera"), *axes("d", unit), *angles, *test, Column())
     return Heading("Mounts of rigs"), Table(columns, rows)
 
 
-def describe_stable(found: Displacements) -> str:
+def describe_stable(displacements: Displacements) -> str:
     """Return in words which points define the datum, and how they were found."""
-    if not found.agreed:
+    if not displacements.agreed:
         return (
             "No stable set is proposed; displacements refer to the datum of all reference points. Name "
             "stable ones with --reference."
         )
     removed = [
-        found.differences.points[s.removed] for s in found.congruency.search.steps if s.removed is not None
+        displacements.differences.points[s.removed]
+        for s in displacements.congruency.search.steps
+        if s.removed is not None
     ]
-    count, all_of_them = int(found.stable.sum()), int(found.reference.sum())
+    count, all_of_them = int(displacements.stable.sum()), int(displacements.reference.sum())
     if count == all_of_them:
         return f"All {counted(count, 'reference point')} agree."
     by = (
         " by removing one point after another"
-        if found.congruency.robust is None or bool((found.stable == found.congruency.search.stable).all())
+        if displacements.congruency.robust is None
+        or bool((displacements.stable == displacements.congruency.search.stable).all())
         else " by a robust start"
     )
-    undecided = list(compress(found.differences.points, found.undecided))
+    undecided = list(compress(displacements.differences.points, displacements.undecided))
     left = f" Left out but not shown to have moved: {_names(undecided)}." if undecided else ""
     gone = f" ({_names(removed)} in this order)" if removed and " one " in by else ""
     return (
@@ -264,8 +283,8 @@ def describe_block(block: BlockMotion) -> str:
 
 
 def _pair(pair: EpochPair) -> dict[str, Any]:
-    found = pair.displacements
-    d = found.differences
+    displacements = pair.displacements
+    d = displacements.differences
     return {
         "first": d.names[0],
         "second": d.names[1],
@@ -275,40 +294,35 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
         "no_change": d.motion,
         "shared_given_values": d.shared,
         **values_of(d, "held_alike held_apart"),
-        **values_of(found, "alpha agreed"),
-        "stable": list(compress(d.points, found.stable)),
-        "moved": list(compress(d.points, found.moved)),
-        "undecided": list(compress(d.points, found.undecided)),
-        "steps": _steps(found).records,
+        **values_of(displacements, "alpha agreed"),
+        "stable": list(compress(d.points, displacements.stable)),
+        "moved": list(compress(d.points, displacements.moved)),
+        "undecided": list(compress(d.points, displacements.undecided)),
+        "steps": _steps(displacements).records,
         "groups": [
             {
-                **values_of(one, "name points model centre"),
+                **values_of(block, "name points model centre"),
                 "parameters": {
                     name: {"value": value, "sigma": sigma}
-                    for name, value, sigma in zip(one.parameters, one.value, one.sigma, strict=True)
+                    for name, value, sigma in zip(block.parameters, block.value, block.sigma, strict=True)
                 },
-                "significant": [part.name for part in one.parts if part.significant],
-                "moved_as_one": one.fits,
+                "significant": [part.name for part in block.parts if part.significant],
+                "moved_as_one": block.fits,
             }
-            for one in pair.blocks
+            for block in pair.blocks
         ],
         "mounts": [
-            values_of(one, "camera difference sigma statistic critical changed") for one in pair.mounts
+            values_of(mount, "camera difference sigma statistic critical changed") for mount in pair.mounts
         ],
     }
 
 
-def _picture(found: Displacements, number: int) -> Plot | None:
-    if not np.linalg.norm(found.displacement, axis=1).max() > 0:
+def _picture(displacements: Displacements, number: int) -> Plot | None:
+    if not np.linalg.norm(displacements.displacement, axis=1).max() > 0:
         return None
-    d = found.differences
-    figure = difference_figure(d.xyz, found.displacement, found.moved, d.unit)
+    d = displacements.differences
+    figure = difference_figure(d.xyz, displacements.displacement, displacements.moved, d.unit)
     return plot(f"displacements-{number}", PICTURE, figure)
-
-
-def _typical(found: Displacements) -> float:
-    lengths: FloatArray = np.linalg.norm(found.displacement, axis=1)
-    return float(max(np.median(found.detectable), lengths.max()))
 
 
 def _names(names: Iterable[str]) -> str:

@@ -69,12 +69,12 @@ def given_parts(
     parts = list(_check(check, adjustment, unit)) if check is not None else []
     for kind in given.kinds:
         parts += _kind(kind, adjustment, unit)
-    if found := adjustment.group_parameters:
+    if group_parameters := adjustment.group_parameters:
         rows = [
-            (one.group, name, *with_exponent(value, sigma), unit)
-            for one in found
+            (parameters.group, name, *with_exponent(value, sigma), unit)
+            for parameters in group_parameters
             for name, value, sigma in zip(
-                one.names, one.value, np.sqrt(np.diagonal(one.covariance)), strict=True
+                parameters.names, parameters.value, np.sqrt(np.diagonal(parameters.covariance)), strict=True
             )
         ]
         heads = columns("of", "parameter", ">value", ">sigma", "unit")
@@ -97,10 +97,17 @@ def _equipment(placed: Sequence[PlacedEquipment]) -> tuple[Part, ...]:
     )
     rows = [
         (
-            *(one.name, one.given_as, one.calibrated.isoformat(), one.calibration_temperature),
-            *(one.expansion, one.expansion_sigma, one.temperature, one.temperature_sigma, one.correction),
+            equipment.name,
+            equipment.given_as,
+            equipment.calibrated.isoformat(),
+            equipment.calibration_temperature,
+            equipment.expansion,
+            equipment.expansion_sigma,
+            equipment.temperature,
+            equipment.temperature_sigma,
+            equipment.correction,
         )
-        for one in placed
+        for equipment in placed
     ]
     note = Note(
         "Lengths are corrected to the temperature of the survey. Their standard deviations include "
@@ -124,35 +131,40 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
         f"{placed} Differences at each point, fitted minus nominal [{finer}]:"
     )
     heads = (
-        *(Column("control point"), *axes("d", "", signed, factor=factor)),
+        Column("control point"),
+        *axes("d", "", signed, factor=factor),
         Column("length", format=significant, factor=factor),
     )
     length = np.linalg.norm(check.differences, axis=1)
     rows = [(n, *d, s) for n, d, s in zip(check.points, check.differences, length, strict=True)]
-    rms = ("RMS", *(significant(factor * one) for one in check.rms), float(np.linalg.norm(check.rms)))
+    rms = ("RMS", *(significant(factor * value) for value in check.rms), float(np.linalg.norm(check.rms)))
     words = Paragraph(describe_check(check, unit))
     return Heading("Check at the control"), words, note, Table(heads, rows, total=rms)
 
 
-def _kind(found: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
+def _kind(residuals: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
     """Yield the residuals of the values of a kind, largest w first."""
-    rows = [_to_second_digit(row) for row in found.table_rows]
+    rows = [_to_second_digit(row) for row in residuals.table_rows]
     if not rows:
         return
-    yield Heading(HEADINGS.get(found.kind, f"Observations: {found.kind}"))
-    what = counted(len(found.names), _named(found))
-    if not found.checked and found.kind == "control point":
+    yield Heading(HEADINGS.get(residuals.kind, f"Observations: {residuals.kind}"))
+    what = counted(len(residuals.names), _named(residuals))
+    if not residuals.checked and residuals.kind == "control point":
         yield Paragraph(f"{what} held fixed: the adjusted coordinates are the given ones, without residuals.")
         return
-    heads, factor, unit = _columns(found, length_unit)
-    if len(found.names) > 1 and len(found.coordinates) > 1 and unit:  # not of one group of observations
-        rms = ", ".join(significant(factor * one) for one in found.rms)
-        yield Paragraph(f"{what}, RMS {rms} {unit} in {', '.join(found.coordinates)}, adjusted minus given.")
+    heads, factor, unit = _columns(residuals, length_unit)
+    if (
+        len(residuals.names) > 1 and len(residuals.coordinates) > 1 and unit
+    ):  # not of one group of observations
+        rms = ", ".join(significant(factor * value) for value in residuals.rms)
+        yield Paragraph(
+            f"{what}, RMS {rms} {unit} in {', '.join(residuals.coordinates)}, adjusted minus given."
+        )
     yield Note(R_AND_W)
     rows.sort(key=lambda row: -abs(np.nan_to_num(row[-1])))
     table = Table(heads, rows, all_in="given.csv")
     yield table if len(rows) <= MAX_OPEN else FoldedParts(counted(len(rows), "value"), table, in_text=True)
-    if found.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
+    if residuals.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
         yield Note("A single bar gives the scale but cannot be checked; two or more check one another.")
 
 
@@ -164,22 +176,22 @@ def _to_second_digit(row: Sequence[Any]) -> tuple[Any, ...]:
     return (*row[:given], with_sigma(float(row[given]), stated)[0], *row[given + 1 :])
 
 
-def _named(found: GivenResiduals) -> str:
+def _named(residuals: GivenResiduals) -> str:
     """Return the noun for the names of the values."""
-    return "photograph" if found.kind in (CENTRE, ROTATION) else found.kind
+    return "photograph" if residuals.kind in (CENTRE, ROTATION) else residuals.kind
 
 
-def _columns(found: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
+def _columns(residuals: GivenResiduals, length_unit: str) -> tuple[tuple[Column, ...], float, str]:
     """Return the columns of given.csv, and factor and unit of differences if all values share a unit."""
-    units = {unit for row in found.units for unit in row}
+    units = {unit for row in residuals.units for unit in row}
     unit = finer = "" if len(units) > 1 else units.pop()
     factor = 1.0
     if unit == length_unit:
-        factor, finer = finer_unit_of(unit, found.difference, found.sigma)
-    several = {"coordinate": Column()} if len(found.coordinates) > 1 else {}
+        factor, finer = finer_unit_of(unit, residuals.difference, residuals.sigma)
+    several = {"coordinate": Column()} if len(residuals.coordinates) > 1 else {}
     shown = {
         **({} if unit else {"unit": Column("unit")}),
-        "name": Column(_named(found)),
+        "name": Column(_named(residuals)),
         "given": Column("given", "", unit, str),
         "difference": Column("adjusted - given", "", finer, signed, factor),
         "sigma": Column("sigma", "", finer, or_fixed, factor),

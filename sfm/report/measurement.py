@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import compress
+from itertools import chain, compress
 from pathlib import Path
 from typing import Any
 
@@ -46,110 +46,156 @@ METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to n
 USED = ("no", "yes")
 
 
-def page(found: Measurement, *, result: Solution) -> Page:
+def page(measurement: Measurement, *, result: Solution) -> Page:
     """Return the page of a measurement: verdict, tolerances, shapes, functions and points.
 
     Args:
-        found: the measurement.
+        measurement: the measurement.
         result: the result that was measured, for the scene.
     """
-    points, u = found.points, found.unit
-    groups = counted(len(found.groups), "group") if found.groups else ""
-    quantities = quantity_table(found)
-    columns = (*(Column("point", "id"), *axes("", u, ".9g"), *axes("s", u)), Column("group", "group"))
+    points, u = measurement.points, measurement.unit
+    groups = counted(len(measurement.groups), "group") if measurement.groups else ""
+    quantities = quantity_table(measurement)
+    columns = (Column("point", "id"), *axes("", u, ".9g"), *axes("s", u), Column("group", "group"))
     rows = [
-        (name, *xyz, *sigma, found.group_of(j))
-        for j, (name, xyz, sigma) in enumerate(zip(points.names, points.xyz, point_sigma(found), strict=True))
+        (name, *xyz, *sigma, measurement.group_of(j))
+        for j, (name, xyz, sigma) in enumerate(
+            zip(points.names, points.xyz, point_sigma(measurement), strict=True)
+        )
     ]
+    judged = [
+        Tile(
+            tolerance.name,
+            f"{tolerance.count('in')} of {len(tolerance.points)} in",
+            f"{tolerance.count('out')} out, {tolerance.count('undecided')} undecided, against "
+            f"{tolerance.against}",
+        )
+        for tolerance in measurement.tolerances[:3]
+    ]
+    files = [
+        _parameters(measurement, measurement.shapes),
+        _shape_points(measurement, measurement.shapes),
+        _deviations(measurement, measurement.tolerances),
+    ]
+    if not quantities.rows:  # else it is on the page
+        files.insert(2, quantities)
     return Page(
         "measurement",
         "Measurement",
-        found.name,
-        found.verdict,
+        measurement.name,
+        measurement.verdict,
         (
-            Section("Tolerances", *_tolerances(found)),
-            Section("Shapes", *(part for fit in found.shapes for part in _shape(found, fit))),
+            Section("Tolerances", *_tolerances(measurement)),
+            Section("Shapes", *chain.from_iterable(_shape(measurement, fit) for fit in measurement.shapes)),
             Section("Distances, angles and heights", quantities if quantities.rows else None),
-            Section("Alignment", *_alignment(found.alignment, u)),
+            Section("Alignment", *_alignment(measurement.alignment, u)),
             Section("Points", FoldedParts(counted(len(rows), "point"), Table(columns, rows, "points"))),
         ),
         tiles=(
             Tile("Points", len(points.names), groups),
-            Tile("Shapes", len(found.shapes)),
-            *(
-                Tile(
-                    one.name,
-                    f"{one.count('in')} of {len(one.points)} in",
-                    f"{one.count('out')} out, {one.count('undecided')} undecided, against {one.against}",
-                )
-                for one in found.tolerances[:3]
-            ),
+            Tile("Shapes", len(measurement.shapes)),
+            *judged,
         ),
-        viewer=measurement_viewer(found, result),
-        summary=_summary(found, quantities),
-        files=(
-            _parameters(found, found.shapes),
-            _shape_points(found, found.shapes),
-            *(() if quantities.rows else (quantities,)),
-            _deviations(found, found.tolerances),
-        ),
+        viewer=measurement_viewer(measurement, result),
+        summary=_summary(measurement, quantities),
+        files=tuple(files),
     )
 
 
-def write_point_covariance(found: Measurement, folder: Path) -> None:
+def write_point_covariance(measurement: Measurement, folder: Path) -> None:
     """Write the joint covariance of the points, if it is known and there are not too many."""
-    covariance = found.points.covariance
-    if covariance is not None and covariance.ndim == 2 and len(found.points.names) <= MAX_POINTS:
-        write_covariance(folder, covariance, found.points.names, None)
+    covariance = measurement.points.covariance
+    if covariance is not None and covariance.ndim == 2 and len(measurement.points.names) <= MAX_POINTS:
+        write_covariance(folder, covariance, measurement.points.names, None)
 
 
-def _tolerances(found: Measurement) -> tuple[Part, ...]:
+def _tolerances(measurement: Measurement) -> tuple[Part, ...]:
     """Return the number of deviations with each decision, and every deviation."""
-    if not found.tolerances:
+    if not measurement.tolerances:
         return ()
-    u = found.unit
+    u = measurement.unit
+    decisions = [Column(decision, format=str) for decision in DECISIONS]
     columns = (
-        *(Column(), Column("against"), Column("lower", "", u, significant)),
-        *(Column("upper", "", u, significant), *(Column(one, format=str) for one in DECISIONS)),
+        Column(),
+        Column("against"),
+        Column("lower", "", u, significant),
+        Column("upper", "", u, significant),
+        *decisions,
         Column("not measured", format=str),
     )
     rows = [
-        (one.name, one.against, one.lower, one.upper, *map(one.count, DECISIONS), len(one.missing))
-        for one in found.tolerances
+        (
+            tolerance.name,
+            tolerance.against,
+            tolerance.lower,
+            tolerance.upper,
+            *map(tolerance.count, DECISIONS),
+            len(tolerance.missing),
+        )
+        for tolerance in measurement.tolerances
     ]
     note = Note(
-        f"ISO 14253-1 with U = {general(found.coverage, 3)} sigma unless a tolerance states another factor. "
-        "In and out are proven; undecided means within U of a limit."
+        f"ISO 14253-1 with U = {general(measurement.coverage, 3)} sigma unless a tolerance states another "
+        "factor. In and out are proven; undecided means within U of a limit."
     )
     parts: list[Part] = [Table(columns, rows), note]
-    for k, one in enumerate(found.tolerances):
-        caption = f"Deviations of {one.name} from {one.against}, with the limits."
-        folded = FoldedParts(counted(len(one.points), "deviation"), _deviations(found, [one], file=""))
-        parts += [Heading(one.name), plot(f"deviations {k}", caption, deviation_figure(one, u)), folded]
+    for k, tolerance in enumerate(measurement.tolerances):
+        caption = f"Deviations of {tolerance.name} from {tolerance.against}, with the limits."
+        folded = FoldedParts(
+            counted(len(tolerance.points), "deviation"), _deviations(measurement, [tolerance], file="")
+        )
+        parts += [
+            Heading(tolerance.name),
+            plot(f"deviations {k}", caption, deviation_figure(tolerance, u)),
+            folded,
+        ]
     return tuple(parts)
 
 
-def _deviations(found: Measurement, those: Iterable[Deviations], *, file: str = "deviations") -> Table:
+def _deviations(
+    measurement: Measurement, tolerances: Iterable[Deviations], *, file: str = "deviations"
+) -> Table:
     """Return the deviations of tolerances."""
-    u = found.unit
+    u = measurement.unit
     columns = (
-        *(Column(None, "tolerance"), Column("point", "point"), *axes("d", u, signed)),
-        *(Column("deviation", "deviation", u, signed), Column("sigma", "sigma", u, significant)),
-        *(Column(None, "U"), Column(None, "lower"), Column(None, "upper"), Column("decision", "decision")),
+        Column(None, "tolerance"),
+        Column("point", "point"),
+        *axes("d", u, signed),
+        Column("deviation", "deviation", u, signed),
+        Column("sigma", "sigma", u, significant),
+        Column(None, "U"),
+        Column(None, "lower"),
+        Column(None, "upper"),
+        Column("decision", "decision"),
     )
     rows = [
-        (one.name, found.points.names[j], *d, v, s, one.coverage * s, one.lower, one.upper, decision)
-        for one in those
+        (
+            tolerance.name,
+            measurement.points.names[j],
+            *d,
+            v,
+            s,
+            tolerance.coverage * s,
+            tolerance.lower,
+            tolerance.upper,
+            decision,
+        )
+        for tolerance in tolerances
         for j, d, v, s, decision in zip(
-            one.points, one.vector, one.value, one.sigma, one.decision, strict=True
+            tolerance.points,
+            tolerance.vector,
+            tolerance.value,
+            tolerance.sigma,
+            tolerance.decision,
+            strict=True,
         )
     ]
     return Table(columns, rows, file)
 
 
-def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
+def _shape(measurement: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
     """Return parameters, fit and points of a shape."""
-    u, size = found.unit, len(fit.used)
+    u, size = measurement.unit, len(fit.used)
     sigma0 = "not known" if np.isnan(fit.sigma0) else fixed(fit.sigma0, 3)
     if fit.weights != "network" and np.isfinite(fit.sigma0):
         sigma0 = f"{significant(fit.sigma0)} {u}"
@@ -160,7 +206,7 @@ def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
         ("RMS distance", f"{significant(fit.rms)} {u}"),
         ("Form error", f"{significant(fit.form_error)} {u}, {span}"),
     ]
-    network = f"covariance of the points{'' if found.points.correlated else ', each point alone'}"
+    network = f"covariance of the points{'' if measurement.points.correlated else ', each point alone'}"
     rows.append(("Weights", network if fit.weights == "network" else "equal"))
     rows.append(("Sigma0", f"{sigma0}, redundancy {fit.redundancy}"))
     if fit.weights == "network" and fit.fits is not None:
@@ -171,78 +217,105 @@ def _shape(found: Measurement, fit: ShapeFit) -> tuple[Part, ...]:
     rows.append(("Standard deviations from", source))
     if fit.offset:
         rows.append(("Offset of the targets", f"{signed(fit.offset)} {u} along the normal"))
-    points = _shape_points(found, [fit], file="")
+    points = _shape_points(measurement, [fit], file="")
     return (
         Heading(f"{fit.name}: {fit.shape.kind.name}"),
-        _parameters(found, [fit], file=""),
+        _parameters(measurement, [fit], file=""),
         facts(rows),
         FoldedParts(counted(len(fit.points), "point"), points),
     )
 
 
-def _parameters(found: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shapes") -> Table:
+def _parameters(measurement: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shapes") -> Table:
     """Return a table of the parameters of shapes, angles in degrees."""
     columns = (
-        *(Column(None, "shape"), Column(None, "kind"), Column("parameter"), Column(None, "parameter")),
-        *(Column(None, "axis"), Column(None, "value"), Column(None, "sigma"), Column("value", format=str)),
-        *(Column("sigma", format=str), Column("unit"), Column(None, "unit")),
+        Column(None, "shape"),
+        Column(None, "kind"),
+        Column("parameter"),
+        Column(None, "parameter"),
+        Column(None, "axis"),
+        Column(None, "value"),
+        Column(None, "sigma"),
+        Column("value", format=str),
+        Column("sigma", format=str),
+        Column("unit"),
+        Column(None, "unit"),
     )
     rows = [
         (
-            *(fit.name, fit.shape.kind.name, f"{name} {axis}".rstrip(), name, axis, value, sigma),
-            *(*with_sigma(value, sigma), "" if unit == "1" else unit, unit),
+            fit.name,
+            fit.shape.kind.name,
+            f"{name} {axis}".rstrip(),
+            name,
+            axis,
+            value,
+            sigma,
+            *with_sigma(value, sigma),
+            "" if unit == "1" else unit,
+            unit,
         )
         for fit in shapes
-        for name, axis, value, sigma, unit in parameter_rows(fit, found.unit)
+        for name, axis, value, sigma, unit in parameter_rows(fit, measurement.unit)
     ]
     return Table(columns, rows, file)
 
 
-def _shape_points(found: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shape_points") -> Table:
+def _shape_points(
+    measurement: Measurement, shapes: Iterable[ShapeFit], *, file: str = "shape_points"
+) -> Table:
     """Return the distances of points from shapes."""
-    u = found.unit
+    u = measurement.unit
     columns = (
-        *(Column(None, "shape"), Column("point", "point"), Column("deviation", "deviation", u, signed)),
+        Column(None, "shape"),
+        Column("point", "point"),
+        Column("deviation", "deviation", u, signed),
         Column("sigma", "sigma", u, significant),
         Column("w", "w", format="z.2f", unknown=""),
         Column("used", "used", flag=USED),
     )
     rows = [
-        (fit.name, found.points.names[j], *values)
+        (fit.name, measurement.points.names[j], *values)
         for fit in shapes
         for j, *values in zip(fit.points, fit.deviation, fit.sigma, fit.w, fit.used, strict=True)
     ]
     return Table(columns, rows, file)
 
 
-def quantity_table(found: Measurement) -> Table:
+def quantity_table(measurement: Measurement) -> Table:
     """Return a table of distances, angles and heights, angles in degrees."""
     columns = (
-        *(Column("", "name"), Column("of", "what"), Column(None, "value"), Column(None, "sigma")),
-        *(Column("value", format=str), Column("sigma", format=str), Column("unit", "unit")),
+        Column("", "name"),
+        Column("of", "what"),
+        Column(None, "value"),
+        Column(None, "sigma"),
+        Column("value", format=str),
+        Column("sigma", format=str),
+        Column("unit", "unit"),
         Column("remark", "remark"),
     )
     rows = []
-    for one in found.quantities:
-        text = " ".join(said.text for said in one.remarks) or None
-        factor, unit = (float(np.rad2deg(1.0)), "deg") if one.kind == "angle" else (1.0, found.unit)
-        value, sigma = one.value * factor, one.sigma * factor
-        rows.append((one.name, one.what, value, sigma, *with_sigma(value, sigma), unit, text))
+    for quantity in measurement.quantities:
+        text = " ".join(said.text for said in quantity.remarks) or None
+        factor, unit = (
+            (float(np.rad2deg(1.0)), "deg") if quantity.kind == "angle" else (1.0, measurement.unit)
+        )
+        value, sigma = quantity.value * factor, quantity.sigma * factor
+        rows.append((quantity.name, quantity.what, value, sigma, *with_sigma(value, sigma), unit, text))
     return Table(columns, rows, "quantities")
 
 
-def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
+def _alignment(alignment: Alignment | None, u: str) -> tuple[Part, ...]:
     """Return how the points were aligned, and the differences from nominal points."""
-    if found is None:
+    if alignment is None:
         return ()
-    fit = found.fitted
+    fit = alignment.fitted
     if fit is None:
-        return (facts([("Method", METHODS[found.method])]),)
+        return (facts([("Method", METHODS[alignment.method])]),)
     sigma0 = "not known" if np.isnan(fit.sigma0) else significant(fit.sigma0)
     rows = [
-        ("Method", METHODS[found.method]),
+        ("Method", METHODS[alignment.method]),
         ("Points", f"{fit.used.sum()} of {len(fit.used)}"),
-        ("Scale", f"{general(fit.scale, 10)} {'fitted' if found.scaled else 'kept'}"),
+        ("Scale", f"{general(fit.scale, 10)} {'fitted' if alignment.scaled else 'kept'}"),
         ("Sigma0", f"{sigma0}, redundancy {fit.redundancy}"),
     ]
     columns = (Column("point"), *axes("d", u, signed), Column("used", flag=USED))
@@ -251,9 +324,9 @@ def _alignment(found: Alignment | None, u: str) -> tuple[Part, ...]:
     return facts(rows), FoldedParts(title, Table(columns, differences))
 
 
-def point_sigma(found: Measurement) -> FloatArray:
+def point_sigma(measurement: Measurement) -> FloatArray:
     """Return the standard deviations of the points, NaN if not known, object unit, (n, 3)."""
-    return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", found.points.blocks), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("nii->ni", measurement.points.blocks), 0.0)))
 
 
 def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, float, str]]:
@@ -270,11 +343,11 @@ def parameter_rows(fit: ShapeFit, unit: str) -> list[tuple[str, str, float, floa
     return rows
 
 
-def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
+def _summary(measurement: Measurement, quantities: Table) -> dict[str, Any]:
     """Return the content of measurement.json."""
     alignment, best_fit = None, None
-    if found.alignment is not None:
-        fit = found.alignment.fitted
+    if measurement.alignment is not None:
+        fit = measurement.alignment.fitted
         if fit is not None:
             best_fit = {
                 "points": fit.used.sum(),
@@ -282,75 +355,82 @@ def _summary(found: Measurement, quantities: Table) -> dict[str, Any]:
                 "rms": np.sqrt((fit.difference[fit.used] ** 2).mean()),
                 **values_of(fit, "sigma0 redundancy statistic critical"),
             }
-        placed = values_of(found.alignment.aligned_from_object, "scale rotation translation")
-        alignment = {"method": found.alignment.method, **placed, "best_fit": best_fit}
+        placed = values_of(measurement.alignment.aligned_from_object, "scale rotation translation")
+        alignment = {"method": measurement.alignment.method, **placed, "best_fit": best_fit}
     return {
-        "result": found.name,
-        "length_unit": found.unit,
-        "datum": found.points.datum,
-        **found.verdict.as_dict(),
-        "points": len(found.points.names),
-        "groups": {name: [found.points.names[j] for j in members] for name, members in found.groups},
+        "result": measurement.name,
+        "length_unit": measurement.unit,
+        "datum": measurement.points.datum,
+        **measurement.verdict.as_dict(),
+        "points": len(measurement.points.names),
+        "groups": {
+            name: [measurement.points.names[j] for j in members] for name, members in measurement.groups
+        },
         "alignment": alignment,
-        "shapes": [_shape_summary(found, fit) for fit in found.shapes],
+        "shapes": [_shape_summary(measurement, fit) for fit in measurement.shapes],
         "quantities": quantities.records,
         "tolerances": [
             {
-                **values_of(one, "name against lower upper coverage"),
-                "points": len(one.points),
-                **{decision.replace(" ", "_"): one.count(decision) for decision in DECISIONS},
-                "missing": one.missing,
+                **values_of(tolerance, "name against lower upper coverage"),
+                "points": len(tolerance.points),
+                **{decision.replace(" ", "_"): tolerance.count(decision) for decision in DECISIONS},
+                "missing": tolerance.missing,
             }
-            for one in found.tolerances
+            for tolerance in measurement.tolerances
         ],
     }
 
 
-def _shape_summary(found: Measurement, fit: ShapeFit) -> dict[str, Any]:
+def _shape_summary(measurement: Measurement, fit: ShapeFit) -> dict[str, Any]:
     return {
         "name": fit.name,
         "kind": fit.shape.kind.name,
         "weights": fit.weights,
         "points": fit.used.sum(),
-        "left_out": [found.points.names[j] for j in fit.points[~fit.used]],
+        "left_out": [measurement.points.names[j] for j in fit.points[~fit.used]],
         "parameters": [
             {"name": f"{name} {axis}".rstrip(), "value": v, "sigma": s, "unit": unit}
-            for name, axis, v, s, unit in parameter_rows(fit, found.unit)
+            for name, axis, v, s, unit in parameter_rows(fit, measurement.unit)
         ],
         **values_of(fit, "covariance rms form_error sigma0 redundancy statistic critical converged"),
     }
 
 
-def describe_measured(found: Measurement) -> str:
+def describe_measured(measurement: Measurement) -> str:
     """Return in one line how much was measured, and the number of deviations with each decision."""
-    if not found.tolerances:
-        parts = [counted(len(found.points.names), "point")]
-        if found.shapes:
-            parts.append(counted(len(found.shapes), "shape"))
-        if found.quantities:
-            count = len(found.quantities)
-            kinds = {one.kind for one in found.quantities}  # length, angle
+    if not measurement.tolerances:
+        parts = [counted(len(measurement.points.names), "point")]
+        if measurement.shapes:
+            parts.append(counted(len(measurement.shapes), "shape"))
+        if measurement.quantities:
+            count = len(measurement.quantities)
+            kinds = {quantity.kind for quantity in measurement.quantities}  # length, angle
             words = plural(kinds.pop(), count) if len(kinds) == 1 else "lengths and angles"
             parts.append(f"{count} {words}")
         return ", ".join(parts) + "."
-    counts = {one: sum(t.count(one) for t in found.tolerances) for one in DECISIONS}
+    counts = {decision: sum(t.count(decision) for t in measurement.tolerances) for decision in DECISIONS}
     total = sum(counts.values())
     parts = [f"{count} {decision}" for decision, count in counts.items() if count]
     return f"{counted(total, 'deviation')} judged by ISO 14253-1: {', '.join(parts)}."
 
 
-def acceptance_page(found: Acceptance) -> Page:
+def acceptance_page(acceptance: Acceptance) -> Page:
     """Return the page of an acceptance test: limit, decisions, and every length."""
-    a, lengths, u = found, found.lengths, found.unit
+    a, lengths, u = acceptance, acceptance.lengths, acceptance.unit
     most = f", at most B = {significant(a.b)} {u}" if np.isfinite(a.b) else ""
     limit = f"A + K L with A = {significant(a.a)} {u}, K = {general(a.k, 4)}{most}"
     lines = len(set(lengths.line))
+    counts = [
+        (decision.capitalize(), counted(a.count(decision), "length"))
+        for decision in DECISIONS
+        if a.count(decision)
+    ]
     figures = facts(
         [
             ("Limit", limit),
             ("Lengths", f"{len(a.error)} on {counted(lines, 'line')}"),
             ("Largest error", f"{significant(a.largest)} {u}"),
-            *((one.capitalize(), counted(a.count(one), "length")) for one in DECISIONS if a.count(one)),
+            *counts,
             ("Body diagonal", f"{general(a.diagonal, 6)} {u}"),
         ]
     )
@@ -360,7 +440,9 @@ def acceptance_page(found: Acceptance) -> Page:
         "of the limit. The scale of the result comes from other bars."
     )
     columns = (
-        *(Column(name, name) for name in ("line", "from", "to")),
+        Column("line", "line"),
+        Column("from", "from"),
+        Column("to", "to"),
         Column("calibrated", "length", u, ".9g"),
         Column("sigma", "sigma", u, significant),
         Column("measured", "measured", u, ".9g"),
@@ -370,8 +452,16 @@ def acceptance_page(found: Acceptance) -> Page:
         Column("decision", "decision"),
     )
     rows = zip(
-        *(lengths.line, lengths.start, lengths.end, lengths.length, lengths.sigma, lengths.length + a.error),
-        *(a.sigma, a.error, a.limit, a.decision),
+        lengths.line,
+        lengths.start,
+        lengths.end,
+        lengths.length,
+        lengths.sigma,
+        lengths.length + a.error,
+        a.sigma,
+        a.error,
+        a.limit,
+        a.decision,
         strict=True,
     )
     summary = {
@@ -383,7 +473,7 @@ def acceptance_page(found: Acceptance) -> Page:
         "coverage": a.coverage,
         "lines": lines,
         "lengths": len(a.error),
-        **{one.replace(" ", "_"): a.count(one) for one in DECISIONS},
+        **{decision.replace(" ", "_"): a.count(decision) for decision in DECISIONS},
         "largest_error": a.largest,
         "rms_error": float(np.sqrt((a.error**2).mean())),
         "body_diagonal": a.diagonal,
@@ -394,7 +484,7 @@ def acceptance_page(found: Acceptance) -> Page:
         a.name,
         a.verdict,
         (
-            Section("Figures", figures, note, plot("errors", PICTURE, length_error_figure(found))),
+            Section("Figures", figures, note, plot("errors", PICTURE, length_error_figure(acceptance))),
             tested_section(a.verdict),
             Section("Lengths", Table(columns, list(rows), "lengths")),
         ),

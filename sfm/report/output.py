@@ -106,12 +106,12 @@ def write_result(
         give_back_memory()
         # One after another: while Python works, threads with short calls wait for their turn each time.
         overlays = draw_overlays(result.photographs, result.adjustment, jobs=jobs, progress=progress)
-        files = {one.image: one.path for one in result.photographs}
+        files = {photograph.image: photograph.path for photograph in result.photographs}
         pictures = cut_pictures(
             scene, files, budget_mb=budget_mb, beside="pictures", jobs=jobs, progress=progress
         )
         drawn = {overlay.image for overlay in overlays}
-        lost = [one.image for one in result.photographs if one.image not in drawn]
+        lost = [photograph.image for photograph in result.photographs if photograph.image not in drawn]
         if lost:
             findings = with_remark(findings, remark("photographs_not_drawn", photographs=lost))
             result = findings.result
@@ -204,7 +204,9 @@ def plot_data(findings: Findings) -> PlotData:
     adjustment, interior, geometry = findings.result.adjustment, findings.interior, findings.geometry
     network, estimate, used = adjustment.network, adjustment.estimate, ~adjustment.rejected
     seen = network.image_points.select(used)
-    sigma = np.array([root_mean_square(one) for one in adjusted_sigmas(adjustment.covariance.points)])
+    sigma = np.array(
+        [root_mean_square(of_point) for of_point in adjusted_sigmas(adjustment.covariance.points)]
+    )
     factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
     centre = np.array([camera.frame[:2] for camera in estimate.cameras])
     sizes = {camera.name: camera.size_px for camera in estimate.cameras}
@@ -214,7 +216,9 @@ def plot_data(findings: Findings) -> PlotData:
         position=estimate.position,
         rotation=estimate.rotation,
         points=estimate.points,
-        cameras=tuple(PlotCamera(one.name, one.camera.c_px, one.camera.size_px) for one in interior.families),
+        cameras=tuple(
+            PlotCamera(family.name, family.camera.c_px, family.camera.size_px) for family in interior.families
+        ),
         camera=interior.family,
         image=seen.image,
         xy=seen.xy,
@@ -227,9 +231,9 @@ def plot_data(findings: Findings) -> PlotData:
         sigma=sigma * factor,
         sigma_unit=unit,
         projection=tuple(
-            None if found is None else ProjectionMap(*found)
+            None if projection is None else ProjectionMap(*projection)
             for f in range(len(interior.families))
-            for found in [projection_of(adjustment, interior.family == f)]
+            for projection in [projection_of(adjustment, interior.family == f)]
         ),
         epipolar=tuple(
             EpipolarMap(
@@ -312,7 +316,7 @@ def refuse_other_origin(out: Path, origin: Origin, *, survey: str = "", photogra
         except SurveyFileError:
             images = ()
         other_name = bool(survey) and name != survey
-        present = any((origin.images / one).is_file() for one in images)
+        present = any((origin.images / image).is_file() for image in images)
         if other_name or (photographs and not present):
             of = f"{counted(len(images), 'photograph')} ({listed(images)})"
             what = of if images else "no table of photographs"
@@ -446,8 +450,8 @@ class SurveyLog:
         """
         self.end_stage()
         judged = ended.verdict if isinstance(ended, Findings) else verdict(ended)
-        for one in judged.remarks:
-            self.note("remark", **one.as_dict())
+        for said in judged.remarks:
+            self.note("remark", **said.as_dict())
         self.note("result", **result_entries(ended), **more)
         (folder / LOG).write_text("\n".join(self._lines) + "\n", encoding="utf-8")
 
@@ -469,7 +473,7 @@ def result_entries(ended: Findings | UnfinishedSurvey) -> dict[str, Any]:
             **_photographs(ended),
         }
     findings, result = ended, ended.result
-    a, both = result.adjustment, result.comparison
+    a, comparison = result.adjustment, result.comparison
     return {
         "survey": result.survey,
         "verdict": findings.verdict.level,
@@ -482,16 +486,16 @@ def result_entries(ended: Findings | UnfinishedSurvey) -> dict[str, Any]:
         "rejected": int(a.rejected.sum()),
         "iterations": a.iterations,
         "converged": a.converged,
-        "comparison": "none" if both is None else both.outcome,
+        "comparison": "none" if comparison is None else comparison.outcome,
         **_photographs(result),
     }
 
 
-def _photographs(found: SurveyResult | UnfinishedSurvey) -> dict[str, Any]:
+def _photographs(survey: SurveyResult | UnfinishedSurvey) -> dict[str, Any]:
     """Return the photographs measured in an earlier run, and those that failed."""
     return {
-        "stored_photographs": [p.image for p in found.photographs if p.stored],
-        "failed_photographs": [{"image": f.image, "reason": f.reason.as_dict()} for f in found.failed],
+        "stored_photographs": [p.image for p in survey.photographs if p.stored],
+        "failed_photographs": [{"image": f.image, "reason": f.reason.as_dict()} for f in survey.failed],
     }
 
 
@@ -526,12 +530,12 @@ def read_log(path: Path) -> tuple[dict[str, Any], ...]:
     """
     if path.stat().st_size > MAX_LOG_BYTES:
         return ()
-    found = []
+    entries = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             entry = json.loads(line)
         except (ValueError, RecursionError):
             continue
         if isinstance(entry, dict):
-            found.append(entry)
-    return tuple(found)
+            entries.append(entry)
+    return tuple(entries)

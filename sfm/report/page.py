@@ -99,12 +99,19 @@ def axes(
     prefix: str, unit: str = "", format: Format = significant, *, factor: float = 1.0, parts: str = "XYZ"
 ) -> tuple[Column, ...]:
     """Return the columns of a vector, with the same names on the page and in files."""
-    return tuple(Column(prefix + one, prefix + one, unit, format, factor) for one in parts)
+    return tuple(Column(prefix + part, prefix + part, unit, format, factor) for part in parts)
 
 
 def columns(*titles: str) -> tuple[Column, ...]:
     """Return columns that are only on the page; ">" before a title marks numbers."""
-    return tuple(Column(one.removeprefix(">"), format=str if one[:1] == ">" else None) for one in titles)
+    return tuple(
+        Column(title.removeprefix(">"), format=str if title[:1] == ">" else None) for title in titles
+    )
+
+
+def file_columns(*names: str) -> tuple[Column, ...]:
+    """Return columns that are only in files."""
+    return tuple(Column(None, name) for name in names)
 
 
 def columns_of(table: ResultTable, shown: Mapping[str, Column]) -> tuple[Column, ...]:
@@ -128,12 +135,12 @@ class Table:
     @property
     def shown(self) -> tuple[tuple[int, Column], ...]:
         """The columns on the page, with their indices in the rows."""
-        return tuple((k, one) for k, one in enumerate(self.columns) if one.title is not None)
+        return tuple((k, column) for k, column in enumerate(self.columns) if column.title is not None)
 
     @property
     def header(self) -> tuple[str, ...]:
         """The headings on the page; ">" before a heading marks numbers."""
-        return tuple(("" if one.format is None else ">") + one.heading for _, one in self.shown)
+        return tuple(("" if column.format is None else ">") + column.heading for _, column in self.shown)
 
     @property
     def cells(self) -> Iterable[tuple[str | Mark | Link, ...]]:
@@ -151,7 +158,7 @@ class Table:
 
     def _cells(self, rows: Iterable[Sequence[Any]]) -> Iterable[tuple[str | Mark | Link, ...]]:
         shown = self.shown
-        return (tuple(one.cell(row[k]) for k, one in shown) for row in rows)
+        return (tuple(column.cell(row[k]) for k, column in shown) for row in rows)
 
     @property
     def cut(self) -> str:
@@ -170,22 +177,22 @@ class Table:
     def csv(self) -> str:
         """The table as CSV, with all digits."""
         named = self._named
-        flags = [one.flag is not None for _, one in named]
+        flags = [column.flag is not None for _, column in named]
         rows = (
             [int(row[k]) if flag else row[k] for (k, _), flag in zip(named, flags, strict=True)]
             for row in self.rows
         )
-        return csv_text([one.name for _, one in named], rows)
+        return csv_text([column.name for _, column in named], rows)
 
     @property
     def records(self) -> list[dict[str, Any]]:
         """The rows for JSON, by the names of the columns in files."""
-        return [{one.name: plain(row[k]) for k, one in self._named} for row in self.rows]
+        return [{column.name: plain(row[k]) for k, column in self._named} for row in self.rows]
 
     @property
     def _named(self) -> list[tuple[int, Column]]:
         """The columns in files, with their indices in the rows."""
-        return [(k, one) for k, one in enumerate(self.columns) if one.name]
+        return [(k, column) for k, column in enumerate(self.columns) if column.name]
 
     @property
     def text(self) -> str:
@@ -194,11 +201,11 @@ class Table:
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return the first rows as plain text in columns, numbers right-aligned; None returns all rows."""
-        shown = [one for _, one in self.shown]
+        shown = [column for _, column in self.shown]
         rows = [[one_line(str(cell)) for cell in row] for row in self.first(most)]
         if not self.facts:
-            rows.insert(0, [one.heading for one in shown])
-        return aligned(rows, [one.format is None for one in shown])
+            rows.insert(0, [column.heading for column in shown])
+        return aligned(rows, [column.format is None for column in shown])
 
 
 def one_line(words: str) -> str:
@@ -294,7 +301,7 @@ class Section:
 
 def tested_section(verdict: Verdict) -> Section:
     """Return the section on what was tested, on what, and with which result; empty if nothing was."""
-    rows = [one.tested for one in verdict.tests]
+    rows = [test.tested for test in verdict.tests]
     table = Table(columns("test", "tested on", "result or why not"), rows) if rows else None
     return Section("What was tested?", table, key="tested")
 
@@ -342,14 +349,14 @@ class Page:
     @property
     def links(self) -> tuple[Section, ...]:
         """The sections that the head of the page links to."""
-        return tuple(one for one in self.sections if one.key and one.parts)
+        return tuple(section for section in self.sections if section.key and section.parts)
 
     @property
     def tables(self) -> tuple[Table, ...]:
         """The tables with a file."""
         parts = [part for section in self.sections for part in _unfolded(section.parts)]
-        found = (*self.files, *(part for part in parts if isinstance(part, Table)))
-        return tuple(one for one in found if one.file)
+        tables = (*self.files, *(part for part in parts if isinstance(part, Table)))
+        return tuple(table for table in tables if table.file)
 
     @property
     def text(self) -> str:
@@ -364,29 +371,29 @@ class Page:
     @property
     def texts(self) -> dict[str, str]:
         """The text files beside the page, by their names."""
-        found = {f"{one.file}.csv": one.csv for one in self.tables}
+        texts = {f"{table.file}.csv": table.csv for table in self.tables}
         if self.summary is not None:
             text = json.dumps(plain(self.summary), indent=2, ensure_ascii=False, allow_nan=False)
-            found[f"{self.name}.json"] = text + "\n"
-        return found
+            texts[f"{self.name}.json"] = text + "\n"
+        return texts
 
 
 def plain(value: Any) -> Any:
     """Return a value for JSON: numbers that are not finite as None, arrays and tuples as lists."""
     if isinstance(value, Mapping):
-        return {key: plain(one) for key, one in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(one) for one in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.integer | np.bool_):
         return value.item()
     return or_none(float(value)) if isinstance(value, float | np.floating) else value
 
 
-def values_of(one: object, names: str) -> dict[str, Any]:
+def values_of(record: object, names: str) -> dict[str, Any]:
     """Return attributes of an object by name, for JSON."""
-    return {name: plain(getattr(one, name)) for name in names.split()}
+    return {name: plain(getattr(record, name)) for name in names.split()}
 
 
 def _unfolded(parts: Iterable[Part]) -> Iterable[Part]:

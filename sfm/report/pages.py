@@ -63,20 +63,20 @@ MAX_ROWS = 10  # rows of a table in the text
 NAME_WIDTH = 36  # maximum width of the name of a fact
 
 
-def page_of(found: Any, **beside: Any) -> Page:
+def page_of(subject: Any, **beside: Any) -> Page:
     """Return the declared page of a result.
 
     Args:
-        found: a result of a type in `PAGES`.
+        subject: a result of a type in `PAGES`.
         beside: further arguments of the function that declares its page.
     """
-    module, function = PAGES[type(found).__name__].split(":")
-    return cast(Page, getattr(import_module(module), function)(found, **beside))
+    module, function = PAGES[type(subject).__name__].split(":")
+    return cast(Page, getattr(import_module(module), function)(subject, **beside))
 
 
-def html_of(found: Any, **beside: Any) -> str:
+def html_of(subject: Any, **beside: Any) -> str:
     """Return the page of a result as HTML; arguments as for `page_of`."""
-    return html(page_of(found, **beside))
+    return html(page_of(subject, **beside))
 
 
 def texts_of(page: Page) -> dict[str, str]:
@@ -84,11 +84,11 @@ def texts_of(page: Page) -> dict[str, str]:
     return page.texts | {page.path: html(page)}
 
 
-def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = None, **beside: Any) -> Path:
+def write_page(subject: Any, out: Path, *, also: Callable[[Path], None] | None = None, **beside: Any) -> Path:
     """Write the page of a result and its files into a folder, whole or not at all.
 
     Args:
-        found: a result of a type in `PAGES`.
+        subject: a result of a type in `PAGES`.
         out: the folder: new, empty or an unchanged earlier one.
         also: receives the folder, to write further files into it.
         beside: further arguments of the function that declares the page.
@@ -99,7 +99,7 @@ def write_page(found: Any, out: Path, *, also: Callable[[Path], None] | None = N
     Raises:
         OutputError: the folder contains something else or cannot be written, or another run is writing it.
     """
-    return write_declared(page_of(found, **beside), out, also=also)
+    return write_declared(page_of(subject, **beside), out, also=also)
 
 
 def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None = None) -> Path:
@@ -184,19 +184,19 @@ def text(page: Page) -> str:
     """Return a page as text of at most `WIDTH` columns."""
     lines = [f"KOLINEAR  {one_line(page.title)}"[:WIDTH], "=" * WIDTH]
     lines += wrapped(one_line(page.verdict.headline), behind=0)
-    for one in page.verdict.lines:
-        lines += wrapped(one_line(f"- {one.severity}: {one.text} {one.remedy}"), behind=2)
+    for line in page.verdict.lines:
+        lines += wrapped(one_line(f"- {line.severity}: {line.text} {line.remedy}"), behind=2)
     for section in page.sections:
-        found = list(_lines(section.parts)) if section.in_text else []
-        if found:
-            lines += ["", f"{section.title} ".ljust(WIDTH, "="), *found]
+        body = list(_lines(section.parts)) if section.in_text else []
+        if body:
+            lines += ["", f"{section.title} ".ljust(WIDTH, "="), *body]
     return "\n".join(lines) + "\n"
 
 
 def _lines(parts: Iterable[Part]) -> Iterator[str]:
     heading: list[str] = []  # written once a part below it has content
     for part in parts:
-        found: list[str] = []
+        lines: list[str] = []
         match part:
             case Plot() | Note() | Cards():
                 continue
@@ -205,13 +205,13 @@ def _lines(parts: Iterable[Part]) -> Iterator[str]:
             case Subheading():
                 heading += ["", *wrapped(MARGIN + one_line(part.text), behind=4)]
             case FoldedParts():
-                found = list(_lines(part.parts)) if part.in_text else []
+                lines = list(_lines(part.parts)) if part.in_text else []
             case Paragraph():
-                found = wrapped(MARGIN + one_line(part.text), behind=4)
+                lines = wrapped(MARGIN + one_line(part.text), behind=4)
             case Table():
-                found = _facts(part) if part.facts else _table(part)
-        if found:
-            yield from (*heading, *found)
+                lines = _facts(part) if part.facts else _table(part)
+        if lines:
+            yield from (*heading, *lines)
             heading = []
 
 
@@ -229,11 +229,11 @@ def _table(table: Table) -> list[str]:
     """Return the first rows in columns, or each as a sentence if the columns are too wide."""
     lines = [MARGIN + line for line in table.lines(MAX_ROWS)]
     if max(map(len, lines)) > WIDTH:
-        before = ["" if one.format is None else f"{one.heading} " for _, one in table.shown]
+        before = ["" if column.format is None else f"{column.heading} " for _, column in table.shown]
         rows = ([one_line(str(cell)) for cell in row] for row in table.first(MAX_ROWS))
         named = ([b + cell for b, cell in zip(before, row, strict=True) if cell] for row in rows)
         sentences = (f"{MARGIN}{name}: {'; '.join(cells)}" for name, *cells in named)
-        lines = [line for one in sentences for line in wrapped(one, behind=4)]
+        lines = [line for sentence in sentences for line in wrapped(sentence, behind=4)]
     if len(table.rows) > MAX_ROWS:
         where = f", in {table.source}" if table.source else ""
         lines.append(f"{MARGIN}and {len(table.rows) - MAX_ROWS} more{where}")
@@ -248,4 +248,4 @@ def wrapped(line: str, *, behind: int) -> list[str]:
         cut = WIDTH if cut < 0 else cut
         lines.append(rest[:cut])
         rest = " " * behind + rest[cut:].strip()
-    return [one.replace(NO_BREAK, " ") for one in (*lines, rest)]
+    return [part.replace(NO_BREAK, " ") for part in (*lines, rest)]

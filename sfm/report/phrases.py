@@ -38,15 +38,16 @@ def describe_sigma0(sigma0: Sigma0) -> tuple[str, str]:
 
 def describe_neighbours(a: Adjustment) -> str:
     """Return how far the errors of neighbouring image points agree; empty if they are independent."""
-    found = a.error_correlation
-    if found is None:
+    correlation = a.error_correlation
+    if correlation is None:
         return ""
-    alone, common = (significant(sigma) for sigma in found.sigmas_px(a.sigma0_px))
-    counted_as = f"; beside other sources {significant(found.design_effect)} of them have the weight of one"
+    alone, common = (significant(sigma) for sigma in correlation.sigmas_px(a.sigma0_px))
+    length, effect = significant(correlation.length_px), correlation.design_effect
+    counted_as = f"; beside other sources {significant(effect)} of them have the weight of one"
     return (
-        f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e within "
-        f"{significant(found.length_px)} px; each also has {alone} px alone; standard deviations include both"
-        f"{counted_as if found.design_effect > 1 else ''}"
+        f"neighbours in a photograph have errors of {common} px in common, which fall to 1/e within {length} "
+        f"px; each also has {alone} px alone; standard deviations include both"
+        f"{counted_as if effect > 1 else ''}"
     )
 
 
@@ -63,7 +64,10 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         adjustment: adjustment, to suggest its sigma_px; None to suggest a factor.
     """
     if test.passed is None:
-        return f"{test.of}: not tested, {_why_untested(test)}"
+        why = f"its redundancy, {test.redundancy:.2g}, is too small"
+        if test.untested == "reweighted":
+            why = "the weights come from the residuals, so v'Pv is not chi-square distributed"
+        return f"{test.of}: not tested, {why}"
     r = f"{test.redundancy:.1f}".removesuffix(".0")
     said = "passed" if test.passed else "NOT passed, worse than stated"
     if not test.passed and test.statistic < test.lower:
@@ -72,12 +76,6 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({percent(1 - test.alpha)})"
     )
-
-
-def _why_untested(test: GlobalTest) -> str:
-    if test.untested == "reweighted":
-        return "the weights come from the residuals, so v'Pv is not chi-square distributed"
-    return f"its redundancy, {test.redundancy:.2g}, is too small"
 
 
 def _fitting_sigmas(test: GlobalTest, a: Adjustment | None) -> str:
@@ -118,18 +116,18 @@ def describe_weights(result: SurveyResult) -> str:
     )
 
 
-def describe_check(found: ControlCheck, unit: str) -> str:
+def describe_check(check: ControlCheck, unit: str) -> str:
     """Return the differences between the fitted points and control that took no part.
 
     Args:
-        found: the differences.
+        check: the differences.
         unit: object unit.
     """
-    length = np.linalg.norm(found.differences, axis=1)
-    worst, points = int(np.argmax(length)), found.points
+    length = np.linalg.norm(check.differences, axis=1)
+    worst, points = int(np.argmax(length)), check.points
     longest = float(length[worst])
     factor, finer = finer_unit(unit, longest)
-    *rms, most = alike([*(found.rms * factor), longest * factor])
+    *rms, most = alike([*(check.rms * factor), longest * factor])
     return (
         f"RMS {', '.join(rms)} {finer} in X, Y, Z at {counted(len(points), 'point')}; largest "
         f"{most} {finer} at {points[worst]}"
@@ -159,8 +157,8 @@ def describe_precision(typical: float, largest: float, unit: str) -> str:
         unit: object unit.
     """
     factor, finer = finer_unit(unit, largest)
-    one = np.array([typical, largest]) * factor
-    rms, most, rms_95, most_95 = alike([*one, *(NORMAL_95 * one)])
+    one_sigma = np.array([typical, largest]) * factor
+    rms, most, rms_95, most_95 = alike([*one_sigma, *(NORMAL_95 * one_sigma)])
     sigmas = f"1 sigma {rms} {finer} RMS, {most} {finer} at most"
     return f"{sigmas}; 95 % {rms_95} {finer} RMS, {most_95} {finer} at most"
 
@@ -168,13 +166,13 @@ def describe_precision(typical: float, largest: float, unit: str) -> str:
 def describe_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     """Return c and principal point, their 1 sigma and 95 % limits, and the projection uncertainty."""
     values, sigmas, within = [], [], []
-    for one in camera.parameters:
-        value, sigma = with_exponent(one.value, one.sigma)
-        state = NOT_DETERMINED if np.isinf(one.sigma) else "" if one.sigma > 0 else "held"
-        value = state if np.isinf(one.sigma) else f"{value} {one.unit}"
-        values.append(f"{one.name}{NO_BREAK}{value}")
-        sigmas.append(state or f"{sigma} {one.unit}")
-        within.append(state or f"{significant(NORMAL_95 * one.sigma, 2)} {one.unit}")
+    for parameter in camera.parameters:
+        value, sigma = with_exponent(parameter.value, parameter.sigma)
+        state = NOT_DETERMINED if np.isinf(parameter.sigma) else "" if parameter.sigma > 0 else "held"
+        value = state if np.isinf(parameter.sigma) else f"{value} {parameter.unit}"
+        values.append(f"{parameter.name}{NO_BREAK}{value}")
+        sigmas.append(state or f"{sigma} {parameter.unit}")
+        within.append(state or f"{significant(NORMAL_95 * parameter.sigma, 2)} {parameter.unit}")
     rms, largest = camera.projection_rms_px, camera.projection_largest_px
     if np.isinf(rms):
         return ", ".join(values), ", ".join(sigmas), ", ".join(within), NOT_DETERMINED
@@ -195,20 +193,15 @@ def words_left_out(findings: Findings) -> str:
     """Return what the comparison with the other adjuster omits from the survey; empty if nothing."""
     counts, fixed = findings.counts, findings.precision.fixed_points
     control = findings.result.adjustment.datum == "control"
-    left_out = [
-        *([counted(fixed, "fixed point")] if control and fixed else []),
-        *(
-            counted(number, what)
-            for number, what in (
-                (counts.control, "control coordinate"),
-                (counts.exterior, "observed exterior orientation parameter"),
-                (counts.interior, "observed interior orientation parameter"),
-                (counts.scale_bars, "scale bar"),
-                (counts.further, "further observation"),
-            )
-            if number
-        ),
-    ]
+    numbers = (
+        (fixed if control else 0, "fixed point"),
+        (counts.control, "control coordinate"),
+        (counts.exterior, "observed exterior orientation parameter"),
+        (counts.interior, "observed interior orientation parameter"),
+        (counts.scale_bars, "scale bar"),
+        (counts.further, "further observation"),
+    )
+    left_out = [counted(number, what) for number, what in numbers if number]
     return f"without {listed(left_out)}" if left_out else ""
 
 
@@ -269,7 +262,7 @@ def or_fixed(sigma: float) -> str:
 def alike(values: Sequence[float], digits: int = 3) -> tuple[str, ...]:
     """Write numbers of one quantity with significant digits, all with an exponent if one needs it."""
     written = tuple(significant(value, digits) for value in values)
-    if not any("e" in one for one in written):
+    if not any("e" in number for number in written):
         return written
     return tuple(scientific(value, digits - 1) if np.isfinite(value) else "not known" for value in values)
 

@@ -35,6 +35,7 @@ from sfm.report.page import (
     Table,
     axes,
     facts,
+    file_columns,
     plain,
     values_of,
 )
@@ -68,7 +69,7 @@ def page(plan: Plan) -> Page:
         (p.stations.names[i], p.planned.names[j], *xy, *s)
         for i, j, xy, s in zip(m, n, p.sight.xy[m, n].tolist(), deviation.tolist(), strict=True)
     ]
-    size = float(np.abs([*p.planned.xyz, *(one.position for one in plan.shots)]).max())
+    size = float(np.abs([*p.planned.xyz, *(shot.position for shot in plan.shots)]).max())
     columns = shot_columns(unit, size)
     points = _points(plan, size)
     prediction = Note(
@@ -93,8 +94,8 @@ def page(plan: Plan) -> Page:
             Section("Photographs", Table(columns, shot_rows(plan.shots)), axis),
             Section("Weak points", *_weak(plan)),
             Section("Camera", *_camera(plan)),
-            *((Section("Rig", *_rigs(plan)),) if plan.prediction.stations.rig is not None else ()),
-            *((Section("Gain", *_gain(plan)),) if plan.contributions else ()),
+            Section("Rig", *_rigs(plan)),
+            Section("Gain", *_gain(plan)),
             Section("Points", FoldedParts(counted(len(points.rows), "point"), points)),
         ),
         viewer=plan_viewer(plan),
@@ -132,7 +133,9 @@ def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Colum
     return (
         Column("station", "image"),
         *axes("", unit, lambda value: placed(value, size)),
-        *(Column(a, f"{a}_deg", "deg", "z.0f") for a in ("azimuth", "elevation", "roll")),
+        Column("azimuth", "azimuth_deg", "deg", "z.0f"),
+        Column("elevation", "elevation_deg", "deg", "z.0f"),
+        Column("roll", "roll_deg", "deg", "z.0f"),
         Column("distance", "distance", unit, ".4g"),
         Column("focus" if planned else None, "focus", unit, ".4g"),
         Column("points", "points", format=str),
@@ -143,12 +146,12 @@ def shot_columns(unit: str, size: float, *, planned: bool = True) -> tuple[Colum
 def shot_rows(shots: Sequence[Shot], *, rounded: bool = False) -> list[tuple[object, ...]]:
     """Return the rows of photographs to be taken, rounded for files to what can be set up."""
     rows: list[tuple[object, ...]] = []
-    for one in shots:
-        lengths = [*one.position.tolist(), one.distance, one.focus]
-        angles = [one.azimuth_deg, one.elevation_deg, one.roll_deg]
+    for shot in shots:
+        lengths = [*shot.position.tolist(), shot.distance, shot.focus]
+        angles = [shot.azimuth_deg, shot.elevation_deg, shot.roll_deg]
         if rounded:
             lengths, angles = ([round(value, to) for value in x] for x, to in ((lengths, 6), (angles, 2)))
-        rows.append((one.station, *lengths[:3], *angles, *lengths[3:], one.points, one.coded))
+        rows.append((shot.station, *lengths[:3], *angles, *lengths[3:], shot.points, shot.coded))
     return rows
 
 
@@ -159,7 +162,7 @@ def _points(plan: Plan, size: float) -> Table:
     columns = (
         Column("point", "id"),
         *axes("", plan.unit, lambda value: placed(value, size)),
-        *(Column(None, name) for name in ("nX", "nY", "nZ", "sX", "sY", "sZ")),
+        *file_columns("nX", "nY", "nZ", "sX", "sY", "sZ"),
         Column("sigma", "", fine, significant, factor),
         Column("rays", "rays", format=str),
         Column("angle", "angle_deg", "deg", "z.0f", unknown=""),
@@ -168,10 +171,17 @@ def _points(plan: Plan, size: float) -> Table:
     sigma = np.sqrt(np.diagonal(p.covariance, axis1=1, axis2=2))
     coded = np.isin(np.arange(len(p.planned.names)), plan.coded)
     rows = [
-        (name, *xyz, *normal, *s, one if known else NOT_DETERMINED, *others)
-        for name, xyz, normal, s, one, known, *others in zip(
-            *(p.planned.names, p.planned.xyz, p.planned.normals, sigma, p.sigma, p.determined, p.rays),
-            *(p.angle_deg, coded),
+        (name, *xyz, *normal, *s, rms if known else NOT_DETERMINED, *others)
+        for name, xyz, normal, s, rms, known, *others in zip(
+            p.planned.names,
+            p.planned.xyz,
+            p.planned.normals,
+            sigma,
+            p.sigma,
+            p.determined,
+            p.rays,
+            p.angle_deg,
+            coded,
             strict=True,
         )
     ]
@@ -185,8 +195,8 @@ def _weak(plan: Plan) -> tuple[Part, ...]:
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
     columns = (Column("point"), Column("sigma", "", fine, significant, factor), Column("reason"))
     rows = [
-        (one.name, one.sigma if np.isfinite(one.sigma) else NOT_DETERMINED, one.reason)
-        for one in plan.weak[:MAX_NAMED]
+        (point.name, point.sigma if np.isfinite(point.sigma) else NOT_DETERMINED, point.reason)
+        for point in plan.weak[:MAX_NAMED]
     ]
     more = (Note(f"The worst {MAX_NAMED} of {len(plan.weak)}."),) if len(plan.weak) > MAX_NAMED else ()
     return Table(columns, rows), *more
@@ -211,7 +221,9 @@ def _calibration(c: Calibratability, cameras: Sequence[Camera]) -> tuple[Part, .
         "its distance."
     )
     columns = (
-        *(Column("parameter"), Column("sigma", format=str), Column("unit")),
+        Column("parameter"),
+        Column("sigma", format=str),
+        Column("unit"),
         Column("strongly correlated with"),
     )
     (camera,) = (camera for camera in cameras if camera.name == c.camera)
@@ -219,8 +231,10 @@ def _calibration(c: Calibratability, cameras: Sequence[Camera]) -> tuple[Part, .
 
 
 def _rigs(plan: Plan) -> tuple[Part, ...]:
-    """Return the mounts of the cameras of the rig, with their predicted precision."""
-    columns = (*map(Column, ("camera", "")), Column("value"), Column("sigma"), Column("unit"))
+    """Return the mounts of the cameras of the rig, with their predicted precision; nothing without a rig."""
+    if plan.prediction.stations.rig is None:
+        return ()
+    heads = tuple(map(Column, ("camera", "", "value", "sigma", "unit")))
     rows = [
         (mount.camera, name, *with_exponent(value, sigma), plan.unit if is_length else "deg")
         for rig in rigs_of(plan.prediction.adjustment, planned=True)
@@ -228,30 +242,29 @@ def _rigs(plan: Plan) -> tuple[Part, ...]:
         for name, value, sigma, is_length in mount.values
     ]
     note = "In the image axes of the reference camera: x right, y up, z towards the camera."
-    return Table(columns, rows), Note(note)
+    return Table(heads, rows), Note(note)
 
 
 def _gain(plan: Plan) -> tuple[Part, ...]:
-    """Return the contribution of the rig and of each kind of observation."""
+    """Return the contribution of the rig and of each kind of observation; nothing if there is none."""
+    if not plan.contributions:
+        return ()
     factor, fine = finer_unit(plan.unit, plan.prediction.rms_sigma)
     columns = (
-        *(Column("", "kind"), Column("number", "count", format=str)),
-        *(Column(None, one, format=str) for one in ("shifts", "rotations", "scale", "points")),
+        Column("", "kind"),
+        Column("number", "count", format=str),
+        *file_columns("shifts", "rotations", "scale", "points"),
         Column("gives"),
-        *(Column(f"sigma {a} it", f"sigma_{a}", fine, significant, factor) for a in ("without", "with")),
+        Column("sigma without it", "sigma_without", fine, significant, factor),
+        Column("sigma with it", "sigma_with", fine, significant, factor),
         Column("gain", "gain", format=".2f"),
     )
-    rows = [
-        (
-            *(o.name, o.count, o.shifts, o.rotations, int(o.scale), o.points, ", ".join(_given(o))),
-            *(
-                (o.sigma_without, o.sigma_with, o.gain)
-                if np.isfinite(o.gain)
-                else (*[NOT_DETERMINED] * 2, "")
-            ),
-        )
-        for o in plan.contributions
-    ]
+    rows = []
+    for o in plan.contributions:
+        known = np.isfinite(o.gain)
+        precision = (o.sigma_without, o.sigma_with, o.gain) if known else (NOT_DETERMINED, NOT_DETERMINED, "")
+        given = ", ".join(_given(o))
+        rows.append((o.name, o.count, o.shifts, o.rotations, int(o.scale), o.points, given, *precision))
     note = Note(
         "Gain: standard deviation of points without the observation over that with it, RMS of a "
         "coordinate, all else unchanged. Gives: shifts, rotations and scale of the network, and points, "
@@ -265,7 +278,7 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
 def figures(plan: Plan) -> list[tuple[str, str]]:
     """Return the key figures of a plan, each with its unit."""
     p, a, unit = plan.prediction, plan.prediction.adjustment, plan.unit
-    found = reliability(a)
+    reliabilities = reliability(a)
     d = found_displacement(p)[p.determined]
     r = a.redundancy_numbers[np.isfinite(a.redundancy_numbers)]
     worst, along = float(p.sigma[p.determined].max()), float(p.largest_sigma[p.determined].max())
@@ -289,8 +302,8 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             "redundancy",
             f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
         ),
-        ("detectable gross error", _spread(found.minimal_bias, "px")),
-        ("its effect if not detected", _spread(found.external, "sigmas of an unknown")),
+        ("detectable gross error", _spread(reliabilities.minimal_bias, "px")),
+        ("its effect if not detected", _spread(reliabilities.external, "sigmas of an unknown")),
         (
             "rule of Fraser",
             f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
@@ -307,35 +320,42 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
         ),
     ]
     rows += describe_rigs(rigs_of(a, planned=True), plan.unit)
-    for one in plan.contributions:
-        name = "scale bars and distances" if one.name == ScaleBars.name else one.name  # both are bars
-        rows.append((f"gain by {name}", _gain_in_words(one)))
+    for contribution in plan.contributions:
+        name = (
+            "scale bars and distances" if contribution.name == ScaleBars.name else contribution.name
+        )  # both are bars
+        rows.append((f"gain by {name}", _gain_in_words(contribution)))
     if a.undetermined:
-        rows.append(("not determined", _first(a.undetermined)))
+        more = f"; and {len(a.undetermined) - 1} more" if len(a.undetermined) > 1 else ""
+        rows.append(("not determined", f"{a.undetermined[0]}{more}"))
     return rows
 
 
-def _gain_in_words(one: Contribution) -> str:
+def _gain_in_words(contribution: Contribution) -> str:
     """Return in words what a kind of observation adds, as "alone gives the scale; points 1.30 times ..."."""
-    precise = f"points {one.gain:.2f} times as precise" if np.isfinite(one.gain) else "nothing without it"
-    if not _given(one):
+    precise = (
+        f"points {contribution.gain:.2f} times as precise"
+        if np.isfinite(contribution.gain)
+        else "nothing without it"
+    )
+    if not _given(contribution):
         return precise
-    beside = "beside that " if one.shifts or one.rotations or one.scale else ""
-    return f"alone gives {' and '.join(_given(one))}; {beside}{precise}"
+    beside = "beside that " if contribution.shifts or contribution.rotations or contribution.scale else ""
+    return f"alone gives {' and '.join(_given(contribution))}; {beside}{precise}"
 
 
-def _given(one: Contribution) -> list[str]:
+def _given(contribution: Contribution) -> list[str]:
     """Return in words what only one kind of observation determines."""
-    counts = ((one.shifts, "shift"), (one.rotations, "rotation"))
+    counts = ((contribution.shifts, "shift"), (contribution.rotations, "rotation"))
     words = [counted(count, what) for count, what in counts if count]
-    words += ["the scale"] if one.scale else []
-    return words + ([counted(one.points, "point")] if one.points else [])
+    words += ["the scale"] if contribution.scale else []
+    return words + ([counted(contribution.points, "point")] if contribution.points else [])
 
 
 def _summary(plan: Plan) -> dict[str, Any]:
     """Return the content of plan.json."""
     p = plan.prediction
-    found = {c.camera: c for c in plan.calibrations}
+    by_camera = {c.camera: c for c in plan.calibrations}
     return {
         **values_of(plan, "name unit"),
         **verdict_of_plan(plan).as_dict(),
@@ -357,11 +377,11 @@ def _summary(plan: Plan) -> dict[str, Any]:
         },
         "coded_targets": len(plan.coded),
         **_observed(plan),
-        "cameras": [_camera_summary(camera, found.get(camera.name)) for camera in p.cameras],
+        "cameras": [_camera_summary(camera, by_camera.get(camera.name)) for camera in p.cameras],
         "rigs": summary_of_rigs(rigs_of(p.adjustment, planned=True)),
         "contributions": [
-            values_of(one, "name count shifts rotations scale points sigma_without sigma_with gain")
-            for one in plan.contributions
+            values_of(contribution, "name count shifts rotations scale points sigma_without sigma_with gain")
+            for contribution in plan.contributions
         ],
         "weak_points": [{"point": w.name, "sigma": w.sigma, "reason": w.reason} for w in plan.weak],
     }
@@ -373,21 +393,26 @@ def _observed(plan: Plan) -> dict[str, Any]:
     bars = network.scale_bars
     ends = ([network.points[j] for j in side] for side in (bars.start, bars.end))
     tables = {
-        kind: [row for one in network.observations if type(one) is of for row in one.table_rows(network)]
+        kind: [
+            row
+            for observations in network.observations
+            if type(observations) is of
+            for row in observations.table_rows(network)
+        ]
         for kind, of in TABLES.items()
     }
-    found: dict[str, Any] = {
+    observed: dict[str, Any] = {
         "scale_bars": [list(bar) for bar in zip(*ends, bars.sigma.tolist(), strict=True)],
         "survey_observations": {kind: rows for kind, rows in tables.items() if rows},
         "mounts": [],
     }
     if mounts is None:
-        return found
+        return observed
     sigma = {int(a): np.zeros(6) for a in np.flatnonzero(~mounts.free.any(axis=1))}
-    for one in network.observations:
-        if isinstance(one, MountObservations):
-            deviations = np.sqrt(np.diagonal(one.covariance, axis1=1, axis2=2))
-            sigma |= dict(zip(one.camera.tolist(), deviations, strict=True))
+    for observations in network.observations:
+        if isinstance(observations, MountObservations):
+            deviations = np.sqrt(np.diagonal(observations.covariance, axis1=1, axis2=2))
+            sigma |= dict(zip(observations.camera.tolist(), deviations, strict=True))
     values = np.hstack([mounts.position, angles_from_rotation(mounts.rotation)])
     for a, camera in enumerate(plan.prediction.cameras):
         mount = {
@@ -396,8 +421,8 @@ def _observed(plan: Plan) -> dict[str, Any]:
             "value": plain(IN_FILES * values[a]),
             "sigma": plain(IN_FILES * sigma[a]) if a in sigma else None,
         }
-        found["mounts"].append(mount)
-    return found
+        observed["mounts"].append(mount)
+    return observed
 
 
 def _camera_summary(camera: Camera, c: Calibratability | None) -> dict[str, Any]:
@@ -420,19 +445,13 @@ def _camera_rows(c: Calibratability, camera: Camera) -> list[tuple[str, ...]]:
             if name in (pair.first.split(" ")[0], pair.second.split(" ")[0])
         ]
         outer = [
-            f"{one.partners} ({one.largest:+.2f})"
-            for one in c.with_exterior
-            if one.parameter.startswith(f"{name} ")
+            f"{correlation.partners} ({correlation.largest:+.2f})"
+            for correlation in c.with_exterior
+            if correlation.parameter.startswith(f"{name} ")
         ]
         shown = significant(sigma) if np.isfinite(sigma) else "not determined"
         rows.append((name, shown, raised(units[name]), "; ".join((*others, *outer))))
     return rows
-
-
-def _first(undetermined: tuple[str, ...]) -> str:
-    """Write the first undetermined quantity, and how many more there are."""
-    more = len(undetermined) - 1
-    return undetermined[0] + (f"; and {more} more" if more else "")
 
 
 def _spread(values: FloatArray, unit: str) -> str:

@@ -66,20 +66,21 @@ def protocol_of(result: SurveyResult, given: Given) -> Protocol:
     """Return the protocol entries of a result."""
     a = result.adjustment
     seen, source = a.network.image_points, a.network.source
-    names = tuple(one.name for one in a.network.sources)
+    names = tuple(declared.name for declared in a.network.sources)
+    residuals = list(_groups(a, "source", source, names, seen.point, a.network.points)) if names[1:] else []
+    residuals += _groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points)
+    residuals += _groups(a, "point", seen.point, a.network.points, seen.image, a.network.images)
     return Protocol(
-        residuals=(
-            *(_groups(a, "source", source, names, seen.point, a.network.points) if names[1:] else ()),
-            *_groups(a, "photograph", seen.image, a.network.images, seen.point, a.network.points),
-            *_groups(a, "point", seen.point, a.network.points, seen.image, a.network.images),
-        ),
+        residuals=tuple(residuals),
         limits=_limits(result),
         control=(
             *_control(a, given),
             *_checked(a, result.control_check),
             *check_coordinates(result, placed=True),
         ),
-        lenses=tuple(_lens(one) for k, one in enumerate(a.estimate.cameras) if (a.network.camera == k).any()),
+        lenses=tuple(
+            _lens(camera) for k, camera in enumerate(a.estimate.cameras) if (a.network.camera == k).any()
+        ),
         cumulative=_cumulative(a),
     )
 
@@ -124,15 +125,15 @@ def _limits(result: SurveyResult) -> str:
 
 
 def _control(a: Adjustment, given: Given) -> list[ControlCoordinate]:
-    found = given.control
-    if found is None:
+    control = given.control
+    if control is None:
         return []
     points = a.network.control.point
     xyz, posterior = a.estimate.points[points], standard_deviations(a.covariance.points[points])
-    numbers = np.stack([found.given, found.sigma, xyz, posterior, found.difference, found.w], axis=-1)
+    numbers = np.stack([control.given, control.sigma, xyz, posterior, control.difference, control.w], axis=-1)
     return [
-        ControlCoordinate("control", found.names[k], "XYZ"[c], *numbers[k, c].tolist())
-        for k, c in np.argwhere(np.isfinite(found.sigma))
+        ControlCoordinate("control", control.names[k], "XYZ"[c], *numbers[k, c].tolist())
+        for k, c in np.argwhere(np.isfinite(control.sigma))
     ]
 
 
@@ -160,11 +161,11 @@ def _lens(camera: Camera) -> Lens:
     width, height = camera.size_px
     along = np.linspace(0.0, 1.0, EDGE_STEPS)
     x, y = (width - 1) * along, (height - 1) * along
-    zero, one = np.zeros(EDGE_STEPS), np.ones(EDGE_STEPS)
+    zero, ones = np.zeros(EDGE_STEPS), np.ones(EDGE_STEPS)
     edge = np.concatenate(
         [
             np.stack(side, axis=1)
-            for side in ((x, zero), (x, one * (height - 1)), (zero, y), (one * (width - 1), y))
+            for side in ((x, zero), (x, ones * (height - 1)), (zero, y), (ones * (width - 1), y))
         ]
     )
     straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
@@ -192,15 +193,15 @@ def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:
         names = [camera.names[s] for s in free]
         radial = np.flatnonzero(camera.plays(Role.RADIAL)[free])
         for first in range(len(radial)):
-            some = radial[first:]
-            value = camera.parameters[free[some]]
-            scale = np.sqrt(np.diagonal(Q)[some])
+            terms = radial[first:]
+            value = camera.parameters[free[terms]]
+            scale = np.sqrt(np.diagonal(Q)[terms])
             if not (scale > 0).all() or a.redundancy < 1:
                 continue
-            normed = Q[np.ix_(some, some)] / scale[:, None] / scale
-            statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(some)
-            p = float(f_sf(statistic, len(some), a.redundancy))
-            owner = camera.owner_of(int(free[some[0]]))
-            which = ", ".join(names[s] for s in some)
+            normed = Q[np.ix_(terms, terms)] / scale[:, None] / scale
+            statistic = float((value / scale) @ np.linalg.solve(normed, value / scale)) / len(terms)
+            p = float(f_sf(statistic, len(terms), a.redundancy))
+            owner = camera.owner_of(int(free[terms[0]]))
+            which = ", ".join(names[s] for s in terms)
             tests[owner, which] = CumulativeTest(owner, which, p)
     return tuple(tests.values())

@@ -24,21 +24,34 @@ from sfm.textbook.resection.dlt import DirectLinearTransformation
 
 EXTERIOR = ("X0", "Y0", "Z0", "omega_deg", "phi_deg", "kappa_deg")
 METHODS = (
-    *(Column("method"), Column("no", format=str)),
-    *(Column(name, format=".6f") for name in EXTERIOR[:3]),
-    *(Column(name, format=".5f") for name in ("omega", "phi", "kappa")),
+    Column("method"),
+    Column("no", format=str),
+    Column("X0", format=".6f"),
+    Column("Y0", format=".6f"),
+    Column("Z0", format=".6f"),
+    Column("omega", format=".5f"),
+    Column("phi", format=".5f"),
+    Column("kappa", format=".5f"),
     Column("rms mm", format=".6f"),
 )
 NO_SECOND = -1.0  # r of the second-best position if there is none
 COLUMNS = (
-    *(Column("point", "point"), Column(None, "x_px"), Column(None, "y_px"), Column("left px", format=str)),
-    *(Column(None, "x_right_px"), Column(None, "y_right_px"), Column("right px", format=str)),
-    *(Column(None, "sx_px"), Column(None, "sy_px"), Column("sigma px", format=str)),
+    Column("point", "point"),
+    Column(None, "x_px"),
+    Column(None, "y_px"),
+    Column("left px", format=str),
+    Column(None, "x_right_px"),
+    Column(None, "y_right_px"),
+    Column("right px", format=str),
+    Column(None, "sx_px"),
+    Column(None, "sy_px"),
+    Column("sigma px", format=str),
     Column("r", "r", format=".4f", unknown="-"),
     Column("second r", "r_second", format=lambda r: f"{r:.2f}" if r > NO_SECOND else "-"),
-    *(Column("steps", "steps", format=str), Column("", "reason")),
+    Column("steps", "steps", format=str),
+    Column("", "reason"),
 )
-NAMES = tuple(one.name for one in COLUMNS if one.name)
+NAMES = tuple(column.name for column in COLUMNS if column.name)
 TABLE_ENDINGS = (".csv", ".json")
 PICTURE_ENDING = ".png"
 PNG_HEAD = 33  # bytes of the signature and the first chunk (PNG specification, sec. 5.2 and 11.2.1)
@@ -46,11 +59,13 @@ MARK = b"Software\0kolinear match"  # identifies pictures by this program (PNG s
 LOOKED_AT = 4096  # bytes of an existing file that are checked
 
 
-def matches_table(names: tuple[str, ...], found: ConjugatePoints) -> Table:
+def matches_table(names: tuple[str, ...], matches: ConjugatePoints) -> Table:
     """Return the matches as a table, NaN for missing values."""
-    values = np.column_stack([found.left, found.right, found.sigma, found.correlation, found.second])
+    values = np.column_stack(
+        [matches.left, matches.right, matches.sigma, matches.correlation, matches.second]
+    )
     rows = []
-    for name, row, steps, why in zip(names, values.tolist(), found.steps, found.reason, strict=True):
+    for name, row, steps, why in zip(names, values.tolist(), matches.steps, matches.reason, strict=True):
         x, y, x_right, y_right, sx, sy, r, second = row
         right, sigma = ("-", "-") if why else (f"{x_right:.3f}, {y_right:.3f}", f"{sx:.4f}, {sy:.4f}")
         left = f"{x:.2f}, {y:.2f}"
@@ -58,16 +73,21 @@ def matches_table(names: tuple[str, ...], found: ConjugatePoints) -> Table:
     return Table(COLUMNS, rows)
 
 
-def matches_json(names: tuple[str, ...], found: ConjugatePoints) -> str:
+def matches_json(names: tuple[str, ...], matches: ConjugatePoints) -> str:
     """Return the matches as JSON, null for missing values."""
-    beside = zip(matches_table(names, found).records, found.covariance, found.gain, found.offset, strict=True)
+    beside = zip(
+        matches_table(names, matches).records, matches.covariance, matches.gain, matches.offset, strict=True
+    )
     entries = [
         entry | {"covariance_px2": Q if np.isfinite(Q).all() else None, "gain": gain, "offset": offset}
         for entry, Q, gain, offset in beside
     ]
     return (
         json.dumps(
-            plain({"method": found.method, "points": entries}), indent=1, ensure_ascii=False, allow_nan=False
+            plain({"method": matches.method, "points": entries}),
+            indent=1,
+            ensure_ascii=False,
+            allow_nan=False,
         )
         + "\n"
     )
@@ -121,8 +141,8 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 
 def _refuse_ending(option: str, path: Path, endings: tuple[str, ...]) -> None:
     if path.suffix.lower() not in endings:
-        found = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
-        raise OutputError(f"{option} {path}: {found}, needed {' or '.join(endings)}")
+        ending = f"ends in '{path.suffix}'" if path.suffix else "has no ending"
+        raise OutputError(f"{option} {path}: {ending}, needed {' or '.join(endings)}")
 
 
 def _refuse_existing(option: str, path: Path, inputs: tuple[Path, ...], heads: tuple[bytes, ...]) -> None:
@@ -141,11 +161,11 @@ def _refuse_existing(option: str, path: Path, inputs: tuple[Path, ...], heads: t
         raise OutputError(f"{option} {path}: exists and was not written by kolinear match")
 
 
-def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
+def resection_json(result: ResectionResult, c: float) -> dict[str, Any]:
     """Return the result of one method, ready for JSON.
 
     Args:
-        found: result of `resection.by_method.resect`.
+        result: result of `resection.by_method.resect`.
         c: principal distance, mm.
 
     Returns:
@@ -154,95 +174,101 @@ def resection_json(found: ResectionResult, c: float) -> dict[str, Any]:
         line_fit, interior, rejected, trials, warning.
     """
     unit = np.array([1, 1, 1, *[np.degrees(1.0)] * 3])
-    lines = found.line_fit or ()
+    lines = result.line_fit or ()
     known = {
-        "method": found.method,
-        "points": found.points,
+        "method": result.method,
+        "points": result.points,
         "solutions": [
-            dict(zip(EXTERIOR, _values(one), strict=True)) | {"M": one.rotation.T, "rms_mm": one.rms * c}
-            for one in found.solutions
+            dict(zip(EXTERIOR, _values(solution), strict=True))
+            | {"M": solution.rotation.T, "rms_mm": solution.rms * c}
+            for solution in result.solutions
         ],
         "line_fit": [
-            {"slope": one.slope, "intercept_mm": one.intercept * c, "scatter_mm": one.scatter * c}
-            for one in lines
+            {"slope": line.slope, "intercept_mm": line.intercept * c, "scatter_mm": line.scatter * c}
+            for line in lines
         ]
         or None,
-        "sigma0_mm": found.sigma0_mm,
-        "redundancy": None if found.sigma0_mm is None else found.redundancy,
-        "dispersion": None if found.dispersion is None else found.dispersion * np.outer(unit, unit),
-        "history": None if found.history is None else found.history * unit[: found.history.shape[1]],
-        "residuals_mm": found.residuals_mm,
-        "interior": None if found.interior is None else _interior(found.interior),
-        "rejected": found.rejected,
-        "trials": found.trials,
-        "warning": found.warning or None,
+        "sigma0_mm": result.sigma0_mm,
+        "redundancy": None if result.sigma0_mm is None else result.redundancy,
+        "dispersion": None if result.dispersion is None else result.dispersion * np.outer(unit, unit),
+        "history": None if result.history is None else result.history * unit[: result.history.shape[1]],
+        "residuals_mm": result.residuals_mm,
+        "interior": None if result.interior is None else _interior(result.interior),
+        "rejected": result.rejected,
+        "trials": result.trials,
+        "warning": result.warning or None,
     }
     return {name: plain(value) for name, value in known.items() if value is not None}
 
 
-def comparison_json(found: dict[str, ResectionResult | GeometryError], c: float) -> list[dict[str, Any]]:
+def comparison_json(results: dict[str, ResectionResult | GeometryError], c: float) -> list[dict[str, Any]]:
     """Return the results of all methods, or the reason for no result, ready for JSON; c in mm."""
     return [
-        {"method": name, "error": str(one)} if isinstance(one, GeometryError) else resection_json(one, c)
-        for name, one in found.items()
+        {"method": name, "error": str(result)}
+        if isinstance(result, GeometryError)
+        else resection_json(result, c)
+        for name, result in results.items()
     ]
 
 
-def comparison_table(found: dict[str, ResectionResult | GeometryError], c: float) -> str:
+def comparison_table(results: dict[str, ResectionResult | GeometryError], c: float) -> str:
     """Return the results of all methods in a table, and below it the reasons for no result; c in mm."""
     rows, remarks = [], []
-    for name, one in found.items():
-        if isinstance(one, GeometryError):
-            remarks.append(f"{name}: {str(one).removeprefix(f'{name}: ')}\n")
+    for name, result in results.items():
+        if isinstance(result, GeometryError):
+            remarks.append(f"{name}: {str(result).removeprefix(f'{name}: ')}\n")
             continue
-        rows += [(name, k, *_values(each), each.rms * c) for k, each in enumerate(one.solutions, start=1)]
-        if one.warning:
-            remarks.append(f"{name}: {one.warning}\n")
+        rows += [
+            (name, k, *_values(solution), solution.rms * c)
+            for k, solution in enumerate(result.solutions, start=1)
+        ]
+        if result.warning:
+            remarks.append(f"{name}: {result.warning}\n")
     return (Table(METHODS, rows).text + "".join(remarks)).rstrip("\n")
 
 
-def resection_text(found: ResectionResult, c: float) -> str:
+def resection_text(result: ResectionResult, c: float) -> str:
     """Return the result of one method as text; c in mm."""
-    lines = [f"{found.method}, {counted(found.points, 'point')}"]
-    for k, one in enumerate(found.solutions, start=1):
-        X0, Y0, Z0, omega, phi, kappa = _values(one)
-        lines.append(f"solution {k}: rms {one.rms * c:.6f} mm")
+    lines = [f"{result.method}, {counted(result.points, 'point')}"]
+    for k, solution in enumerate(result.solutions, start=1):
+        X0, Y0, Z0, omega, phi, kappa = _values(solution)
+        lines.append(f"solution {k}: rms {solution.rms * c:.6f} mm")
         lines.append(f"  X0 Y0 Z0        {X0:.8f} {Y0:.8f} {Z0:.8f}")
         lines.append(f"  omega phi kappa {omega:.7f} {phi:.7f} {kappa:.7f} deg")
-        lines += ["  M " + " ".join(f"{value:12.9f}" for value in row) for row in one.rotation.T]
-    if found.sigma0_mm is not None and np.isfinite(found.sigma0_mm):
-        lines.append(f"sigma0 {found.sigma0_mm:.7g} mm, redundancy {found.redundancy}")
-        if found.dispersion is not None:
-            sigma = np.sqrt(np.diag(found.dispersion))
+        lines += ["  M " + " ".join(f"{value:12.9f}" for value in row) for row in solution.rotation.T]
+    if result.sigma0_mm is not None and np.isfinite(result.sigma0_mm):
+        lines.append(f"sigma0 {result.sigma0_mm:.7g} mm, redundancy {result.redundancy}")
+        if result.dispersion is not None:
+            sigma = np.sqrt(np.diag(result.dispersion))
             sigma[3:] = np.degrees(sigma[3:])
             lines.append("standard deviations X0 Y0 Z0 " + " ".join(f"{value:.4g}" for value in sigma[:3]))
             lines.append("  omega phi kappa (deg)      " + " ".join(f"{value:.4g}" for value in sigma[3:]))
-    if found.interior is not None:
-        interior = _interior(found.interior)
+    if result.interior is not None:
+        interior = _interior(result.interior)
         lines.append("interior " + ", ".join(f"{key} {value:.6g}" for key, value in interior.items()))
-    if found.rejected is not None:
+    if result.rejected is not None:
         lines.append(
-            f"rejected {len(found.rejected)}: {', '.join(found.rejected)}"
-            if found.rejected
+            f"rejected {len(result.rejected)}: {', '.join(result.rejected)}"
+            if result.rejected
             else "rejected none"
         )
-    if found.history is not None:
+    if result.history is not None:
         lines.append("history")
-        for unknowns in found.history:
+        for unknowns in result.history:
             values = [*unknowns[:3], *np.degrees(unknowns[3:])]
             lines.append("  " + " ".join(f"{value:14.8f}" for value in values))
-    if found.warning:
-        lines.append(f"warning: {found.warning}")
+    if result.warning:
+        lines.append(f"warning: {result.warning}")
     return "\n".join(lines)
 
 
-def _interior(found: DirectLinearTransformation) -> dict[str, float]:
+def _interior(transformation: DirectLinearTransformation) -> dict[str, float]:
     return {
-        "c_mm": found.c,
-        "x0_mm": float(found.principal_point[0]),
-        "y0_mm": float(found.principal_point[1]),
-        "affinity": found.affinity,
-        "shear_deg": float(np.degrees(found.shear)),
+        "c_mm": transformation.c,
+        "x0_mm": float(transformation.principal_point[0]),
+        "y0_mm": float(transformation.principal_point[1]),
+        "affinity": transformation.affinity,
+        "shear_deg": float(np.degrees(transformation.shear)),
     }
 
 

@@ -76,7 +76,7 @@ def precision_parts(f: Findings) -> Iterator[Part]:
         ("omega, phi, kappa, RMS sigma", np.degrees(p.angles) * 3600, 1.0, "arc seconds"),
     ]
     shown = [
-        (name, *(significant(one) for one in values * times), of)
+        (name, *(significant(value) for value in values * times), of)
         for name, values, times, of in rows
         if not np.isnan(values[3])
     ]
@@ -113,25 +113,29 @@ def precision_parts(f: Findings) -> Iterator[Part]:
 
 def geometry_parts(f: Findings) -> Iterator[Part]:
     """Yield rays, angles, residuals and coverage."""
-    network, found = f.result.adjustment.network, f.geometry
-    weak = listed(f"{network.points[j]} ({found.angle_deg[j]:.1f})" for j in found.weak)
-    words = f"{counted(len(found.weak), 'point')}: {weak}" if len(found.weak) else "none"
+    network, geometry = f.result.adjustment.network, f.geometry
+    weak = listed(f"{network.points[j]} ({geometry.angle_deg[j]:.1f})" for j in geometry.weak)
+    words = f"{counted(len(geometry.weak), 'point')}: {weak}" if len(geometry.weak) else "none"
     points = tuple(f"point {name}" for name in network.points)
-    known = found.angle_deg[np.isfinite(found.angle_deg)]
+    known = geometry.angle_deg[np.isfinite(geometry.angle_deg)]
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {words}" if len(known) else ""
-    low, high = int(found.rays.min()), int(found.rays.max())
+    low, high = int(geometry.rays.min()), int(geometry.rays.max())
     yield Heading("Geometry of the network")
+    covered = [(f"coverage {coverage.camera}", _covered(coverage)) for coverage in geometry.coverage]
     yield facts(
         [
             (
                 "rays of a point",
-                f"{low} each" if low == high else f"{low} to {high}, mean {found.rays.mean():.1f}",
+                f"{low} each" if low == high else f"{low} to {high}, mean {geometry.rays.mean():.1f}",
             ),
-            ("points by rays", ", ".join(f"{rays}: {count}" for rays, count in points_by_rays(found))),
-            ("intersection angle", _between(found.angle_deg, points, "deg", 1) + mean),
-            ("RMS by point", f"{_between(found.point_rms_px, points, 'px', 4)} per coordinate"),
-            ("RMS by photograph", f"{_between(found.image_rms_px, network.images, 'px', 4)} per coordinate"),
-            *((f"coverage {one.camera}", _covered(one)) for one in found.coverage),
+            ("points by rays", ", ".join(f"{rays}: {count}" for rays, count in points_by_rays(geometry))),
+            ("intersection angle", _between(geometry.angle_deg, points, "deg", 1) + mean),
+            ("RMS by point", f"{_between(geometry.point_rms_px, points, 'px', 4)} per coordinate"),
+            (
+                "RMS by photograph",
+                f"{_between(geometry.image_rms_px, network.images, 'px', 4)} per coordinate",
+            ),
+            *covered,
         ]
     )
     yield Note(
@@ -142,9 +146,9 @@ def geometry_parts(f: Findings) -> Iterator[Part]:
     )
 
 
-def points_by_rays(found: Geometry) -> tuple[tuple[str, int], ...]:
+def points_by_rays(geometry: Geometry) -> tuple[tuple[str, int], ...]:
     """Return pairs of a number of rays and the number of points; ranges if there are many numbers."""
-    histogram = found.histogram()
+    histogram = geometry.histogram()
     if len(histogram) <= MAX_BINS:
         return tuple((str(rays), n) for rays, n in histogram)
     low, high = histogram[0][0], histogram[-1][0]
@@ -165,11 +169,11 @@ def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: in
     return " to ".join(f"{values[k]:.{decimals}f} {unit} ({names[k]})" for k in ends)
 
 
-def _covered(one: Coverage) -> str:
-    hull, radius = 100 * one.hull, 100 * one.radius
+def _covered(coverage: Coverage) -> str:
+    hull, radius = 100 * coverage.hull, 100 * coverage.radius
     area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
     reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
-    return f"{area}, all together {100 * one.hull_of_all:.0f} %; reach from the centre {reach}"
+    return f"{area}, all together {100 * coverage.hull_of_all:.0f} %; reach from the centre {reach}"
 
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:
@@ -212,16 +216,23 @@ def _reliability(f: Findings) -> Iterator[Part]:
     tests = zip(names, (s.w, s.tau), (s.largest_w, s.largest_tau), strict=True)
     yield Table(
         (
-            *(Column("test for a gross error"), *columns(">coordinates")),
-            *(Column("critical value", format=".2f"), *columns(">beyond it")),
-            *(Column("by chance", format=".1f"), Column("largest", format=".2f")),
+            Column("test for a gross error"),
+            *columns(">coordinates"),
+            Column("critical value", format=".2f"),
+            *columns(">beyond it"),
+            Column("by chance", format=".1f"),
+            Column("largest", format=".2f"),
         ),
         [
             (
-                f"{name}, {percent(one.alpha)}",
-                *(one.tested, one.critical, one.beyond, one.expected, largest),
+                f"{name}, {percent(test.alpha)}",
+                test.tested,
+                test.critical,
+                test.beyond,
+                test.expected,
+                largest,
             )
-            for name, one, largest in tests
+            for name, test, largest in tests
         ],
     )
     r, bias, effect = s.redundancy, s.minimal_bias, s.external
@@ -261,11 +272,17 @@ def largest_residual_parts(f: Findings) -> Iterator[Part]:
 PARAMETERS = columns("of", "parameter", ">value", ">sigma", "unit", ">value / sigma")
 
 
-def _parameters(found: Sequence[InteriorParameter], *, of: bool = False) -> Table:
-    tests = ("" if one.t is None else fixed(one.t, 1) for one in found)
+def _parameters(parameters: Sequence[InteriorParameter], *, of: bool = False) -> Table:
+    tests = ("" if parameter.t is None else fixed(parameter.t, 1) for parameter in parameters)
     rows = [
-        (one.owner, one.name, *with_exponent(one.value, one.sigma), raised(one.unit), t)
-        for one, t in zip(found, tests, strict=True)
+        (
+            parameter.owner,
+            parameter.name,
+            *with_exponent(parameter.value, parameter.sigma),
+            raised(parameter.unit),
+            t,
+        )
+        for parameter, t in zip(parameters, tests, strict=True)
     ]
     return Table(PARAMETERS[0 if of else 1 :], [row[0 if of else 1 :] for row in rows], all_in="cameras.csv")
 
@@ -276,7 +293,7 @@ def camera_parts(f: Findings) -> Iterator[Part]:
     for family in f.interior.families:
         camera = family.camera
         yield Subheading(family.name)
-        size, pixel = camera.size_px, [general(1000 * one, 5) for one in camera.pixel_mm]
+        size, pixel = camera.size_px, [general(1000 * side, 5) for side in camera.pixel_mm]
         shared = f"; these parameters are shared by {counted(family.photographs, 'photograph')}"
         yield Paragraph(
             f"model {camera.model}, {size[0]} x {size[1]} px of {pixel[0]} x {pixel[1]} µm"
@@ -284,15 +301,15 @@ def camera_parts(f: Findings) -> Iterator[Part]:
         )
         yield _parameters(family.parameters)
     for lens in f.protocol.lenses:
-        across, up, diagonal = (fixed(one, 1) for one in lens.field_of_view_deg)
+        across, up, diagonal = (fixed(angle, 1) for angle in lens.field_of_view_deg)
         yield Paragraph(
             f"{lens.camera}: distortion up to {fixed(lens.largest_px, 1)} px; field of view {across} x {up} "
             f"deg, diagonal {diagonal} deg."
         )
     if f.protocol.cumulative:
         tests = (
-            f"{one.parameters} of {one.camera}: {probability(one.probability)}"
-            for one in f.protocol.cumulative
+            f"{test.parameters} of {test.camera}: {probability(test.probability)}"
+            for test in f.protocol.cumulative
         )
         yield Paragraph(f"Radial distortion terms jointly tested against 0 (F test): {'; '.join(tests)}.")
     if single := f.interior.single:
@@ -338,8 +355,13 @@ def _correlations(f: Findings) -> Iterator[Part]:
     if strong:
         heads = (Column("camera parameter"), Column("strongly correlated with"))
         rows = [
-            (one.parameter, one.partners, 100 * one.largest, f"with {one.part} of {one.image}")
-            for one in strong
+            (
+                correlation.parameter,
+                correlation.partners,
+                100 * correlation.largest,
+                f"with {correlation.part} of {correlation.image}",
+            )
+            for correlation in strong
         ]
         yield Table((*heads, Column("largest correlation", "", "%", "+.1f"), Column("")), rows)
         yield Note(
@@ -351,8 +373,8 @@ def _correlations(f: Findings) -> Iterator[Part]:
             f"No camera parameter is correlated with the exterior orientation of a photograph beyond {OVER}."
         )
     tests = ", ".join(
-        f"{one.parameter} of {one.camera} ({fixed(one.t, 1)}, p {fixed(one.probability, 2)})"
-        for one in s.not_significant
+        f"{test.parameter} of {test.camera} ({fixed(test.t, 1)}, p {fixed(test.probability, 2)})"
+        for test in s.not_significant
     )
     level = percent(f.result.adjustment.false_alarm)
     yield Paragraph(
@@ -363,8 +385,8 @@ def _correlations(f: Findings) -> Iterator[Part]:
     )
 
 
-def _pairs(found: Iterable[Correlation]) -> Table:
-    rows = [(one.first, one.second, 100 * one.value) for one in found]
+def _pairs(correlations: Iterable[Correlation]) -> Table:
+    rows = [(correlation.first, correlation.second, 100 * correlation.value) for correlation in correlations]
     heads = (Column("parameter"), Column("and"), Column("correlation", "", "%", "+.1f"))
     return Table(heads, rows, most=MAX_CORRELATIONS, all_in="summary.json")
 
@@ -387,7 +409,7 @@ def component_parts(f: Findings) -> Iterator[Part]:
     for kind in ("kind", "source", "camera", "photograph"):
         name = named.get(kind, kind)
         columns = columns_of(VARIANCE_COMPONENTS, {"group": Column(name), **COMPONENTS})
-        some = [row for row in rows if row[0] == kind]
-        if kind not in named or len(some) > 1:
-            table = Table(columns, some, all_in=VARIANCE_COMPONENTS.file)
+        members = [row for row in rows if row[0] == kind]
+        if kind not in named or len(members) > 1:
+            table = Table(columns, members, all_in=VARIANCE_COMPONENTS.file)
             yield FoldedParts(f"Variance components by {name}", table, in_text=True)

@@ -85,11 +85,11 @@ class Report:
 
     def plot(self, stem: str) -> Plot | None:
         """Return a plot by the stem of its file name; None if there is none."""
-        return next((one for one in self.plots if one.stem == stem), None)
+        return next((plot for plot in self.plots if plot.stem == stem), None)
 
 
 def page(
-    found: Findings,
+    findings: Findings,
     *,
     plots: Sequence[Plot] = (),
     overlays: Sequence[Overlay] = (),
@@ -99,39 +99,39 @@ def page(
     """Return the report of a survey.
 
     Args:
-        found: the findings of the result.
+        findings: the findings of the result.
         plots: pictures of the adjustment.
         overlays: annotated photographs; links lead to the folder of overlays.
         has_model: whether the folder contains the compared solution as a COLMAP model.
         viewer: the scene of the 3D viewer, whose pictures may be files beside the page; None omits it.
     """
-    report = Report(found, plots, overlays, has_model)
+    report = Report(findings, plots, overlays, has_model)
     return Page(
         "report",
         "Survey report",
-        found.result.survey,
-        found.verdict,
+        findings.result.survey,
+        findings.verdict,
         tuple(section(report) for section in SECTIONS),
-        tuple(_tiles(found)),
+        tuple(_tiles(findings)),
         viewer=viewer,
         pictures_beside=viewer is not None,
     )
 
 
-def text_report(found: Findings) -> str:
+def text_report(findings: Findings) -> str:
     """Return the text of report.txt, without dates and hosts so that two reports can be compared."""
-    files = f"Tables (.csv): {', '.join(table_stems(found))}."
-    return "\n".join([text(page(found)), *wrapped(CONVENTIONS, behind=0), *wrapped(files, behind=0), ""])
+    files = f"Tables (.csv): {', '.join(table_stems(findings))}."
+    return "\n".join([text(page(findings)), *wrapped(CONVENTIONS, behind=0), *wrapped(files, behind=0), ""])
 
 
 def _tiles(f: Findings) -> Iterator[Tile]:
     """Yield the key figures at the top of the page."""
     result, a = f.result, f.result.adjustment
-    for one in f.calibrated[:2]:
-        values, sigmas, within, projection = describe_calibration(one)
-        yield Tile(f"Camera {one.name}", values, f"1 sigma {sigmas}; 95 % {within}", wide=True)
-        rms = f"{significant(one.projection_rms_px)} px"
-        yield Tile(f"Projection uncertainty of {one.name}", rms, projection)
+    for camera in f.calibrated[:2]:
+        values, sigmas, within, projection = describe_calibration(camera)
+        yield Tile(f"Camera {camera.name}", values, f"1 sigma {sigmas}; 95 % {within}", wide=True)
+        rms = f"{significant(camera.projection_rms_px)} px"
+        yield Tile(f"Projection uncertainty of {camera.name}", rms, projection)
     yield Tile("Photographs oriented", f"{len(a.network.images)} of {result.images_total}")
     yield Tile("Object points", len(result.code), result.point_counts)
     if not f.calibrated:
@@ -139,13 +139,13 @@ def _tiles(f: Findings) -> Iterator[Tile]:
     yield Tile("RMS residual", f"{fixed(a.rms_px, 4)} px", "per image coordinate")
     sigma0, times = describe_sigma0(f.sigma0)
     yield Tile("Sigma0", sigma0, f"{times}, redundancy {a.redundancy}")
-    if both := result.comparison:
-        left_out, better = words_left_out(f), both.better
+    if adjusters := result.comparison:
+        left_out, better = words_left_out(f), adjusters.better
         note = f"with {', '.join(better.free)} free" if better else "image points alone"
         if left_out and not better:
             note += f", {left_out}"
-        outcome = "fits better" if both.agree and better else both.outcome
-        yield Tile(program_name(both.backend), outcome, note)
+        outcome = "fits better" if adjusters.agree and better else adjusters.outcome
+        yield Tile(program_name(adjusters.backend), outcome, note)
 
 
 def _precision_tile(f: Findings) -> Tile:
@@ -175,6 +175,7 @@ def worked(report: Report) -> Section:
     datum = a.datum
     if a.datum_points is not None:
         datum = f"{datum} on {counted(int(a.datum_points.sum()), 'chosen point')}"
+    undetermined = [("Cannot be determined", words) for words in a.undetermined]
     state = facts(
         [
             ("Photographs", f"{oriented}, {len(failed)} failed (below)" if failed else oriented),
@@ -186,7 +187,7 @@ def worked(report: Report) -> Section:
                 f"{a.unknowns} (exterior orientation {exterior}, interior {interior}, points {points})",
             ),
             ("Redundancy", str(a.redundancy)),
-            *(("Cannot be determined", words) for words in a.undetermined),
+            *undetermined,
         ]
     )
     rows = (
@@ -202,12 +203,17 @@ def worked(report: Report) -> Section:
     )
     fixes = agreeing(counts.constraints, "fixes|fix")
     besides = f"In addition, {counted(counts.constraints, 'constraint')} {fixes} the datum."
-    lost = left_out("photograph", f)
+    lost: tuple[Part, ...] = ()
+    if failed:
+        lost = (Heading("Photographs not in the result"), left_out("photograph", f))
     return Section(
         "Did it work?",
         *_calibrated(f),
-        *(state, Heading("Observations"), observed, Paragraph(besides) if counts.constraints else None),
-        *((Heading("Photographs not in the result"), lost) if failed else ()),
+        state,
+        Heading("Observations"),
+        observed,
+        Paragraph(besides) if counts.constraints else None,
+        *lost,
         report.plot("network"),
         key="worked",
     )
@@ -226,9 +232,9 @@ def _calibrated(f: Findings) -> Iterator[Part]:
     """Yield the calibrated cameras if they are the result of the survey."""
     if f.calibrated:
         rows = []
-        for one in f.calibrated:
-            values, sigmas, within, projection = describe_calibration(one)
-            rows += [(one.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"), ("projection", projection)]
+        for camera in f.calibrated:
+            values, sigmas, within, projection = describe_calibration(camera)
+            rows += [(camera.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"), ("projection", projection)]
         yield Heading("Calibrated cameras")
         yield facts(rows)
 
@@ -239,13 +245,20 @@ def quality(report: Report) -> Section:
     photographs = Heading("Photographs")
     return Section(
         "How good is it?",
-        *(*quality_of.precision_parts(f), report.plot("precision")),
+        *quality_of.precision_parts(f),
+        report.plot("precision"),
         *quality_of.geometry_parts(f),
         *quality_of.given_values_parts(f),
-        *(*quality_of.image_point_parts(f), report.plot("distribution"), report.plot("residuals")),
+        *quality_of.image_point_parts(f),
+        report.plot("distribution"),
+        report.plot("residuals"),
         *quality_of.largest_residual_parts(f),
-        *(*quality_of.camera_parts(f), report.plot("projection"), report.plot("epipolar")),
-        *(photographs, report.plot("photographs"), *quality_of.component_parts(f)),
+        *quality_of.camera_parts(f),
+        report.plot("projection"),
+        report.plot("epipolar"),
+        photographs,
+        report.plot("photographs"),
+        *quality_of.component_parts(f),
         key="quality",
     )
 
@@ -273,7 +286,7 @@ def rejected(report: Report) -> Section:
         words = f"None of the {len(a.rejected)} image points was rejected in the adjustment."
         parts.append(Paragraph(f"{words} {limits}"))
     if result.left_out:
-        seen = sum(one.image_points for one in result.left_out)
+        seen = sum(point.image_points for point in result.left_out)
         lost = left_out("point", f)
         parts += [
             Heading("Measured points not in the result"),
@@ -304,8 +317,10 @@ def _rejected_points(a: Adjustment) -> Table:
         for k in rows[np.argsort(-np.nan_to_num(length[rows], nan=np.inf))]
     ]
     heads = (
-        *(*columns("photograph", "point"), *axes("", "px", ".2f", parts="xy")),
-        *(*axes("v", "px", "+.3f", parts="xy"), Column("length", "", "px", ".3f")),
+        *columns("photograph", "point"),
+        *axes("", "px", ".2f", parts="xy"),
+        *axes("v", "px", "+.3f", parts="xy"),
+        Column("length", "", "px", ".3f"),
     )
     return Table(heads, shown, most=MAX_LISTED, all_in="image_points.csv")
 
@@ -314,16 +329,16 @@ def _candidates(f: Findings) -> FoldedParts:
     """Return the counts of measured targets and of other candidates, by reason, in each photograph."""
     result = f.result
     used = dict(zip(f.result.adjustment.network.images, f.geometry.image_points.tolist(), strict=True))
-    counts = {one.image: Counter(dict(one.reasons())) for one in result.photographs}
+    counts = {photograph.image: Counter(dict(photograph.reasons())) for photograph in result.photographs}
     every = sum(counts.values(), Counter[str]())
     reasons = sort_likeliest_first(every)
-    rows = [
-        (one.image, len(one.xy), used.get(one.image, 0), *(counts[one.image][why] or "" for why in reasons))
-        for one in result.photographs
-    ]
+    rows = []
+    for photograph in result.photographs:
+        others = [counts[photograph.image][why] or "" for why in reasons]
+        rows.append((photograph.image, len(photograph.xy), used.get(photograph.image, 0), *others))
     total = (
         "all",
-        sum(len(one.xy) for one in result.photographs),
+        sum(len(photograph.xy) for photograph in result.photographs),
         sum(used.values()),
         *map(every.get, reasons),
     )
@@ -331,7 +346,9 @@ def _candidates(f: Findings) -> FoldedParts:
         "Blobs that might have been targets but were not measured, by reason; the most target-like first. "
         "Clutter in view produces many of them. The overlays show each one."
     )
-    heads = columns("photograph", ">measured", ">accepted in the result", *(f">{one}" for one in reasons))
+    heads = columns(
+        "photograph", ">measured", ">accepted in the result", *(f">{reason}" for reason in reasons)
+    )
     return FoldedParts("Candidates in the photographs", note, Table(heads, rows, total=total), open=True)
 
 
@@ -379,10 +396,8 @@ def coordinates(report: Report) -> Section:
     points, photographs = _object_points(f), _exterior(f)
     return Section(
         "Where are my coordinates?",
-        *(
-            Paragraph("In the folder of this report:"),
-            facts([(Link(name, name), words) for name, words in files]),
-        ),
+        Paragraph("In the folder of this report:"),
+        facts([(Link(name, name), words) for name, words in files]),
         FoldedParts(counted(len(points.rows), "object point"), points, open=len(points.rows) <= MAX_OPEN),
         FoldedParts(f"Exterior orientation of {counted(len(photographs.rows), 'photograph')}", photographs),
         key="coordinates",
@@ -395,19 +410,23 @@ def _object_points(f: Findings) -> Table:
     rows = [
         (name, *zip(xyz, sigma, strict=True), *sigma, rays, "" if code < 0 else code, angle, rms)
         for name, xyz, sigma, rays, code, angle, rms in zip(
-            *(a.network.points, a.estimate.points, f.precision.points, g.rays),
-            *(f.result.code, g.angle_deg, g.point_rms_px),
+            a.network.points,
+            a.estimate.points,
+            f.precision.points,
+            g.rays,
+            f.result.code,
+            g.angle_deg,
+            g.point_rms_px,
             strict=True,
         )
     ]
     heads = (
-        *(
-            Column("point"),
-            *axes("", unit, _with_digits),
-            *axes("s", unit, or_fixed),
-            *columns(">rays", ">code"),
-        ),
-        *(Column("angle", "", "deg", "z.1f"), Column("RMS", "", "px", "z.3f")),
+        Column("point"),
+        *axes("", unit, _with_digits),
+        *axes("s", unit, or_fixed),
+        *columns(">rays", ">code"),
+        Column("angle", "", "deg", "z.1f"),
+        Column("RMS", "", "px", "z.3f"),
     )
     return Table(heads, rows, all_in="points.csv")
 
@@ -416,17 +435,27 @@ def _exterior(f: Findings) -> Table:
     a, unit, g = f.result.adjustment, f.result.length_unit, f.geometry
     angles = np.degrees(angles_from_rotation(a.estimate.rotation))
     of_photographs = zip(
-        *(a.network.images, np.hstack([a.estimate.position, angles]), f.precision.exterior_deg),
-        *(g.image_points, g.image_rms_px, g.hull),
+        a.network.images,
+        np.hstack([a.estimate.position, angles]),
+        f.precision.exterior_deg,
+        g.image_points,
+        g.image_rms_px,
+        g.hull,
         strict=True,
     )
     rows = [(n, *zip(X, s, strict=True), *s, *others) for n, X, s, *others in of_photographs]
     names = ("omega", "phi", "kappa")
+    of_angles = [Column(name, "", "deg", _with_digits) for name in names]
+    sigmas_of_angles = [Column(f"s {name}", "", "deg", significant) for name in names]
     heads = (
-        *(Column("photograph"), *axes("", unit, _with_digits)),
-        *(Column(one, "", "deg", _with_digits) for one in names),
-        *(*axes("s", unit), *(Column(f"s {one}", "", "deg", significant) for one in names)),
-        *(*columns(">points"), Column("RMS", "", "px", "z.4f"), Column("coverage", "", "%", "z.0f", 100.0)),
+        Column("photograph"),
+        *axes("", unit, _with_digits),
+        *of_angles,
+        *axes("s", unit),
+        *sigmas_of_angles,
+        *columns(">points"),
+        Column("RMS", "", "px", "z.4f"),
+        Column("coverage", "", "%", "z.0f", 100.0),
     )
     return Table(heads, rows, all_in="images.csv")
 
@@ -473,10 +502,10 @@ def overlay_parts(overlays: Sequence[Overlay], describe: Callable[[str], str]) -
         describe: returns the words below the thumbnail of a photograph, from its name.
     """
     cards = Cards(
-        Card(f"overlays/{one.file_name}", one.thumbnail, one.image, describe(one.image))
-        for one in overlays[:MAX_LISTED]
+        Card(f"overlays/{overlay.file_name}", overlay.thumbnail, overlay.image, describe(overlay.image))
+        for overlay in overlays[:MAX_LISTED]
     )
-    others = [(Link(one.image, f"overlays/{one.file_name}"),) for one in overlays[MAX_LISTED:]]
+    others = [(Link(overlay.image, f"overlays/{overlay.file_name}"),) for overlay in overlays[MAX_LISTED:]]
     without = f"{counted(len(others), 'further photograph')} without a thumbnail here"
     return (cards, FoldedParts(without, Table(columns("photograph"), others))) if others else (cards,)
 
@@ -485,7 +514,7 @@ def process(report: Report) -> Section:
     """Return the section on processing: settings, times, corrections, conventions."""
     result = report.f.result
     written = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
-    times = [(one.stage, one.seconds) for one in result.seconds]
+    times = [(timed.stage, timed.seconds) for timed in result.seconds]
     settings = facts([("Written", f"{written} by Kolinear {version('kolinear')}"), *result.settings])
     seconds = Table(
         (Column("stage"), Column("seconds", format=".2f")),
@@ -493,12 +522,12 @@ def process(report: Report) -> Section:
         total=("all", float(np.sum([time for _, time in times]))),
     )
     eccentricity = None
-    if found := result.eccentricity:
+    if corrected := result.eccentricity:
         eccentricity = Paragraph(
             "Eccentricity: the centre of an ellipse is not the image of the circle's centre. Image points "
-            f"were corrected by {fixed(found.rms_px, 4)} px RMS per coordinate, "
-            f"{fixed(found.largest_px, 4)} px at most. Their standard deviations include that of the "
-            f"correction, {fixed(found.sigma_px, 5)} px."
+            f"were corrected by {fixed(corrected.rms_px, 4)} px RMS per coordinate, "
+            f"{fixed(corrected.largest_px, 4)} px at most. Their standard deviations include that of the "
+            f"correction, {fixed(corrected.sigma_px, 5)} px."
         )
     parts = (settings, seconds, eccentricity, Note(CONVENTIONS))
     return Section("How it was done", *parts, key="process", in_text=False)
@@ -511,12 +540,21 @@ def comparison(report: Report) -> Section:
 
 def baseline(report: Report) -> Section:
     """Return the section on another pipeline run on the photographs alone; empty if none was requested."""
-    found = report.f.result.baseline
-    return Section(f"And {found.name if found else ''} by itself?", *pipeline_parts(report.f), key="baseline")
+    pipeline = report.f.result.baseline
+    return Section(
+        f"And {pipeline.name if pipeline else ''} by itself?", *pipeline_parts(report.f), key="baseline"
+    )
 
 
 SECTIONS: tuple[Callable[[Report], Section], ...] = (
-    *(worked, quality, tested, rejected, comparison, baseline),
-    *(coordinates, photographs, process),
+    worked,
+    quality,
+    tested,
+    rejected,
+    comparison,
+    baseline,
+    coordinates,
+    photographs,
+    process,
 )
 """The sections of the report, in their order."""

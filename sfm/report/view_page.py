@@ -48,8 +48,11 @@ def page(scene: ViewerScene, *, pictures: Pictures, source: str) -> Page:
         ]
     )
     columns = (
-        *(Column("point"), *axes("", u, ".9g"), Column("rays", format=str)),
-        *(Column("angle", "", "deg", "z.1f"), Column("RMS", "", "px", "z.3f")),
+        Column("point"),
+        *axes("", u, ".9g"),
+        Column("rays", format=str),
+        Column("angle", "", "deg", "z.1f"),
+        Column("RMS", "", "px", "z.3f"),
     )
     rows = [
         (name, *xyz, *others)
@@ -121,10 +124,10 @@ def refuse_foreign_page(out: Path) -> None:
 def photographs_in(folder: Path, names: tuple[str, ...]) -> dict[str, Path]:
     """Return the photographs of given names in a folder; names that lead out of the folder are left out."""
     root = folder.resolve()
-    found = {}
+    paths = {}
     for name in names:
         with suppress(OSError, ValueError):  # a name that is not a valid file name here
             path = (root / name).resolve()
             if path.is_relative_to(root) and path.is_file():
-                found[name] = path
-    return found
+                paths[name] = path
+    return paths

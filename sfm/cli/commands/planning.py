@@ -312,7 +312,12 @@ def network_command(
         if stations is not None:
             placed = taken.photographs(stations_of(stations, object_, one))
             found = plan_of(
-                *(name, unit, object_, taken.cameras, placed, seeing),
+                name,
+                unit,
+                object_,
+                taken.cameras,
+                placed,
+                seeing,
                 wanted=wanted,
                 bars=bars,
                 given=taken.given,
@@ -325,7 +330,11 @@ def network_command(
                 floor,
             )
             design = design_network(
-                *(object_, one, allowed, seeing, wanted),
+                object_,
+                one,
+                allowed,
+                seeing,
+                wanted,
                 max_photographs=photographs,
                 bars=bars,
                 given=taken.given,

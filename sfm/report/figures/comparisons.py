@@ -84,31 +84,31 @@ def difference_figure(
     return picture
 
 
-def plot_series(found: EpochSeries) -> Plot | None:
+def plot_series(series: EpochSeries) -> Plot | None:
     """Plot the series of the points that moved farthest; None with two epochs, or if no point moved."""
-    if len(found.names) < 3:
+    if len(series.names) < 3:
         return None
-    pairs = [pair.displacements for pair in found.since_first]
+    pairs = [pair.displacements for pair in series.since_first]
     moved: dict[str, float] = {}
-    for one in pairs:
-        for k in np.flatnonzero(one.moved):
-            name = one.differences.points[k]
-            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(one.displacement[k])))
+    for displacements in pairs:
+        for k in np.flatnonzero(displacements.moved):
+            name = displacements.differences.points[k]
+            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(displacements.displacement[k])))
     chosen = sorted(moved, key=lambda name: -moved[name])[:MAX_DRAWN]
     if not chosen:
         return None
     factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
     picture = single_panel_figure(3.8)
     axes = picture.subplots()
-    at = np.arange(len(found.names))
+    at = np.arange(len(series.names))
     for name in chosen:
-        length, sigma = (factor * np.array(one) for one in _along(name, pairs))
+        length, sigma = (factor * np.array(values) for values in _along(name, pairs))
         (line,) = axes.plot(at, length, marker="o", ms=3, label=name)
         axes.fill_between(
             at, length - 2 * sigma, length + 2 * sigma, color=line.get_color(), alpha=0.15, lw=0
         )
     axes.axhline(0.0, color="grey", lw=0.8)
-    axes.set_xticks(at, found.names)
+    axes.set_xticks(at, series.names)
     axes.set_ylabel(f"displacement [{unit}]")
     axes.legend(fontsize=8, ncols=4, loc="upper left")
     return plot("series", BANDS, picture)
@@ -116,17 +116,20 @@ def plot_series(found: EpochSeries) -> Plot | None:
 
 def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
     """Return displacements of a point since the first epoch along its latest direction, and their sigmas."""
-    rows = [one.differences.points.index(name) if name in one.differences.points else -1 for one in pairs]
-    last, k = next((one, k) for one, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
+    rows = [
+        displacements.differences.points.index(name) if name in displacements.differences.points else -1
+        for displacements in pairs
+    ]
+    last, k = next((epoch, k) for epoch, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
     direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
     length, sigma = [0.0], [0.0]
-    for one, k in zip(pairs, rows, strict=True):
+    for epoch, k in zip(pairs, rows, strict=True):
         if k < 0:
             length.append(np.nan)
             sigma.append(np.nan)
             continue
-        Q = one.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
-        length.append(float(one.displacement[k] @ direction))
+        Q = epoch.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        length.append(float(epoch.displacement[k] @ direction))
         sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
     return length, sigma
 
@@ -178,19 +181,19 @@ def design_diagram(
     return buffer.getvalue()
 
 
-def deviation_figure(found: Deviations, unit: str) -> Figure:
+def deviation_figure(deviations: Deviations, unit: str) -> Figure:
     """Draw a histogram of the deviations, and each deviation with its uncertainty in ascending order."""
-    limits = [x for x in (found.lower, found.upper) if np.isfinite(x)]
-    largest = float(np.abs([*found.value, *limits]).max())
+    limits = [x for x in (deviations.lower, deviations.upper) if np.isfinite(x)]
+    largest = float(np.abs([*deviations.value, *limits]).max())
     factor, fine = finer_unit(unit, largest)
-    value, U = found.value * factor, found.coverage * np.nan_to_num(found.sigma) * factor
+    value, U = deviations.value * factor, deviations.coverage * np.nan_to_num(deviations.sigma) * factor
     picture = two_panel_figure(3.6)
     left, right = picture.subplots(1, 2)
     left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
     left.set(xlabel=f"deviation [{fine}]", ylabel="points")
     order = np.argsort(value, kind="stable")
     x = np.arange(1, len(order) + 1)
-    _draw_decided(right, x, value[order], U[order], np.array(found.decision)[order], 3)
+    _draw_decided(right, x, value[order], U[order], np.array(deviations.decision)[order], 3)
     for limit in limits:
         left.axvline(limit * factor, color=GREY, lw=1, ls="--")
         right.axhline(limit * factor, color=GREY, lw=1, ls="--")
@@ -199,21 +202,21 @@ def deviation_figure(found: Deviations, unit: str) -> Figure:
     return picture
 
 
-def length_error_figure(found: Acceptance) -> Figure:
+def length_error_figure(acceptance: Acceptance) -> Figure:
     """Draw the length measurement errors over the length, with their limits."""
-    length, error = found.lengths.length, found.error
-    U = found.coverage * np.nan_to_num(found.lengths.sigma)
-    factor, fine = finer_unit(found.unit, float(max(np.abs(error).max(), found.limit.max())))
+    length, error = acceptance.lengths.length, acceptance.error
+    U = acceptance.coverage * np.nan_to_num(acceptance.lengths.sigma)
+    factor, fine = finer_unit(acceptance.unit, float(max(np.abs(error).max(), acceptance.limit.max())))
     picture = single_panel_figure(4.2)
     axes = picture.subplots()
     x = np.linspace(0, 1.05 * float(length.max()), 200)
-    limit = np.minimum(found.a + found.k * x, found.b) * factor
+    limit = np.minimum(acceptance.a + acceptance.k * x, acceptance.b) * factor
     axes.plot(x, limit, color=GREY, lw=1.2)
     axes.plot(x, -limit, color=GREY, lw=1.2)
     axes.axhline(0, color=GREY, lw=0.6)
-    _draw_decided(axes, length, error * factor, U * factor, np.array(found.decision), 4)
+    _draw_decided(axes, length, error * factor, U * factor, np.array(acceptance.decision), 4)
     axes.set(
-        xlabel=f"calibrated length [{found.unit}]",
+        xlabel=f"calibrated length [{acceptance.unit}]",
         ylabel=f"measured minus calibrated [{fine}]",
     )
     axes.legend(fontsize=8, loc="upper left")

@@ -238,9 +238,9 @@ def _drawn(xy: FloatArray, scale: float) -> AnyArray:
 def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]], scale: float) -> None:
     """Draw dots as lines of zero length and the thickness of a dot, all dots of one colour at once."""
     at = np.repeat(_drawn(xy, scale)[:, None], 2, axis=1)
-    for one_colour in dict.fromkeys(colour):
-        dots = at[[one == one_colour for one in colour]]
-        cv2.polylines(picture, list(dots), False, one_colour, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
+    for shade in dict.fromkeys(colour):
+        dots = at[[c == shade for c in colour]]
+        cv2.polylines(picture, list(dots), False, shade, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
 
 
 def _outlines(
@@ -331,8 +331,8 @@ def fitted_picture(picture: AnyArray, side: int) -> AnyArray:
     # OpenCV averages whole blocks about ten times as fast as fractions of pixels.
     blocks = [k for k in range(2, int(1 / scale) + 1) if width % k == height % k == 0]
     if blocks:
-        whole = width // blocks[-1], height // blocks[-1]
-        picture = cv2.resize(picture, whole, interpolation=cv2.INTER_AREA)
+        by_blocks = width // blocks[-1], height // blocks[-1]
+        picture = cv2.resize(picture, by_blocks, interpolation=cv2.INTER_AREA)
     few = max(picture.shape[:2]) < 2 * side  # source pixels per pixel, so that four neighbours suffice
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_LINEAR if few else cv2.INTER_AREA))
 
@@ -344,7 +344,7 @@ def jpeg_of(picture: AnyArray, quality: int) -> bytes:
 
 
 def draw_patches(
-    names: tuple[str, ...], left: AnyArray, right: AnyArray, found: ConjugatePoints, template_px: int
+    names: tuple[str, ...], left: AnyArray, right: AnyArray, matches: ConjugatePoints, template_px: int
 ) -> AnyArray:
     """Return a picture with template, matched patch and difference of each point in a row.
 
@@ -354,36 +354,35 @@ def draw_patches(
     A last line is added if not all points are drawn.
     """
     zoom = max(ZOOM, math.ceil(PANEL / template_px))
-    drawn = min(len(found), MAX_PICTURES)
-    lines = [_caption(names[k], found, k) for k in range(drawn)]
-    last = f"the first {drawn} of {len(found)} points" if drawn < len(found) else ""
+    drawn = min(len(matches), MAX_PICTURES)
+    lines = [_caption(names[k], matches, k) for k in range(drawn)]
+    last = f"the first {drawn} of {len(matches)} points" if drawn < len(matches) else ""
     width = max(3 * zoom * template_px + 2 * GAP, LETTER * max(len(line) for line in [*lines, last]))
     rows = []
     for k, line in enumerate(lines):
-        rows += [
-            _text(line, width),
-            *(_padded(row, width) for row in _panels(left, right, found, k, template_px, zoom)),
-        ]
+        rows.append(_text(line, width))
+        panels = _panels(left, right, matches, k, template_px, zoom)
+        rows += [np.pad(row, ((0, 0), (0, width - row.shape[1])), constant_values=255) for row in panels]
     return np.vstack([*rows, _text(last, width)] if last else rows)
 
 
 def _panels(
-    left: AnyArray, right: AnyArray, found: ConjugatePoints, k: int, template_px: int, zoom: int
+    left: AnyArray, right: AnyArray, matches: ConjugatePoints, k: int, template_px: int, zoom: int
 ) -> list[AnyArray]:
     """Return the patches of one point side by side; none if its template is outside the photograph."""
     half = template_px // 2
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    template = resample(left, found.left[k] + np.stack([u, v], axis=-1), interpolation="bilinear")
+    template = resample(left, matches.left[k] + np.stack([u, v], axis=-1), interpolation="bilinear")
     if not np.isfinite(template).any():
         return []
     low, high = np.nanmin(template), np.nanmax(template)
     scale = 255.0 / max(high - low, 1e-6)
     panels = [(template - low) * scale]
-    if found.good[k]:
-        H = found.warp[k]
+    if matches.good[k]:
+        H = matches.warp[k]
         w = H[2, 0] * u + H[2, 1] * v + H[2, 2]
         place = np.stack([(H[i, 0] * u + H[i, 1] * v + H[i, 2]) / w for i in range(2)], axis=-1)
-        patch = (resample(right, place, interpolation="bilinear") - found.offset[k]) / found.gain[k]
+        patch = (resample(right, place, interpolation="bilinear") - matches.offset[k]) / matches.gain[k]
         panels += [(patch - low) * scale, 128 + 4 * (patch - template) * scale]
     row = []
     for panel in panels:
@@ -393,11 +392,11 @@ def _panels(
     return [np.hstack(row[:-1])]
 
 
-def _caption(name: str, found: ConjugatePoints, k: int) -> str:
+def _caption(name: str, matches: ConjugatePoints, k: int) -> str:
     """Return name, r and reason in characters that OpenCV can draw."""
-    r = float(found.correlation[k])
+    r = float(matches.correlation[k])
     what = f"{name}  r {r:.4f}" if math.isfinite(r) else name
-    line = f"{what}  not matched: {found.reason[k]}" if found.reason[k] else what
+    line = f"{what}  not matched: {matches.reason[k]}" if matches.reason[k] else what
     return line[:MAX_LETTERS].encode("ascii", "replace").decode()
 
 
@@ -406,8 +405,3 @@ def _text(line: str, width: int) -> AnyArray:
     row = np.full((LINE, width), 255, np.uint8)
     cv2.putText(row, line, (2, LINE - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.45, 0, 1, cv2.LINE_AA)
     return row
-
-
-def _padded(row: AnyArray, width: int) -> AnyArray:
-    """Return a picture padded with white on the right."""
-    return np.pad(row, ((0, 0), (0, width - row.shape[1])), constant_values=255)

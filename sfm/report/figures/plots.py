@@ -140,13 +140,13 @@ _EPIPOLAR = (
 def epipolar_figure(shown: PlotData) -> Figure:
     """Draw the distances from epipolar lines over the format of each mounted camera, two in a row."""
     figure, panels = _two_in_a_row(len(shown.epipolar))
-    for panel, one in zip(panels, shown.epipolar, strict=True):
-        keep = slice(None, None, max(1, len(one.xy) // MAX_ARROWS))
-        limit = 3 * max(one.rms_px, 1e-12)
-        x, y = one.xy[keep].T
-        drawn = panel.scatter(x, y, 6, one.distance_px[keep], cmap="coolwarm", vmin=-limit, vmax=limit)
+    for panel, shown_map in zip(panels, shown.epipolar, strict=True):
+        keep = slice(None, None, max(1, len(shown_map.xy) // MAX_ARROWS))
+        limit = 3 * max(shown_map.rms_px, 1e-12)
+        x, y = shown_map.xy[keep].T
+        drawn = panel.scatter(x, y, 6, shown_map.distance_px[keep], cmap="coolwarm", vmin=-limit, vmax=limit)
         figure.colorbar(drawn, ax=panel, label="distance [px]", shrink=0.85, fraction=BAR_FRACTION)
-        _show_format(panel, one.size_px, f"{_plain(one.name)}: RMS {one.rms_px:.3g} px")
+        _show_format(panel, shown_map.size_px, f"{_plain(shown_map.name)}: RMS {shown_map.rms_px:.3g} px")
     return figure
 
 
@@ -250,16 +250,22 @@ def precision_figure(shown: PlotData) -> Figure:
 
 def projection_figure(shown: PlotData) -> Figure:
     """Draw the projection uncertainty of each adjusted camera over its format, two in a row."""
-    adjusted = [k for k, one in enumerate(shown.projection) if one is not None]
+    adjusted = [k for k, projection in enumerate(shown.projection) if projection is not None]
     figure, panels = _two_in_a_row(len(adjusted))
     owner = shown.camera[shown.image]
     for panel, k in zip(panels, adjusted, strict=True):
-        camera, found = shown.cameras[k], shown.projection[k]
-        assert found is not None
-        known = found.sigma[found.sigma > 0]
+        camera, projection = shown.cameras[k], shown.projection[k]
+        assert projection is not None
+        known = projection.sigma[projection.sigma > 0]
         levels = np.geomspace(np.quantile(known, OUTSIDE), known.max() * (1 + 1e-9), LEVELS)
         drawn = panel.contourf(
-            found.x, found.y, found.sigma, levels=levels, norm=LogNorm(), cmap=SHADES, extend="min"
+            projection.x,
+            projection.y,
+            projection.sigma,
+            levels=levels,
+            norm=LogNorm(),
+            cmap=SHADES,
+            extend="min",
         )
         xy = shown.xy[owner == k]
         panel.plot(*xy[:: max(1, len(xy) // MAX_ARROWS)].T, ".", color="black", markersize=1, alpha=0.5)

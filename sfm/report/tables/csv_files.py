@@ -44,7 +44,7 @@ def write_tables(findings: Findings, folder: Path) -> None:
     g, codes = findings.geometry, [None if code < 0 else code for code in result.code.tolist()]
     limiting = findings.precision.limiting_points.T.tolist()
     seen = [g.rays.tolist(), codes, g.angle_deg.tolist(), g.point_rms_px.tolist(), *limiting]
-    further = (seen, [one.tolist() for one in (g.image_points, g.image_rms_px, g.hull)], a.residuals)
+    further = (seen, [values.tolist() for values in (g.image_points, g.image_rms_px, g.hull)], a.residuals)
     tables.write_solution(folder, result.solution, a.network.image_points, a.rejected, *further)
     tables.LEFT_OUT.write_rows(folder, left_out_rows(result))
     tables.GIVEN.write_rows(folder, given_rows(findings.given.kinds, result.network, result.unit))
@@ -73,9 +73,9 @@ def write_tables(findings: Findings, folder: Path) -> None:
 
 def table_stems(findings: Findings) -> tuple[str, ...]:
     """Return the names of the tables that `write_tables` writes, without suffix."""
-    some = {tables.CAMERAS_BALANCED: _is_balanced(findings)}
-    some[tables.TARGETS] = len(findings.result.seen_targets.image) > 0
-    written = [one.file.removesuffix(".csv") for one in tables.TABLES if some.get(one, True)]
+    optional = {tables.CAMERAS_BALANCED: _is_balanced(findings)}
+    optional[tables.TARGETS] = len(findings.result.seen_targets.image) > 0
+    written = [table.file.removesuffix(".csv") for table in tables.TABLES if optional.get(table, True)]
     rigs = (MOUNTS, MOMENTS) if findings.rigs else ()
     return (*written, *(name.removesuffix(".csv") for name in rigs))
 
@@ -131,8 +131,8 @@ def left_out_rows(result: SurveyResult) -> Iterable[Sequence[Any]]:
     """Return kind, name, image points and reason of every photograph and point not in the result."""
     for failed in result.failed:
         yield ("photograph", failed.image, None, failed.reason.text)
-    for one in result.left_out:
-        yield ("point", one.point, one.image_points, one.reason.text)
+    for point in result.left_out:
+        yield ("point", point.point, point.image_points, point.reason.text)
 
 
 def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable[Sequence[object]]:
@@ -142,8 +142,15 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
     with a redundancy number of 0, since no error in them is detected.
     """
     network = adjustment.network
-    a, found = adjustment, statistics.reliability
-    tests = (a.residuals, a.redundancy_numbers, a.standardised, a.tau, found.minimal_bias, found.external)
+    a, reliability = adjustment, statistics.reliability
+    tests = (
+        a.residuals,
+        a.redundancy_numbers,
+        a.standardised,
+        a.tau,
+        reliability.minimal_bias,
+        reliability.external,
+    )
     checked = a.redundancy_numbers > MIN_CHECKED_REDUNDANCY
     error = np.where(checked, a.residuals / np.where(checked, a.redundancy_numbers, 1.0), np.nan)
     for names, values, rejected in zip(
@@ -162,14 +169,14 @@ def _names(network: Network) -> Iterator[tuple[str, str]]:
 def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
     """Return the variance components of kinds of observation, sources, cameras and photographs."""
     of_sources = (("source", statistics.sources),) if len(statistics.sources.names) > 1 else ()
-    for kind, found in (
+    for kind, components in (
         ("kind", statistics.kinds),
         *of_sources,
         ("camera", statistics.cameras),
         ("photograph", statistics.photographs),
     ):
-        for g, name in enumerate(found.names):
-            yield (kind, name, int(found.count[g]), found.redundancy[g], found.sigma0[g])
+        for g, name in enumerate(components.names):
+            yield (kind, name, int(components.count[g]), components.redundancy[g], components.sigma0[g])
 
 
 def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
@@ -185,11 +192,11 @@ def _correlation_rows(a: Adjustment) -> Iterable[Sequence[object]]:
 
 def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]:
     """Yield the correlations of every interior parameter with every photograph's exterior orientation."""
-    found = findings.result.exterior_correlations
-    if found is None:
+    correlations = findings.result.exterior_correlations
+    if correlations is None:
         return
-    for c, (parameter, camera) in enumerate(found.parameters):
-        for image, rho in zip(found.images, found.rho[:, :, c], strict=True):
+    for c, (parameter, camera) in enumerate(correlations.parameters):
+        for image, rho in zip(correlations.images, correlations.rho[:, :, c], strict=True):
             yield (camera.removeprefix("camera "), parameter, image, *rho)
 
 

@@ -43,9 +43,9 @@ def summary(findings: Findings) -> dict[str, Any]:
 def _finite(value: Any, name: str, names: list[str]) -> Any:
     """Return a value with None for every number that is not finite, and append the names of these."""
     if isinstance(value, dict):
-        return {key: _finite(one, f"{name}.{key}".lstrip("."), names) for key, one in value.items()}
+        return {key: _finite(item, f"{name}.{key}".lstrip("."), names) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one, f"{name}[{k}]", names) for k, one in enumerate(value)]
+        return [_finite(item, f"{name}[{k}]", names) for k, item in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
         names.append(name)
         return None
@@ -84,7 +84,8 @@ def _figures(findings: Findings) -> dict[str, Any]:
             "not_in_result": result.unused_image_points,
         },
         "left_out": [
-            values_of(one, "point image_points") | {"reason": one.reason.as_dict()} for one in result.left_out
+            values_of(point, "point image_points") | {"reason": point.reason.as_dict()}
+            for point in result.left_out
         ],
         **values_of(a, "unknowns redundancy"),
         "datum": {
@@ -114,28 +115,30 @@ def _figures(findings: Findings) -> dict[str, Any]:
         "control": _control(findings),
         "scale_bars": _scale_bars(findings),
         "equipment": [
-            values_of(one, "name given_as")
-            | {"calibrated": one.calibrated.isoformat()}
+            values_of(equipment, "name given_as")
+            | {"calibrated": equipment.calibrated.isoformat()}
             | values_of(
-                one,
+                equipment,
                 "calibration_temperature expansion expansion_sigma temperature temperature_sigma correction",
             )
-            for one in result.equipment
+            for equipment in result.equipment
         ],
         "weighted_interior": _given_values(given.interior, "parameter"),
         "observed_exterior": [
-            one for kind in (CENTRE, ROTATION) for one in _given_values(given.of(kind), "image", "parameter")
+            value
+            for kind in (CENTRE, ROTATION)
+            for value in _given_values(given.of(kind), "image", "parameter")
         ],
         "further_observations": _further(given),
         "group_parameters": [
             {
-                "group": one.group,
-                "names": list(one.names),
-                "values": one.value.tolist(),
-                "covariance": [[or_none(value) for value in row] for row in one.covariance.tolist()],
+                "group": parameters.group,
+                "names": list(parameters.names),
+                "values": parameters.value.tolist(),
+                "covariance": [[or_none(value) for value in row] for row in parameters.covariance.tolist()],
                 "unit": result.length_unit,
             }
-            for one in a.group_parameters
+            for parameters in a.group_parameters
         ],
         "eccentricity": result.eccentricity and values_of(result.eccentricity, "largest_px rms_px sigma_px"),
         "no_circles": list(result.no_circles),
@@ -150,18 +153,23 @@ def _error_correlation(a: Adjustment) -> dict[str, float] | None:
     if a.error_correlation is None:
         return None
     alone, common = a.error_correlation.sigmas_px(a.sigma0_px)
-    found = a.error_correlation
+    correlation = a.error_correlation
     return {
         "alone_px": alone,
         "common_px": common,
-        "length_px": found.length_px,
-        "design_effect": found.design_effect,
+        "length_px": correlation.length_px,
+        "design_effect": correlation.design_effect,
     }
 
 
 def _statistics(findings: Findings) -> dict[str, Any]:
     """Return the tests, reliability, components, correlations and significance of a result."""
-    result, found, sigma0, counts = findings.result, findings.statistics, findings.sigma0, findings.counts
+    result, statistics, sigma0, counts = (
+        findings.result,
+        findings.statistics,
+        findings.sigma0,
+        findings.counts,
+    )
     return {
         "sigma0_ratio": or_none(sigma0.ratio),
         **values_of(sigma0, "image_points_px stated_px"),
@@ -174,65 +182,68 @@ def _statistics(findings: Findings) -> dict[str, Any]:
                 **values_of(test, "redundancy lower upper passed"),
                 "words": describe_test(test, result.adjustment),
             }
-            for test in found.global_tests
+            for test in statistics.global_tests
         ],
-        "w_test": _coordinate_test(found.w, found.largest_w),
-        "tau_test": _coordinate_test(found.tau, found.largest_tau),
+        "w_test": _coordinate_test(statistics.w, statistics.largest_w),
+        "tau_test": _coordinate_test(statistics.tau, statistics.largest_tau),
         "observations": {
             "image_coordinates": counts.image,
             **values_of(counts, "control exterior interior scale_bars further constraints total"),
         },
         "redundancy_number": {
-            "sum": or_none(found.redundancy_sum),
-            "mean": or_none(found.redundancy.mean),
-            "min": or_none(found.redundancy.smallest),
+            "sum": or_none(statistics.redundancy_sum),
+            "mean": or_none(statistics.redundancy.mean),
+            "min": or_none(statistics.redundancy.smallest),
         },
-        "minimal_detectable_bias_px": _median_and_max(found.minimal_bias),
-        "external_reliability_sigmas": _median_and_max(found.external),
-        "sigma0_by_kind": _components(found.kinds),
-        "sigma0_by_camera": _components(found.cameras),
-        "sigma0_by_photograph": _components(found.photographs),
-        "correlations": [values_of(pair, "first second value") for pair in found.correlations],
+        "minimal_detectable_bias_px": _median_and_max(statistics.minimal_bias),
+        "external_reliability_sigmas": _median_and_max(statistics.external),
+        "sigma0_by_kind": _components(statistics.kinds),
+        "sigma0_by_camera": _components(statistics.cameras),
+        "sigma0_by_photograph": _components(statistics.photographs),
+        "correlations": [values_of(pair, "first second value") for pair in statistics.correlations],
         "orientation_correlations": [
             {
-                "parameter": one.parameter,
-                "with": one.part,
-                "image": one.image,
-                "value": one.largest,
-                "photographs": dict(one.counts),
+                "parameter": correlation.parameter,
+                "with": correlation.part,
+                "image": correlation.image,
+                "value": correlation.largest,
+                "photographs": dict(correlation.counts),
             }
-            for one in result.orientation_correlations
+            for correlation in result.orientation_correlations
         ],
         "significance": [
-            values_of(test, "camera parameter t probability significant") for test in found.significance
+            values_of(test, "camera parameter t probability significant") for test in statistics.significance
         ],
-        "not_significant": [values_of(test, "camera parameter t") for test in found.not_significant],
+        "not_significant": [values_of(test, "camera parameter t") for test in statistics.not_significant],
     }
 
 
 def _consistency(findings: Findings) -> dict[str, Any]:
     """Return the outcome of the tests of points, photographs and the format."""
-    found = findings.consistency
+    consistency = findings.consistency
     return {
-        "large_residuals": list(found.large),
-        "doubtful": [values_of(one, "point rejected instead misfit other") for one in found.doubtful],
-        "uneven_photographs": found.uneven and values_of(found.uneven, "probability worst largest median"),
+        "large_residuals": list(consistency.large),
+        "doubtful": [
+            values_of(remark, "point rejected instead misfit other") for remark in consistency.doubtful
+        ],
+        "uneven_photographs": consistency.uneven
+        and values_of(consistency.uneven, "probability worst largest median"),
         "other_solutions": [
             {
-                **values_of(one, "camera c unit reflected"),
-                "moved_over_sigma": or_none(one.moved),
-                "vPv_ratio": or_none(one.vPv),
+                **values_of(other, "camera c unit reflected"),
+                "moved_over_sigma": or_none(other.moved),
+                "vPv_ratio": or_none(other.vPv),
             }
-            for one in findings.result.other_solutions
+            for other in findings.result.other_solutions
         ],
         "given_against_free_network": [
             {
-                "what": one.what,
-                "chi2": or_none(one.statistic),
-                "degrees_of_freedom": one.dof,
-                "probability": or_none(one.probability),
+                "what": test.what,
+                "chi2": or_none(test.statistic),
+                "degrees_of_freedom": test.dof,
+                "probability": or_none(test.probability),
             }
-            for one in findings.result.given_tests
+            for test in findings.result.given_tests
         ],
     }
 
@@ -250,47 +261,47 @@ def _components(components: VarianceComponents) -> dict[str, float | None]:
 
 
 def _geometry(findings: Findings) -> dict[str, Any]:
-    found, network = findings.geometry, findings.result.adjustment.network
+    geometry, network = findings.geometry, findings.result.adjustment.network
     return {
-        "rays": _spread(found.rays.astype(float)),
-        "points_by_rays": {str(rays): n for rays, n in found.histogram()},
-        "intersection_angle_deg": _spread(found.angle_deg),
-        "weak_points": [network.points[j] for j in found.weak],
-        "point_rms_px": _spread(found.point_rms_px),
-        "image_rms_px": _spread(found.image_rms_px),
+        "rays": _spread(geometry.rays.astype(float)),
+        "points_by_rays": {str(rays): n for rays, n in geometry.histogram()},
+        "intersection_angle_deg": _spread(geometry.angle_deg),
+        "weak_points": [network.points[j] for j in geometry.weak],
+        "point_rms_px": _spread(geometry.point_rms_px),
+        "image_rms_px": _spread(geometry.image_rms_px),
         "coverage": [
             {
-                "camera": one.camera,
-                "hull": _spread(one.hull) | {"all": or_none(one.hull_of_all)},
-                "radius": _spread(one.radius),
+                "camera": coverage.camera,
+                "hull": _spread(coverage.hull) | {"all": or_none(coverage.hull_of_all)},
+                "radius": _spread(coverage.radius),
             }
-            for one in found.coverage
+            for coverage in geometry.coverage
         ],
     }
 
 
 def _spread(values: FloatArray) -> dict[str, float | None]:
     """Return smallest, mean and largest of the known values."""
-    found = summarise_redundancy(values)
-    return {"min": or_none(found.smallest), "mean": or_none(found.mean), "max": or_none(found.largest)}
+    known = summarise_redundancy(values)
+    return {"min": or_none(known.smallest), "mean": or_none(known.mean), "max": or_none(known.largest)}
 
 
 def _control(findings: Findings) -> dict[str, Any] | None:
-    check, found = findings.result.control_check, findings.given.control
+    check, control = findings.result.control_check, findings.given.control
     if check is not None:
         return {
             "role": "check",
             **values_of(check, "scale rms"),
             "differences": plain(dict(zip(check.points, check.differences, strict=True))),
         }
-    if found is None:
+    if control is None:
         return None
     columns = ("difference", "sigma", "r", "w")
     return {
         "role": "datum",
         "points": [
-            {"id": name} | {c: plain(getattr(found, c)[k]) for c in columns}
-            for k, name in enumerate(found.names)
+            {"id": name} | {c: plain(getattr(control, c)[k]) for c in columns}
+            for k, name in enumerate(control.names)
         ],
     }
 
@@ -300,78 +311,82 @@ def _scale_bars(findings: Findings) -> list[dict[str, Any]]:
     bars, names = network.scale_bars, network.points
     ends = [{"from": names[i], "to": names[j]} for i, j in zip(bars.start, bars.end, strict=True)]
     values = _given_values(findings.given.bars)
-    for one in values:
-        one["length"] = one.pop("given")
-        del one["unit"]
-    return [end | one for end, one in zip(ends, values, strict=True)]
+    for bar in values:
+        bar["length"] = bar.pop("given")
+        del bar["unit"]
+    return [end | bar for end, bar in zip(ends, values, strict=True)]
 
 
-def _given_values(found: GivenResiduals | None, *keys: str) -> list[dict[str, Any]]:
+def _given_values(residuals: GivenResiduals | None, *keys: str) -> list[dict[str, Any]]:
     """Return every given value of a kind; `keys` are the keys of its name and coordinate."""
     return [
-        dict(zip(keys, (one.name, one.coordinate), strict=False))
-        | values_of(one, "unit given difference sigma r w")
-        for one in (found.values if found is not None else ())
+        dict(zip(keys, (value.name, value.coordinate), strict=False))
+        | values_of(value, "unit given difference sigma r w")
+        for value in (residuals.values if residuals is not None else ())
     ]
 
 
 def _comparison(result: SurveyResult) -> dict[str, Any] | None:
     """Return the comparison with the other adjuster; None without one."""
-    both = result.comparison
-    if both is None:
+    adjusters = result.comparison
+    if adjusters is None:
         return None
-    difference, C, other = both.comparison, both.adjustment.covariance, both.backend_points
+    difference, C, other = adjusters.comparison, adjusters.adjustment.covariance, adjusters.backend_points
     return {
-        **values_of(both, "backend agree outcome gap model stopped_early"),
+        **values_of(adjusters, "backend agree outcome gap model stopped_early"),
         **values_of(difference, "max_sigmas max_position max_rotation_deg max_point"),
         "max_interior_px": or_none(float(np.nanmax(difference.interior_px, initial=0.0))),
         "object_size": or_none(difference.object_size),
-        "rms_px": {"kolinear": difference.rms_px[0], both.backend: difference.rms_px[1]},
-        "cost": {"kolinear": difference.cost[0], both.backend: difference.cost[1]},
+        "rms_px": {"kolinear": difference.rms_px[0], adjusters.backend: difference.rms_px[1]},
+        "cost": {"kolinear": difference.cost[0], adjusters.backend: difference.cost[1]},
         "point_sigma_rms": {
             "kolinear_marginal": or_none(point_sigma(C.points)[0]),
             "kolinear_conditional": or_none(point_sigma(C.points_limiting)[0]),
-            f"{both.backend}_conditional": None if other is None else or_none(point_sigma(other)[0]),
+            f"{adjusters.backend}_conditional": None if other is None else or_none(point_sigma(other)[0]),
         },
         "exceeded": list(difference.exceeded),
-        **values_of(both, "held unshared freed"),
+        **values_of(adjusters, "held unshared freed"),
         "conversions": [
             {
-                "camera": one.camera.name,
-                "from": one.source_model,
-                "to": one.camera.model,
-                **values_of(one, "rms_px max_px"),
+                "camera": conversion.camera.name,
+                "from": conversion.source_model,
+                "to": conversion.camera.model,
+                **values_of(conversion, "rms_px max_px"),
             }
-            for one in both.conversions
+            for conversion in adjusters.conversions
         ],
     }
 
 
 def _baseline(result: SurveyResult) -> dict[str, Any] | None:
     """Return the comparison with the other pipeline; None without one."""
-    found = result.baseline
-    if found is None:
+    baseline = result.baseline
+    if baseline is None:
         return None
 
     def pair(values: tuple[float, float]) -> dict[str, float | None]:
-        return {"kolinear": or_none(values[0]), found.name: or_none(values[1])}
+        return {"kolinear": or_none(values[0]), baseline.name: or_none(values[1])}
 
     return {
-        "pipeline": found.name,
-        "images": {"kolinear": found.photographs[0], found.name: found.photographs[1], "total": found.total},
-        "rms_px": pair(found.rms_px),
-        "seconds": pair(found.seconds),
-        "targets": found.targets,
-        **values_of(found, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
+        "pipeline": baseline.name,
+        "images": {
+            "kolinear": baseline.photographs[0],
+            baseline.name: baseline.photographs[1],
+            "total": baseline.total,
+        },
+        "rms_px": pair(baseline.rms_px),
+        "seconds": pair(baseline.seconds),
+        "targets": baseline.targets,
+        **values_of(baseline, "target_rms_px point_rms max_point position_rms max_rotation_deg"),
     }
 
 
 def _further(given: Given) -> dict[str, list[dict[str, Any]]]:
     """Return the values of all further kinds, with all groups of a kind together."""
-    found = defaultdict[str, list[dict[str, Any]]](list)
+    values = defaultdict[str, list[dict[str, Any]]](list)
     for kind in given.further:
-        found[kind.kind] += _given_values(kind, "name", "component")
-    return dict(found)
+        values[kind.kind] += _given_values(kind, "name", "component")
+    return dict(values)
 
 
 def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
@@ -387,8 +402,8 @@ def summary_of_rigs(rigs: Sequence[Rig]) -> list[dict[str, Any]]:
                 {
                     "camera": mount.camera,
                     **({} if mount.epipolar is None else {"epipolar_rms_px": or_none(mount.epipolar.rms_px)}),
-                    **stated(one for one in mount.values if one[3]),
-                    "rotation_deg": stated(one for one in mount.values if not one[3]),
+                    **stated(value for value in mount.values if value[3]),
+                    "rotation_deg": stated(value for value in mount.values if not value[3]),
                 }
                 for mount in rig.mounts
             ],

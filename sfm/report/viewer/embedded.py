@@ -31,7 +31,7 @@ from sfm.estimate import Estimate
 from sfm.files.plain_text import or_none
 from sfm.geometry.tolerance import Deviations
 from sfm.judgement.checks import rms_of_groups
-from sfm.network import ImagePoints, Network
+from sfm.network import ImagePoints, Network, ScaleBars
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
@@ -126,7 +126,7 @@ def packed_scene(scene: ViewerScene, pictures: Pictures) -> str:
     if scene.displacement is not None:
         states = sorted(set(scene.state))
         arrays["point.displacement"] = ("f4", scene.displacement)
-        arrays["point.state"] = ("u1", np.array([states.index(one) for one in scene.state]))
+        arrays["point.state"] = ("u1", np.array([states.index(state) for state in scene.state]))
     if scene.deviation is not None:
         arrays["point.deviation"] = ("f4", scene.deviation)
     return _packed(_header(scene, pictures), arrays)
@@ -143,19 +143,24 @@ def _header(scene: ViewerScene, pictures: Pictures) -> dict[str, Any]:
         "points": scene.points,
         "photographs": scene.photographs,
         "cameras": [
-            {"name": one.name, "width": one.size_px[0], "height": one.size_px[1], "c_px": one.c_px}
-            for one in scene.cameras
+            {
+                "name": camera.name,
+                "width": camera.size_px[0],
+                "height": camera.size_px[1],
+                "c_px": camera.c_px,
+            }
+            for camera in scene.cameras
         ],
         "reasons": scene.marks.reasons,
         "bars": [
             {
-                "from": one.start,
-                "to": one.end,
-                "length": or_none(one.length),
-                "sigma": or_none(one.sigma),
-                "difference": or_none(one.difference),
+                "from": bar.start,
+                "to": bar.end,
+                "length": or_none(bar.length),
+                "sigma": or_none(bar.sigma),
+                "difference": or_none(bar.difference),
             }
-            for one in scene.bars
+            for bar in scene.bars
         ],
         "control": scene.control,
         "states": sorted(set(scene.state)),
@@ -246,14 +251,7 @@ def scene_of_stored(
     used = ~rejected[kept]
     ellipse, marks = np.full((len(kept), 3), np.nan), Marks.none()
     if seen_targets is not None:
-        there = np.flatnonzero(estimate.oriented[seen_targets.image])
-        shown = SeenTargets(
-            np.searchsorted(oriented, seen_targets.image[there]),
-            seen_targets.xy[there],
-            seen_targets.ellipse[there],
-            tuple(seen_targets.reason[k] for k in there),
-        )
-        ellipse, marks = joined_targets(shown, photo, seen.xy[kept])
+        ellipse, marks = joined_targets(_in_oriented(seen_targets, estimate), photo, seen.xy[kept])
     rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, ellipse)
     use = np.zeros(len(seen), dtype=bool)
     use[kept[used]] = True
@@ -266,14 +264,16 @@ def scene_of_stored(
     if stored.position_covariance is not None:
         sigma[:, :3] = np.sqrt(np.diagonal(stored.position_covariance[oriented], axis1=1, axis2=2))
     joint = stored.covariance
-    bars, index = network.scale_bars, {int(j): k for k, j in enumerate(determined)}
+    if stored.covariance_points is not None or n < len(network.points):
+        joint = None  # of other points
+    index = {int(j): k for k, j in enumerate(determined)}
     notes = []
-    for kind, found, names in (
+    for kind, placed, names in (
         ("photographs", oriented, network.images),
         ("points", determined, network.points),
     ):
-        if len(found) < len(names):
-            notes.append(f"{len(names) - len(found)} of {len(names)} {kind} have no coordinates: omitted.")
+        if len(placed) < len(names):
+            notes.append(f"{len(names) - len(placed)} of {len(names)} {kind} have no coordinates: omitted.")
     return ViewerScene(
         stored.name,
         stored.unit or "object units",
@@ -293,20 +293,37 @@ def scene_of_stored(
         np.bincount(photo[used], minlength=m),
         rays,
         marks,
-        tuple(
-            Bar(index[i], index[j], length, s, float(np.linalg.norm(xyz[index[i]] - xyz[index[j]])) - length)
-            for i, j, length, s in zip(
-                *(x.tolist() for x in (bars.start, bars.end, bars.length, bars.sigma)), strict=True
-            )
-            if i in index and j in index
-        ),
+        _bars(network.scale_bars, xyz, index),
         tuple(index[int(j)] for j in network.control.point if int(j) in index),
-        None
-        if joint is None or stored.covariance_points is not None or n < len(network.points)
-        else distance_sigmas(xyz, joint),
+        None if joint is None else distance_sigmas(xyz, joint),
         float(np.sqrt(np.nanmean(v[used] ** 2))) if used.any() else np.nan,
         tuple(notes),
     )
+
+
+def _in_oriented(seen: SeenTargets, estimate: Estimate) -> SeenTargets:
+    """Return the targets in photographs with an orientation, which are numbered without the others."""
+    rows = np.flatnonzero(estimate.oriented[seen.image])
+    return SeenTargets(
+        np.searchsorted(np.flatnonzero(estimate.oriented), seen.image[rows]),
+        seen.xy[rows],
+        seen.ellipse[rows],
+        tuple(seen.reason[k] for k in rows),
+    )
+
+
+def _bars(bars: ScaleBars, xyz: FloatArray, index: dict[int, int]) -> tuple[Bar, ...]:
+    """Return the scale bars between points of a scene, each with its adjusted minus its given length."""
+    shown = []
+    for i, j, length, sigma in zip(
+        bars.start.tolist(), bars.end.tolist(), bars.length.tolist(), bars.sigma.tolist(), strict=True
+    ):
+        if i in index and j in index:
+            start, end = index[i], index[j]
+            shown.append(
+                Bar(start, end, length, sigma, float(np.linalg.norm(xyz[start] - xyz[end])) - length)
+            )
+    return tuple(shown)
 
 
 def _residuals(stored: Solution, seen: ImagePoints) -> FloatArray:
@@ -347,79 +364,79 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
 
 
-def displacements_viewer(found: EpochSeries) -> Viewer | None:
+def displacements_viewer(series: EpochSeries) -> Viewer | None:
     """Return the viewer of the first epoch with displacements to the last; None without photographs."""
-    if not found.first.result.estimate.oriented.any():
+    if not series.first.result.estimate.oriented.any():
         return None
-    scene = _scene_of_displacements(found.since_first[-1].displacements, found.first.result)
+    scene = _scene_of_displacements(series.since_first[-1].displacements, series.first.result)
     return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
 
 
-def _scene_of_displacements(found: Displacements, first: Solution) -> ViewerScene:
+def _scene_of_displacements(displacements: Displacements, first: Solution) -> ViewerScene:
     """Return the scene of an epoch with the displacement of every point and the outcome of its test.
 
     Standard deviations and ellipsoids are those of the displacements.
     """
     names = first.network.points
     row = {name: j for j, name in enumerate(names)}
-    tested = np.array([row[name] for name in found.differences.points], dtype=np.int64)
+    tested = np.array([row[name] for name in displacements.differences.points], dtype=np.int64)
     covariance = np.full((len(names), 3, 3), np.nan)
-    covariance[tested] = point_blocks(found.covariance, 3)
+    covariance[tested] = point_blocks(displacements.covariance, 3)
     scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
     displacement = np.full((len(names), 3), np.nan)
-    displacement[tested] = found.displacement
+    displacement[tested] = displacements.displacement
     state = [UNTESTED] * len(names)
     for k, j in enumerate(tested.tolist()):
-        state[j] = MOVED if found.moved[k] else STABLE if found.stable[k] else ""
+        state[j] = MOVED if displacements.moved[k] else STABLE if displacements.stable[k] else ""
     kept = [row[name] for name in scene.points]
     return replace(
         scene,
-        name=" to ".join(found.differences.names),
+        name=" to ".join(displacements.differences.names),
         displacement=displacement[kept],
         state=tuple(state[j] for j in kept),
         notes=(
             *scene.notes,
-            f"Displacements from {found.differences.names[0]} to {found.differences.names[1]}; standard "
-            "deviations and ellipsoids are those of the displacements.",
+            f"Displacements from {' to '.join(displacements.differences.names)}; standard deviations and "
+            " ellipsoids are those of the displacements.",
         ),
     )
 
 
-def measurement_viewer(found: Measurement, result: Solution) -> Viewer | None:
+def measurement_viewer(measurement: Measurement, result: Solution) -> Viewer | None:
     """Return the viewer in the coordinate system of a measurement; None without photographs."""
     if not result.estimate.oriented.any():
         return None
     estimate, n = result.estimate, int(result.estimate.determined.sum())
     positions = result.position_covariance
-    if found.alignment is not None:
-        estimate = found.alignment.aligned_from_object.apply_estimate(estimate)
+    if measurement.alignment is not None:
+        estimate = measurement.alignment.aligned_from_object.apply_estimate(estimate)
         positions = None
     kept = np.flatnonzero(result.estimate.determined)
     covariance = np.full((len(result.network.points), 3, 3), np.nan)
-    covariance[kept] = found.points.blocks[:n]
+    covariance[kept] = measurement.points.blocks[:n]
     moved = replace(
         result,
         estimate=estimate,
         point_covariance=covariance,
         position_covariance=positions,
         covariance=None,
-        unit=found.unit,
+        unit=measurement.unit,
     )
     scene = scene_of_stored(moved)
-    deviation = _worst_deviation(found)[:n]
+    deviation = _worst_deviation(measurement)[:n]
     if np.isfinite(deviation).any():
         scene = replace(scene, deviation=deviation)
     return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
 
 
-def _worst_deviation(found: Measurement) -> FloatArray:
+def _worst_deviation(measurement: Measurement) -> FloatArray:
     """Return the largest deviation of each point from tolerances, or else from shapes; NaN without any."""
-    worst = np.full(len(found.points.names), np.nan)
-    judged: list[Deviations | ShapeFit] = [*found.tolerances] or [*found.shapes]
-    for one in judged:
-        value = one.value if isinstance(one, Deviations) else one.deviation
-        larger = ~(np.abs(value) <= np.abs(worst[one.points]))
-        worst[one.points[larger]] = value[larger]
+    worst = np.full(len(measurement.points.names), np.nan)
+    judged: list[Deviations | ShapeFit] = [*measurement.tolerances] or [*measurement.shapes]
+    for fit in judged:
+        value = fit.value if isinstance(fit, Deviations) else fit.deviation
+        larger = ~(np.abs(value) <= np.abs(worst[fit.points]))
+        worst[fit.points[larger]] = value[larger]
     return worst
 
 

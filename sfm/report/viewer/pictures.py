@@ -7,7 +7,7 @@ page contain what does not fit in it: every photograph, and its crops as the cel
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,8 +129,8 @@ def cut_pictures(
 
     cuts: list[_Cut | None] = []
     with ThreadPoolExecutor(max_workers=max(1, jobs)) as pool:
-        for name, one in zip(scene.photographs, pool.map(cut, range(m)), strict=True):
-            cuts.append(one)
+        for name, cut_out in zip(scene.photographs, pool.map(cut, range(m)), strict=True):
+            cuts.append(cut_out)
             progress.advance(name)
     return _embed(scene, cuts, order, budget, beside)
 
@@ -197,55 +197,44 @@ def _embed(
     """Choose the pictures that fit in the page, and name the others."""
     m = len(cuts)
     store = _Store()
-    read = [(i, one) for i, one in enumerate(cuts) if one is not None]
-    thumbnail, view = _none(m), _none(m)
+    read = {i: cut for i, cut in enumerate(cuts) if cut is not None}
+    worst = sorted(read, key=lambda i: -np.nan_to_num(scene.photo_rms_px[i]))
     room = int(THUMBNAILS_PART * budget)
-    for i, one in read:
-        if store.size + len(one.thumbnail) <= room:
-            thumbnail[i] = store.add(one.thumbnail)
+    thumbnail = store.add_fitting({i: cut.thumbnail for i, cut in read.items()}, room)
     room = store.size + int(VIEWS_PART * (budget - store.size))
-    worst = sorted(read, key=lambda pair: -np.nan_to_num(scene.photo_rms_px[pair[0]]))
-    views = 0
-    for i, one in worst:
-        if store.size + len(one.view) <= room:
-            view[i] = store.add(one.view)
-            views += 1
-    kept: dict[int, tuple[int, int]] = {}
-    for k in order.tolist():
-        found = cuts[scene.rays.photo[k]]
-        crop = found.crops.get(k) if found else None
-        if crop is not None and store.size + len(crop) + 2 <= budget:
-            kept[k] = store.add(crop)
+    view = store.add_fitting({i: read[i].view for i in worst}, room)
+    crops = {k: crop for cut in read.values() for k, crop in cut.crops.items()}
+    kept = store.add_fitting({k: crops[k] for k in order.tolist() if k in crops}, budget - 2)
     names = overlay_names(scene.photographs)
     folder = f"{beside}/" if beside else ""
-    files = tuple(f"{folder}{names[i]}" if one and one.file else "" for i, one in enumerate(cuts))
-    crop_files = tuple(f"{folder}crops_{names[i]}" if one and one.cells else "" for i, one in enumerate(cuts))
-    content = {names[i]: one.file for i, one in read if one.file}
-    content |= {f"crops_{names[i]}": one.cells for i, one in read if one.cells}
-    ray, frame, crop_of, cell = [], [], [], []
-    for i, one in read:
-        for number, (k, place) in enumerate(one.frames.items()):
-            if k in kept or crop_files[i]:
-                ray.append(k)
-                frame.append(place)
-                crop_of.append(kept.get(k, (0, 0)))
-                cell.append(number)
+    content = {names[i]: cut.file for i, cut in read.items() if cut.file}
+    content |= {f"crops_{names[i]}": cut.cells for i, cut in read.items() if cut.cells}
+    shown = list(_shown_crops(read.values(), kept))
+    rays = sum(len(cut.frames) for cut in read.values())
     return Pictures(
         store.text(),
         len(read),
-        files,
-        crop_files,
+        tuple(f"{folder}{names[i]}" if i in read and read[i].file else "" for i in range(m)),
+        tuple(f"{folder}crops_{names[i]}" if i in read and read[i].cells else "" for i in range(m)),
         content,
-        thumbnail,
-        view,
-        np.array(ray, dtype=np.int64),
-        np.array(frame, dtype=float).reshape(-1, 4),
-        np.array(crop_of, dtype=np.int64).reshape(-1, 2),
-        np.array(cell, dtype=np.int64),
-        tuple(
-            _notes_of(len(read), m, views, len(kept), sum(len(one.frames) for _, one in read), bool(beside))
-        ),
+        _places(thumbnail, m),
+        _places(view, m),
+        np.array([k for k, *_ in shown], dtype=np.int64),
+        np.array([frame for _, frame, *_ in shown], dtype=float).reshape(-1, 4),
+        np.array([place for *_, place, _ in shown], dtype=np.int64).reshape(-1, 2),
+        np.array([cell for *_, cell in shown], dtype=np.int64),
+        tuple(_notes_of(len(read), m, len(view), len(kept), rays, bool(beside))),
     )
+
+
+def _shown_crops(
+    cuts: Iterable[_Cut], kept: Mapping[int, tuple[int, int]]
+) -> Iterator[tuple[int, tuple[float, float, float, int], tuple[int, int], int]]:
+    """Yield image point, frame, place in the page and cell in its file of each crop that the viewer shows."""
+    for cut in cuts:
+        for cell, (k, frame) in enumerate(cut.frames.items()):
+            if k in kept or cut.cells:
+                yield k, frame, kept.get(k, (0, 0)), cell
 
 
 def _notes_of(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:
@@ -276,12 +265,28 @@ class _Store:
         self.size += len(data)
         return start, len(data) // 3
 
+    def add_fitting(self, pictures: Mapping[int, bytes], room: int) -> dict[int, tuple[int, int]]:
+        """Add, in their order, the pictures that fit below a size in bytes; return starts and lengths."""
+        places = {}
+        for k, data in pictures.items():
+            if self.size + len(data) <= room:
+                places[k] = self.add(data)
+        return places
+
     def text(self) -> str:
         return base64.b64encode(b"".join(self.parts)).decode()
 
 
 def _none(count: int) -> IntArray:
     return np.zeros((count, 2), dtype=np.int64)
+
+
+def _places(places: Mapping[int, tuple[int, int]], count: int) -> IntArray:
+    """Return start and length of each picture by its number, 0 for those without a place, (count, 2)."""
+    table = _none(count)
+    for k, place in places.items():
+        table[k] = place
+    return table
 
 
 @dataclass(frozen=True)
