@@ -137,17 +137,12 @@ def measure_one(survey: SurveyFile, image: str, path: Path, *, send: Send) -> Me
     store = MeasuredStore.of_user()
     try:
         with when_compiling(lambda: send({"compiling": True})):
-            note = _measure(survey, image, path, store)
+            counts, stored = measure_photograph_once(survey, image, path, store)
+            note = PhotographNote(image, counts, stored=stored)
     except Exception as error:  # an unforeseen error recurs when the survey runs, and fails it there
         note = PhotographNote(image, failed=as_plain(error_in_words(error)))
     send({"photograph": image})
     return MeasuredPhotograph(replace(note, seconds=round(time.perf_counter() - begun, 4)), store.held)
-
-
-def _measure(survey: SurveyFile, image: str, path: Path, store: MeasuredStore) -> PhotographNote:
-    """Measure a photograph for each source of the survey, and store what is found."""
-    counts, stored = measure_photograph_once(survey, image, path, store)
-    return PhotographNote(image, counts, stored=stored)
 
 
 def reconstruct(
@@ -176,7 +171,7 @@ def reconstruct(
         for photograph in photographs:
             log.note("photograph", **photograph.note.entry())
         before = sum(photograph.note.seconds for photograph in photographs)
-        held = {key: found for photograph in photographs for key, found in photograph.held.items()}
+        held = {key: measured for photograph in photographs for key, measured in photograph.held.items()}
         try:
             survey = read_survey(job.file, allow_outside=job.allow_outside)
             name = survey.name
@@ -219,8 +214,8 @@ def fingerprint(survey: SurveyFile) -> str:
             with table.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
     if reads_photographs(survey):
-        found = find_photographs(survey)
-        for name, path in zip(found.names, found.paths, strict=True):
+        photographs = find_photographs(survey)
+        for name, path in zip(photographs.names, photographs.paths, strict=True):
             status = path.stat() if path.exists() else path.lstat()  # a link that leads nowhere
             digest.update(f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
     return digest.hexdigest()

@@ -164,18 +164,18 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
     Raises:
         SurveyFileError: a name matches nothing.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     for name in names:
         if not name:  # such as an unset variable of the shell; for Path it means the current folder
             raise SurveyFileError("an empty name stands for no survey")
         path = Path(name)
         if path.exists() or not glob.has_magic(name):
-            found.update(dict.fromkeys(_survey_files_in(path)))
+            files.update(dict.fromkeys(_survey_files_in(path)))
             continue
         matches = _matches(path)
         for match in matches:
-            found.update(dict.fromkeys(_survey_files_in(match)))
-    return tuple(found)
+            files.update(dict.fromkeys(_survey_files_in(match)))
+    return tuple(files)
 
 
 def _matches(path: Path) -> list[Path]:
@@ -188,12 +188,12 @@ def _matches(path: Path) -> list[Path]:
             raise SurveyFileError(f"{path}: {link} leads out of {folder}, which is not searched with {BELOW}")
 
     try:
-        found = find_files(folder, str(pattern), enter=refuse_leaving, folders=True, hidden=False)
+        paths = find_files(folder, str(pattern), enter=refuse_leaving, folders=True, hidden=False)
     except ValueError as error:
         raise SurveyFileError(f"{path}: {BELOW} stands for whole folders only") from error
-    if not found:
+    if not paths:
         raise SurveyFileError(f"{path}: no file matches")
-    return found
+    return paths
 
 
 def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
@@ -324,11 +324,11 @@ def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     parts: tuple[Call, ...] = ()
     if reads_photographs(survey):
         given = read_survey(job.file, allow_outside=job.allow_outside)
-        found = find_photographs(survey)
-        refuse_unknown_photographs(given, found.names)  # before the photographs are measured
+        photographs = find_photographs(survey)
+        refuse_unknown_photographs(given, photographs.names)  # before the photographs are measured
         parts = tuple(
             Call(measure_one, (survey, name, path))
-            for name, path in zip(found.names, found.paths, strict=True)
+            for name, path in zip(photographs.names, photographs.paths, strict=True)
         )
     return Work(job.folder, parts, Call(reconstruct, (job, comparers)))
 

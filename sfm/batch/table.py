@@ -241,10 +241,9 @@ def batch_remarks(rows: Sequence[SurveyRow]) -> tuple[Remark, ...]:
         "surveys_with_warnings": [row.survey for row in rows if row.verdict == "fair"],
     }
     ended = {how: [row.survey for row in rows if row.status == how] for how in ("failed", "set aside")}
-    return (
-        *(remark("surveys_failed", how=how, surveys=names) for how, names in ended.items() if names),
-        *(remark(kind, surveys=names) for kind, names in kinds.items() if names),
-    )
+    remarks = [remark("surveys_failed", how=how, surveys=names) for how, names in ended.items() if names]
+    remarks += [remark(kind, surveys=names) for kind, names in kinds.items() if names]
+    return tuple(remarks)
 
 
 def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
@@ -332,7 +331,7 @@ def _table_of_failures(rows: Sequence[SurveyRow], above: str) -> Table:
         )
         for row in rows
     ]
-    return Table(tuple(Column(one) for one in ("survey", "file", "", "reason", "log")), cells)
+    return Table(tuple(Column(title) for title in ("survey", "file", "", "reason", "log")), cells)
 
 
 def _below(file: str, above: str) -> str:

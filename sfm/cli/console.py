@@ -124,18 +124,18 @@ def _failures(findings: Findings) -> list[str]:
     """
     said = {
         (image, kind)
-        for one in findings.verdict.remarks
-        for image in one.names("photographs")
-        for kind in one.row.explains
+        for remark in findings.verdict.remarks
+        for image in remark.names("photographs")
+        for kind in remark.row.explains
     }
     images: dict[tuple[str, str], list[str]] = {}
     for failed in findings.result.failed:
         if (failed.image, failed.reason.kind) not in said:
-            one = failed.reason
-            images.setdefault((one.text, one.remedy), []).append(failed.image)
+            reason = failed.reason
+            images.setdefault((reason.text, reason.remedy), []).append(failed.image)
     return [
-        f"{listed(ones)}{', each' if len(ones) > 1 else ''}: {text} {remedy}"
-        for (text, remedy), ones in images.items()
+        f"{listed(names)}{', each' if len(names) > 1 else ''}: {text} {remedy}"
+        for (text, remedy), names in images.items()
     ]
 
 
@@ -167,31 +167,31 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
         rows.append(("point precision", text))
     if result.control_check is not None:
         rows.append(("check at control", describe_check(result.control_check, result.length_unit)))
-    both = result.comparison
-    if both is not None:
-        word: str = "stopped early, same optimum" if both.stopped_early else both.outcome
-        if both.better is not None and both.agree:
-            word = f"free {', '.join(both.better.free)}: fits {both.better.times:.3g} times better"
-        rms, other = both.comparison.rms_px, program_name(both.backend)
+    adjusters = result.comparison
+    if adjusters is not None:
+        word: str = "stopped early, same optimum" if adjusters.stopped_early else adjusters.outcome
+        if adjusters.better is not None and adjusters.agree:
+            word = f"free {', '.join(adjusters.better.free)}: fits {adjusters.better.times:.3g} times better"
+        rms, other = adjusters.comparison.rms_px, program_name(adjusters.backend)
         left_out = words_left_out(findings)
         rows.append(
             (
                 other,
                 f"{word}: RMS {rms[0]:.7f} px (Kolinear), {rms[1]:.7f} px ({other}), both from the image "
                 f"points alone{f', {left_out}' if left_out else ''}, with equal weights, a free datum and "
-                f"the camera model {both.model}",
+                f"the camera model {adjusters.model}",
             )
         )
-    found = result.baseline
-    if found is not None:
-        factor, unit = finer_unit(result.length_unit, found.point_rms)
+    baseline = result.baseline
+    if baseline is not None:
+        factor, unit = finer_unit(result.length_unit, baseline.point_rms)
         rows.append(
             (
-                found.name,
-                f"{found.photographs[1]} of {found.total} oriented, RMS {found.rms_px[1]:.3f} px, "
-                f"{significant(factor * found.point_rms)} {unit} from the survey at "
-                f"{counted(found.targets, 'point')}, "
-                f"{found.seconds[1]:.0f} s",
+                baseline.name,
+                f"{baseline.photographs[1]} of {baseline.total} oriented, RMS {baseline.rms_px[1]:.3f} px, "
+                f"{significant(factor * baseline.point_rms)} {unit} from the survey at "
+                f"{counted(baseline.targets, 'point')}, "
+                f"{baseline.seconds[1]:.0f} s",
             )
         )
     return tuple(rows)
@@ -199,9 +199,9 @@ def _figures(findings: Findings) -> tuple[tuple[str, str], ...]:
 
 def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
     """Yield the calibrated cameras, if the survey is a calibration without adjusted coordinates."""
-    for one in findings.calibrated[:MAX_LISTED]:
-        values, sigmas, within, projection = describe_calibration(one)
-        yield f"camera {one.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
+    for camera in findings.calibrated[:MAX_LISTED]:
+        values, sigmas, within, projection = describe_calibration(camera)
+        yield f"camera {camera.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
         yield "  projection", projection
     if len(findings.calibrated) > MAX_LISTED:
         yield "cameras", f"{len(findings.calibrated) - MAX_LISTED} more, in the report"
@@ -217,12 +217,15 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
          f"{counted(counts.scale_bars, 'scale bar')}, {counts.further} further; "
          f"{counted(counts.constraints, 'constraint')}, "
          f"{counted(a.unknowns, 'unknown')}"),
-        *(("global test", describe_test(test, a)) for test in findings.statistics.global_tests),
     ]  # fmt: skip
-    found = result.eccentricity
-    if found is not None:
+    rows += [("global test", describe_test(test, a)) for test in findings.statistics.global_tests]
+    eccentricity = result.eccentricity
+    if eccentricity is not None:
         rows.append(
-            ("eccentricity", f"corrected by {found.rms_px:.4f} px RMS, {found.largest_px:.4f} px at most")
+            (
+                "eccentricity",
+                f"corrected by {eccentricity.rms_px:.4f} px RMS, {eccentricity.largest_px:.4f} px at most",
+            )
         )
     if result.no_circles:
         rows.append(("no circles", f"{len(result.no_circles)} left out: {', '.join(result.no_circles)}"))

@@ -171,7 +171,7 @@ def _held_cameras(a: Solution, b: Solution) -> tuple[tuple[str, ...], tuple[str,
 
 
 def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
-    found: dict[str, tuple[tuple[str, float], ...]] = {}
+    held_values: dict[str, tuple[tuple[str, float], ...]] = {}
     mounts = result.estimate.mounts
     for a, camera in enumerate(result.estimate.cameras):
         held = ~camera.free & (camera.parameters != 0)
@@ -179,13 +179,13 @@ def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
         if mounts is not None and not mounts.free[a].any():
             values += zip("XYZ", mounts.position[a].tolist(), strict=True) if mounts.position[a].any() else ()
         if values:
-            found[camera.name] = tuple(values)
-    return found
+            held_values[camera.name] = tuple(values)
+    return held_values
 
 
 def _refuse_same_photographs(first: Epoch, second: Epoch) -> None:
     """Refuse the same survey under two names, with displacements and standard deviations of 0."""
-    a, b = (one.result.network.image_points.xy for one in (first, second))
+    a, b = (epoch.result.network.image_points.xy for epoch in (first, second))
     if len(a) and a.shape == b.shape and np.array_equal(a, b):
         raise GeometryError(
             f"{first.name} and {second.name} have the same image points: they are one epoch, not two"
@@ -231,10 +231,12 @@ def _correlation_of_shared(
         other, other_sigma, other_value = theirs[key]
         if abs(other_value - value) > MAX_SAME_DIFFERENCE * max(abs(value), 1.0):
             continue
-        for epoch, gradient, s, found in ((first, ours, sigma, mine), (second, other, other_sigma, yours)):
+        for epoch, gradient, s, columns in ((first, ours, sigma, mine), (second, other, other_sigma, yours)):
             Q = epoch.result.covariance
             assert Q is not None and epoch.sigma0 is not None  # refused before; see `Epoch`
-            found.append(sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0))
+            columns.append(
+                sum((Q[:, k] * g for k, g in gradient), start=np.zeros(len(Q))) / (s * epoch.sigma0)
+            )
         words.append(key)
     if not words:
         return None, ()
@@ -244,7 +246,8 @@ def _correlation_of_shared(
 def _covariance(first: Epoch, second: Epoch, a: FloatArray, b: FloatArray, pairs: IntArray) -> FloatArray:
     """Return a b' for the common points, each epoch in its frame, (3 n, 3 n)."""
     rows_a, rows_b = (
-        coordinates_of(one.result.covariance_rows(p)) for one, p in zip((first, second), pairs.T, strict=True)
+        coordinates_of(epoch.result.covariance_rows(p))
+        for epoch, p in zip((first, second), pairs.T, strict=True)
     )
     return np.asarray(a[rows_a] @ b[rows_b].T)
 
@@ -282,7 +285,7 @@ def mount_changes(
     ours, theirs = _mounts(first, 1.0), _mounts(second, scale or 1.0)
     common = [name for name in ours if name in theirs]
     tested = np.arange(6) if scale is not None else np.arange(3, 6)
-    found = []
+    changes = []
     for name in common:
         (a, Q_a), (b, Q_b) = ours[name], theirs[name]
         d, Q = b - a, Q_a + Q_b
@@ -293,8 +296,8 @@ def mount_changes(
         part = Q[np.ix_(tested, tested)]
         statistic = float(d[tested] @ np.linalg.solve(part, d[tested])) / len(tested)
         critical = critical_value(alpha / len(common), len(tested), redundancy)
-        found.append(MountChange(name, d, sigma, statistic, critical))
-    return tuple(found)
+        changes.append(MountChange(name, d, sigma, statistic, critical))
+    return tuple(changes)
 
 
 def _mounts(result: Solution, scale: float) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -87,12 +87,12 @@ class Displacements:
 
 @checked_arguments()
 def find_displacements(
-    found: Differences, *, reference: BoolArray | None = None, alpha: float = FALSE_ALARM
+    differences: Differences, *, reference: BoolArray | None = None, alpha: float = FALSE_ALARM
 ) -> Displacements:
     """Test which points moved.
 
     Args:
-        found: the differences of two epochs.
+        differences: the differences of two epochs.
         reference: points that are assumed stable until a test shows otherwise, (n,); all if not given.
         alpha: probability of reporting a displacement if nothing moved.
 
@@ -100,20 +100,20 @@ def find_displacements(
         GeometryError: fewer than four reference points, or a covariance that is singular beyond its datum.
     """
     tested = congruency(
-        found.difference,
-        found.covariance,
-        found.xyz,
-        motion=found.motion,
-        redundancy=found.redundancy,
+        differences.difference,
+        differences.covariance,
+        differences.xyz,
+        motion=differences.motion,
+        redundancy=differences.redundancy,
         reference=reference,
         alpha=alpha,
     )
     return Displacements(
-        differences=found,
+        differences=differences,
         congruency=tested,
-        detectable=_detectable(tested, found.redundancy),
+        detectable=_detectable(tested, differences.redundancy),
         cause=find_cause(
-            found.pairs,
+            differences.pairs,
             reference=tested.reference,
             changed=not (tested.agreed and tested.stable[tested.reference].all()),
             deforms=True,
@@ -146,13 +146,13 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
     return math.sqrt(high)
 
 
-def _detectable(found: Congruency, redundancy: int | None) -> FloatArray:
+def _detectable(tested: Congruency, redundancy: int | None) -> FloatArray:
     """Return the smallest detectable displacement of each point in its worst direction, (n,).
 
     A stable point is tested by the drop of Omega, any other point by a separate test in the datum.
     """
-    shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(found.level.tolist())}
-    variance = point_blocks(found.covariance, 3)
-    variance[found.stable] = np.linalg.inv(found.weights[found.stable])
+    shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(tested.level.tolist())}
+    variance = point_blocks(tested.covariance, 3)
+    variance[tested.stable] = np.linalg.inv(tested.weights[tested.stable])
     worst = np.sqrt(np.linalg.eigvalsh(variance)[:, -1].clip(0))
-    return np.asarray(worst * np.array([shift[a] for a in found.level.tolist()]))
+    return np.asarray(worst * np.array([shift[a] for a in tested.level.tolist()]))

@@ -172,33 +172,33 @@ def analyse_epochs(
         epochs, cameras = adjust_together(epochs)
 
     def analysed(first: Epoch, second: Epoch) -> EpochPair:
-        found = epoch_differences(first, second)
-        chosen = _reference(found, reference, (first, second)) if reference else None
-        moved = find_displacements(found, reference=chosen, alpha=alpha)
+        differences = epoch_differences(first, second)
+        chosen = _reference(differences, reference, (first, second)) if reference else None
+        moved = find_displacements(differences, reference=chosen, alpha=alpha)
         return EpochPair(
             moved,
             tuple(
-                block_motion(moved, _group(found, name, patterns), name=name, model=model)
+                block_motion(moved, _group(differences, name, patterns), name=name, model=model)
                 for name, patterns in (groups or {}).items()
             ),
             _common_motion(moved),
-            mount_changes(first.result, second.result, alpha=alpha, redundancy=found.redundancy),
+            mount_changes(first.result, second.result, alpha=alpha, redundancy=differences.redundancy),
         )
 
     first = [analysed(epochs[0], epoch) for epoch in epochs[1:]]
     previous = [first[0]]
-    previous += [analysed(one, other) for one, other in pairwise(epochs[1:])]
+    previous += [analysed(earlier, later) for earlier, later in pairwise(epochs[1:])]
     return EpochSeries(names, epochs[0], tuple(first), tuple(previous), cameras)
 
 
-def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:
+def _reference(differences: Differences, patterns: Sequence[str], epochs: tuple[Epoch, Epoch]) -> BoolArray:
     """Return the reference points among the common points; a point missing in an epoch is an error."""
-    chosen = np.zeros(len(found.points), dtype=bool)
+    chosen = np.zeros(len(differences.points), dtype=bool)
     for pattern in patterns:
-        hits = _matching(found.points, pattern)
+        hits = _matching(differences.points, pattern)
         chosen |= hits
         if not hits.any():
-            if _matching(found.untested, pattern).any():
+            if _matching(differences.untested, pattern).any():
                 raise GeometryError(
                     f"epochs: point of reference {pattern} cannot be tested in {epochs[0].name} and "
                     f"{epochs[1].name}: one of them holds it as known, or did not keep its covariance "
@@ -213,14 +213,14 @@ def _reference(found: Differences, patterns: Sequence[str], epochs: tuple[Epoch,
     return chosen
 
 
-def _group(found: Differences, name: str, patterns: Sequence[str]) -> BoolArray:
-    chosen = np.zeros(len(found.points), dtype=bool)
+def _group(differences: Differences, name: str, patterns: Sequence[str]) -> BoolArray:
+    chosen = np.zeros(len(differences.points), dtype=bool)
+    first, second = differences.names
     for pattern in patterns:
-        hits = _matching(found.points, pattern)
+        hits = _matching(differences.points, pattern)
         if not hits.any():
             raise GeometryError(
-                f"group {name}: no point that {found.names[0]} and {found.names[1]} share is called "
-                f"'{pattern}'"
+                f"group {name}: no point that {first} and {second} share is called '{pattern}'"
             )
         chosen |= hits
     return chosen
@@ -230,53 +230,59 @@ def _matching(names: tuple[str, ...], pattern: str) -> BoolArray:
     return np.array([matches(name, pattern) for name in names], dtype=bool)
 
 
-def _common_motion(found: Displacements) -> BlockMotion | None:
+def _common_motion(displacements: Displacements) -> BlockMotion | None:
     """Return the motion of all points that moved as one block; None if it is not determined or checked."""
-    if found.moved.sum() <= MIN_POINTS["rigid"]:
+    if displacements.moved.sum() <= MIN_POINTS["rigid"]:
         return None
     try:
-        return block_motion(found, found.moved, name=MOVED)
+        return block_motion(displacements, displacements.moved, name=MOVED)
     except GeometryError:  # points on a line do not determine their rotation about it
         return None
 
 
-def verdict_of_epochs(found: EpochSeries) -> Verdict:
+def verdict_of_epochs(series: EpochSeries) -> Verdict:
     """Return the verdict on epochs with the remarks on every pair; pairs with the first epoch come first."""
-    remarks = [one for pair in found.pairs for one in remarks_of_pair(pair.displacements)]
+    remarks = [said for pair in series.pairs for said in remarks_of_pair(pair.displacements)]
     remarks += [
         remark(
             "mount_changed",
-            camera=one.camera,
+            camera=mount.camera,
             first=pair.displacements.differences.names[0],
             second=pair.displacements.differences.names[1],
-            statistic=one.statistic,
-            critical=one.critical,
+            statistic=mount.statistic,
+            critical=mount.critical,
         )
-        for pair in found.pairs
-        for one in pair.mounts
-        if one.changed
+        for pair in series.pairs
+        for mount in pair.mounts
+        if mount.changed
     ]
     cameras = [
         remark(
-            "one_camera", camera=one.name, epochs=one.epochs, statistic=one.statistic, critical=one.critical
+            "one_camera",
+            camera=camera.name,
+            epochs=camera.epochs,
+            statistic=camera.statistic,
+            critical=camera.critical,
         )
-        for one in found.cameras
+        for camera in series.cameras
     ]
     return judge((*remarks, *cameras), HEADLINES)
 
 
-def remarks_of_pair(found: Displacements) -> Iterator[Remark]:
+def remarks_of_pair(displacements: Displacements) -> Iterator[Remark]:
     """Yield the remarks on two epochs."""
-    d = found.differences
+    d = displacements.differences
     first, second = d.names
-    length = np.linalg.norm(found.displacement, axis=1)
+    length = np.linalg.norm(displacements.displacement, axis=1)
     unit = d.unit or "object units"
-    if found.cause is not None:
-        yield from remarks_of_cause(found.cause, first, second, len(d.points), (float(length.max()), unit))
-    elif not found.agreed:
+    if displacements.cause is not None:
+        yield from remarks_of_cause(
+            displacements.cause, first, second, len(d.points), (float(length.max()), unit)
+        )
+    elif not displacements.agreed:
         yield remark("no_majority_agrees", first=first, second=second)
-    elif found.moved.any():
-        names = [name for name, moved in zip(d.points, found.moved, strict=True) if moved]
+    elif displacements.moved.any():
+        names = [name for name, moved in zip(d.points, displacements.moved, strict=True) if moved]
         yield remark(
             "displaced",
             first=first,
@@ -284,7 +290,7 @@ def remarks_of_pair(found: Displacements) -> Iterator[Remark]:
             points=names,
             displaced=len(names),
             tested=len(d.points),
-            distance=(float(length[found.moved].max()), unit),
+            distance=(float(length[displacements.moved].max()), unit),
         )
     if d.held_alike:
         yield remark("cameras_held", how="alike", cameras=d.held_alike, first=first, second=second)
@@ -294,12 +300,17 @@ def remarks_of_pair(found: Displacements) -> Iterator[Remark]:
 
 @checked_arguments()
 def block_motion(
-    found: Displacements, group: BoolArray, *, name: str, model: str = "rigid", alpha: float | None = None
+    displacements: Displacements,
+    group: BoolArray,
+    *,
+    name: str,
+    model: str = "rigid",
+    alpha: float | None = None,
 ) -> BlockMotion:
     """Fit the motion of a group of points to their displacements.
 
     Args:
-        found: displacements of two epochs.
+        displacements: displacements of two epochs.
         group: points of the group, (n,).
         name: name of the group.
         model: rigid (translation and rotation), similarity (also scale) or affine (also shear).
@@ -317,17 +328,18 @@ def block_motion(
             f"group {name}: {counted(len(chosen), 'point')}, a {model} motion needs "
             f"{MIN_POINTS[model]} or more"
         )
-    d, Q, G = found.differences.difference, found.differences.covariance, found.differences.motions
-    outside = found.stable & ~group
+    differences = displacements.differences
+    d, Q, G = differences.difference, differences.covariance, differences.motions
+    outside = displacements.stable & ~group
     if np.linalg.matrix_rank(G[np.repeat(outside, 3)], tol=RANK * np.linalg.norm(G, 2)) < G.shape[1]:
         raise GeometryError(
             f"group {name}: {counted(int(outside.sum()), 'stable point')} outside it, too few or "
             "on a line to show a motion of the group"
         )
     d, Q = in_datum(d, Q, G, outside.astype(float))
-    alpha = found.alpha if alpha is None else alpha
+    alpha = displacements.alpha if alpha is None else alpha
     parts = PARTS[: MODELS[model]]
-    x = found.differences.xyz[chosen]
+    x = differences.xyz[chosen]
     centre = x.mean(axis=0)
     A = _motion_columns(x, centre, MODELS[model])
     spread = np.linalg.svd(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), compute_uv=False)
@@ -343,7 +355,7 @@ def block_motion(
     value = cofactor @ (PA.T @ d)
     v = d - A @ value
     freedom = len(d) - len(value)
-    redundancy = found.differences.redundancy
+    redundancy = differences.redundancy
     names = tuple(name for _, group_of in parts for name in group_of)
     tests, at = [], 0
     for part, members in parts:
@@ -353,7 +365,7 @@ def block_motion(
         at += len(members)
     return BlockMotion(
         name=name,
-        points=tuple(found.differences.points[j] for j in chosen),
+        points=tuple(differences.points[j] for j in chosen),
         model=model,
         centre=centre,
         parameters=names,
@@ -373,6 +385,6 @@ def _motion_columns(xyz: FloatArray, centre: FloatArray, parts: int) -> FloatArr
         x, y, z = (xyz - centre).T
         o = np.zeros_like(x)
         shear = [(x, -y, o), (x, o, -z), (y, x, o), (z, o, x), (o, z, y)]
-        columns.append(np.stack([np.stack(one, axis=1) for one in shear], axis=2))
+        columns.append(np.stack([np.stack(components, axis=1) for components in shear], axis=2))
     A = np.concatenate(columns, axis=2)
     return A.reshape(-1, A.shape[2])

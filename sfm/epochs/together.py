@@ -89,20 +89,20 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
     alone = [_adjust_alone(epoch, shared) for epoch in epochs]
     keys = _shared_keys(alone)
     conditions, owner = _conditions(alone, shared)
-    given = [_given_columns(one, keys) for one in alone]
+    given = [_given_columns(single, keys) for single in alone]
     q = len(owner)
-    sizes = [len(one.values) for one in alone]
+    sizes = [len(single.values) for single in alone]
     M, w = np.zeros((q, q)), np.zeros(q)
     left = []
-    for one, B, A, p in zip(alone, conditions, given, sizes, strict=True):
+    for single, B, A, p in zip(alone, conditions, given, sizes, strict=True):
         others = sum(
             (A_j[:p_j].T @ B_j.T for B_j, A_j, p_j in zip(conditions, given, sizes, strict=True)),
             start=np.zeros((len(keys), q)),
         )
-        U = one.covariance[:, :p] @ B.T + A @ (others - A[:p].T @ B.T)
+        U = single.covariance[:, :p] @ B.T + A @ (others - A[:p].T @ B.T)
         left.append(U)
         M += B @ U[:p]
-        w += B @ one.values
+        w += B @ single.values
     scale = 1 / np.sqrt(np.diagonal(M))
     M, w = M * np.outer(scale, scale), w * scale
     factor = cho_factor(M, lower=True)
@@ -115,41 +115,42 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
             raise GeometryError(_describe_change(camera, alone))
     out = []
     correction = cho_solve(factor, w)
-    for one, U, A, p in zip(alone, left, given, sizes, strict=True):
+    for single, U, A, p in zip(alone, left, given, sizes, strict=True):
         U = U[p:] * scale
         V = solve_triangular(factor[0], U.T, lower=True).T
-        result = one.epoch.result
+        result = single.epoch.result
         points = np.array(result.estimate.points)
-        points[one.points] -= (U @ correction).reshape(-1, 3)
-        Q = one.covariance[p:, p:] - V @ V.T
-        every = len(one.points) == len(points)
+        points[single.points] -= (U @ correction).reshape(-1, 3)
+        Q = single.covariance[p:, p:] - V @ V.T
+        every = len(single.points) == len(points)
         result = replace(
             result,
             estimate=replace(result.estimate, points=points),
             covariance=Q,
-            covariance_points=None if every else one.points,
+            covariance_points=None if every else single.points,
         )
         signs = np.concatenate([np.ones(len(keys)), -np.ones(q)])
-        out.append(replace(one.epoch, result=result, common=Common(keys, np.hstack([A[p:], V]), signs)))
+        out.append(replace(single.epoch, result=result, common=Common(keys, np.hstack([A[p:], V]), signs)))
     return tuple(out), cameras
 
 
 def _shared_cameras(epochs: Sequence[Epoch]) -> dict[str, list[int]]:
     """Return the cameras that several epochs share by name, with the indices of these epochs."""
-    found: dict[str, list[int]] = {}
+    epochs_of: dict[str, list[int]] = {}
     for k, epoch in enumerate(epochs):
         for camera in epoch.result.estimate.cameras:
-            found.setdefault(camera.name, []).append(k)
-    shared = {name: numbers for name, numbers in found.items() if len(numbers) > 1}
+            epochs_of.setdefault(camera.name, []).append(k)
+    shared = {name: numbers for name, numbers in epochs_of.items() if len(numbers) > 1}
     if not shared:
         raise GeometryError(
-            f"epochs together: no camera is in two of them ({listed(found, most=MAX_NAMED)}); a camera that "
-            "took several epochs needs one name in their survey files, and no parameters per photograph"
+            f"epochs together: no camera is in two of them ({listed(epochs_of, most=MAX_NAMED)}); a camera "
+            "that took several epochs needs one name in their survey files, and no parameters per photograph"
         )
     kept = {}
     for name, numbers in shared.items():
         cameras = [
-            next(one for one in epochs[k].result.estimate.cameras if one.name == name) for k in numbers
+            next(camera for camera in epochs[k].result.estimate.cameras if camera.name == name)
+            for k in numbers
         ]
         first = cameras[0]
         for k, other in zip(numbers[1:], cameras[1:], strict=True):
@@ -178,7 +179,7 @@ def _adjust_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
     )
     m = marginal_of(a)
     names = m.names()
-    place = {one: k for k, one in enumerate(names)}
+    place = {name: k for k, name in enumerate(names)}
     wanted = [
         (camera.name, parameter)
         for camera in result.estimate.cameras
@@ -207,8 +208,8 @@ def _adjust_alone(epoch: Epoch, shared: dict[str, list[int]]) -> _Alone:
         if (camera, parameter) in wanted:
             column = joint[:, wanted.index((camera, parameter))]
             given[f"{parameter} of camera {camera}"] = (column / (sigma * a.sigma0), value)
-    found = np.array([values[one] for one in wanted])
-    return _Alone(alone, points, found, tuple(wanted), joint, given)
+    adjusted = np.array([values[key] for key in wanted])
+    return _Alone(alone, points, adjusted, tuple(wanted), joint, given)
 
 
 def _network_of(epoch: Epoch) -> Network:
@@ -259,20 +260,20 @@ def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray
 def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
     """Return the given values that two or more epochs share."""
     keys: dict[str, None] = {}
-    for k, one in enumerate(alone):
-        for key, (_, value) in one.given.items():
+    for k, single in enumerate(alone):
+        for key, (_, value) in single.given.items():
             for other in alone[:k]:
                 if key in other.given and _same(other.given[key][1], value):
                     keys[f"{key} = {value:.12g}"] = None
     return tuple(keys)
 
 
-def _given_columns(one: _Alone, keys: tuple[str, ...]) -> FloatArray:
+def _given_columns(single: _Alone, keys: tuple[str, ...]) -> FloatArray:
     """Return the columns of shared given values, zero for those not given in this epoch, (p + 3 k, g)."""
-    columns = {f"{key} = {value:.12g}": column for key, (column, value) in one.given.items()}
-    nothing = np.zeros(len(one.covariance))
-    found = [columns.get(key, nothing) for key in keys]
-    return np.stack(found, axis=1) if found else np.zeros((len(nothing), 0))
+    columns = {f"{key} = {value:.12g}": column for key, (column, value) in single.given.items()}
+    nothing = np.zeros(len(single.covariance))
+    shared = [columns.get(key, nothing) for key in keys]
+    return np.stack(shared, axis=1) if shared else np.zeros((len(nothing), 0))
 
 
 def _conditions(
@@ -286,7 +287,7 @@ def _conditions(
         for camera, parameter in alone[first].names
         if camera == name
     ]
-    B = [np.zeros((len(rows), len(one.names))) for one in alone]
+    B = [np.zeros((len(rows), len(single.names))) for single in alone]
     for r, (name, later, parameter) in enumerate(rows):
         for k, sign in ((shared[name][0], -1.0), (later, 1.0)):
             B[k][r, alone[k].names.index((name, parameter))] = sign
@@ -303,7 +304,7 @@ def _tested(
 ) -> SharedCamera:
     rows = np.array([r for r, (camera, _, _) in enumerate(owner) if camera == name])
     statistic = float(w[rows] @ np.linalg.solve(M[np.ix_(rows, rows)], w[rows])) / len(rows)
-    known = [one.epoch.result.redundancy for one in alone]
+    known = [single.epoch.result.redundancy for single in alone]
     redundancy = None if None in known else sum(r for r in known if r is not None)
     parameters = tuple(dict.fromkeys(owner[r][2] for r in rows))
     return SharedCamera(
@@ -314,18 +315,18 @@ def _tested(
 def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
     """Describe a camera that changed, with the parameter that changed most."""
     first, worst, which, where = None, 0.0, "", ""
-    for one in alone:
-        if one.epoch.name not in camera.epochs:
+    for single in alone:
+        if single.epoch.name not in camera.epochs:
             continue
         if first is None:
-            first = one
+            first = single
             continue
         for parameter in camera.parameters:
-            i, j = (part.names.index((camera.name, parameter)) for part in (first, one))
-            sigma = np.sqrt(first.covariance[i, i] + one.covariance[j, j])
-            off = abs(float(one.values[j] - first.values[i])) / float(sigma)
+            i, j = (part.names.index((camera.name, parameter)) for part in (first, single))
+            sigma = np.sqrt(first.covariance[i, i] + single.covariance[j, j])
+            off = abs(float(single.values[j] - first.values[i])) / float(sigma)
             if off > worst:
-                worst, which, where = off, parameter, f"{first.epoch.name} and {one.epoch.name}"
+                worst, which, where = off, parameter, f"{first.epoch.name} and {single.epoch.name}"
     return (
         f"epochs together: camera {camera.name} is not the same: T {camera.statistic:.3g}, limit "
         f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "

@@ -365,10 +365,10 @@ def _align_by_coordinates(
         T: the transformation.
         entities: position or direction, whether it is a direction, and the axis along which it is held.
     """
-    held = join_functions([one for one, _, _ in entities])
+    held = join_functions([function for function, _, _ in entities])
     moves, by_places = np.zeros((6, 7)), np.zeros((6, len(held.value)))
-    for k, (one, is_direction, axis) in enumerate(entities):
-        value = T.rotation @ one.value if is_direction else T.apply(one.value)
+    for k, (function, is_direction, axis) in enumerate(entities):
+        value = T.rotation @ function.value if is_direction else T.apply(function.value)
         motions = similarity_motions(value[None], centre=np.zeros(3))[0]
         if is_direction:
             motions = motions * np.array([0.0, 0, 0, 1, 1, 1, 0])

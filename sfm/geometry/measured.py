@@ -147,28 +147,28 @@ class MeasuredPoints:
         Returns:
             Covariance, (q, q).
         """
-        q = sum(len(one.value) for one in functions)
+        q = sum(len(function.value) for function in functions)
         if self.covariance is None:
             return np.full((q, q), np.nan)
-        points = np.unique(np.concatenate([one.points for one in functions]))
-        J = np.vstack([self._spread(one, points) for one in functions])
+        points = np.unique(np.concatenate([function.points for function in functions]))
+        J = np.vstack([self._spread(function, points) for function in functions])
         return np.asarray(J @ self.covariance_of(points) @ J.T)
 
-    def _spread(self, one: Function, points: IntArray) -> FloatArray:
-        J = np.zeros((len(one.value), 3 * len(points)))
-        np.add.at(J.T, coordinates_of(np.searchsorted(points, one.points)), one.jacobian.T)
+    def _spread(self, function: Function, points: IntArray) -> FloatArray:
+        J = np.zeros((len(function.value), 3 * len(points)))
+        np.add.at(J.T, coordinates_of(np.searchsorted(points, function.points)), function.jacobian.T)
         return J
 
-    def depends_on_datum(self, one: Function) -> BoolArray:
+    def depends_on_datum(self, function: Function) -> BoolArray:
         """Return which values depend on the datum, because a motion of the whole changes them, (q,)."""
         if self.datum in OWN_DATUM:
-            return np.zeros(len(one.value), dtype=bool)
-        xyz = self.xyz[one.points]
+            return np.zeros(len(function.value), dtype=bool)
+        xyz = self.xyz[function.points]
         size = max(float(np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max(initial=0.0)), 1e-300)
         G = similarity_motions(xyz, centre=xyz.mean(axis=0), size=size).reshape(-1, 7)
         G = G[:, : 6 if self.has_scale else 7]
-        change = np.abs(one.jacobian @ G)
-        most = np.abs(one.jacobian) @ np.abs(G)
+        change = np.abs(function.jacobian @ G)
+        most = np.abs(function.jacobian) @ np.abs(G)
         return np.asarray((change > INVARIANT * most.max(axis=1, keepdims=True)).any(axis=1))
 
 
@@ -257,25 +257,25 @@ def with_hidden_point(
         raise GeometryError(f"hidden point {name}: targets {start} and {end} coincide")
     u = d.value / length
     along = distance * (np.eye(3) - np.outer(u, u)) / length
-    found = join_functions([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
-    of_hidden = sigma**2 * np.outer(u, u) + points.covariance_between([found])
+    placed = join_functions([b, d]).times(np.hstack([np.eye(3), along]), b.value + distance * u)
+    of_hidden = sigma**2 * np.outer(u, u) + points.covariance_between([placed])
     Q = points.covariance
     if Q is not None and Q.ndim == 3:
         Q = np.concatenate([Q, of_hidden[None]])
     elif Q is not None:
-        cross = found.jacobian @ Q[coordinates_of(found.points)]
+        cross = placed.jacobian @ Q[coordinates_of(placed.points)]
         Q = np.block([[Q, cross.T], [cross, of_hidden]])
     sample, known = points.sample, points.sample_covariance
-    if sample is not None and known is not None and points.correlated_among(found.points):
+    if sample is not None and known is not None and points.correlated_among(placed.points):
         place = np.full(len(points.names), -1)
         place[sample] = np.arange(len(sample))
-        cross = found.jacobian @ known[coordinates_of(place[found.points])]
+        cross = placed.jacobian @ known[coordinates_of(place[placed.points])]
         known = np.block([[known, cross.T], [cross, of_hidden]])
         sample = np.append(sample, len(points.names))
     return replace(
         points,
         names=(*points.names, name),
-        xyz=np.vstack([points.xyz, found.value]),
+        xyz=np.vstack([points.xyz, placed.value]),
         covariance=Q,
         sample=sample,
         sample_covariance=known,
@@ -299,13 +299,13 @@ def point_function(points: MeasuredPoints, name: str) -> Function:
 
 def join_functions(functions: list[Function]) -> Function:
     """Return the values of several functions as one function of all their points."""
-    points: IntArray = np.unique(np.concatenate([one.points for one in functions]))
+    points: IntArray = np.unique(np.concatenate([function.points for function in functions]))
     rows = []
-    for one in functions:
-        J = np.zeros((len(one.value), 3 * len(points)))
-        np.add.at(J.T, coordinates_of(np.searchsorted(points, one.points)), one.jacobian.T)
+    for function in functions:
+        J = np.zeros((len(function.value), 3 * len(points)))
+        np.add.at(J.T, coordinates_of(np.searchsorted(points, function.points)), function.jacobian.T)
         rows.append(J)
-    return Function(np.concatenate([one.value for one in functions]), points, np.vstack(rows))
+    return Function(np.concatenate([function.value for function in functions]), points, np.vstack(rows))
 
 
 @checked_arguments()

@@ -78,11 +78,11 @@ def deviations_from_points(
     if chosen is not None:
         check_indices("deviations_from_points: chosen", chosen, len(points.names))
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
-    common = [one for one in nominal.names if one in points.names and one in wanted]
+    common = [name for name in nominal.names if name in points.names and name in wanted]
     if not common:
         raise GeometryError(f"tolerance {name}: no nominal point was measured")
-    rows = np.array([points.index(one) for one in common], dtype=np.int64)
-    of_nominal = np.array([nominal.names.index(one) for one in common], dtype=np.int64)
+    rows = np.array([points.index(name) for name in common], dtype=np.int64)
+    of_nominal = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
     d = points.xyz[rows] - nominal.xyz[of_nominal]
     Q = points.blocks[rows]
     if nominal.covariance is not None:
@@ -90,7 +90,7 @@ def deviations_from_points(
     length = np.linalg.norm(d, axis=1)
     u = np.divide(d, length[:, None], out=np.zeros_like(d), where=length[:, None] > 0)
     sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", u, Q, u), 0.0))
-    missing = tuple(one for one in nominal.names if one not in points.names)
+    missing = tuple(name for name in nominal.names if name not in points.names)
     decision = decide(length, sigma, -np.inf, upper, coverage)
     return Deviations(name, "nominal points", rows, length, sigma, d, 0.0, upper, coverage, decision, missing)
 
@@ -127,12 +127,12 @@ def deviations_from_mesh(
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
     check_indices("deviations_from_mesh: chosen", chosen, len(points.names))
-    found = distances_from_mesh(points.xyz[chosen], mesh)
-    value = found.distance - offset
-    variance = np.einsum("ni,nij,nj->n", found.normal, points.blocks[chosen], found.normal)
+    nearest = distances_from_mesh(points.xyz[chosen], mesh)
+    value = nearest.distance - offset
+    variance = np.einsum("ni,nij,nj->n", nearest.normal, points.blocks[chosen], nearest.normal)
     sigma = np.sqrt(np.maximum(variance, 0.0))
     decision = decide(value, sigma, lower, upper, coverage)
-    vector = value[:, None] * found.normal
+    vector = value[:, None] * nearest.normal
     return Deviations(name, against, chosen, value, sigma, vector, lower, upper, coverage, decision)
 
 
@@ -231,8 +231,8 @@ def distances_from_mesh(xyz: FloatArray, mesh: Mesh) -> MeshDistances:
     level = np.floor(np.log2(radius / radius.max())).astype(np.int64)
     trees = []
     bound = np.full(len(xyz), np.inf)
-    for one in np.unique(level):
-        rows = np.flatnonzero(level == one)
+    for value in np.unique(level):
+        rows = np.flatnonzero(level == value)
         tree = cKDTree(centre[rows])
         trees.append((rows, tree, float(radius[rows].max())))
         bound = np.minimum(bound, tree.query(xyz)[0])

@@ -85,11 +85,13 @@ class Acceptance:
         exceeding = int((unknown & (np.abs(self.error) > self.limit)).sum())
         total, undecided = len(self.error), self.count(UNDECIDED)
         out, without = self.count(OUT) + exceeding, int(unknown.sum()) - exceeding
-        decided = [
-            *([remark("out_of_tolerance", out=out, total=total, unknown=exceeding or None)] if out else []),
-            *([remark("tolerance_undecided", undecided=undecided, total=total)] if undecided else []),
-            *([remark("tolerance_unknown", unknown=without, total=total)] if without else []),
-        ]
+        decided = []
+        if out:
+            decided.append(remark("out_of_tolerance", out=out, total=total, unknown=exceeding or None))
+        if undecided:
+            decided.append(remark("tolerance_undecided", undecided=undecided, total=total))
+        if without:
+            decided.append(remark("tolerance_unknown", unknown=without, total=total))
         return judge((*decided, *self.lacking, remark("temperature_unknown")), HEADLINES)
 
 
@@ -161,8 +163,8 @@ def accept_result(
         distance(point_function(points, start), point_function(points, end))
         for start, end in zip(lengths.start, lengths.end, strict=True)
     ]
-    measured = np.array([one.value[0] for one in functions])
-    variance = np.array([points.covariance_between([one])[0, 0] for one in functions])
+    measured = np.array([function.value[0] for function in functions])
+    variance = np.array([points.covariance_between([function])[0, 0] for function in functions])
     error = measured - lengths.length
     limit = np.minimum(a + k * lengths.length, b)
     # |error| is scaled so that the limit of each length is 1
@@ -204,8 +206,8 @@ def _refuse_tested_scale(
         )
     given, fixed = set(bars), set(control)
     for line in dict.fromkeys(lengths.line):
-        rows = [k for k, one in enumerate(lengths.line) if one == line]
-        ends = sorted({one for k in rows for one in (lengths.start[k], lengths.end[k])})
+        rows = [k for k, owner in enumerate(lengths.line) if owner == line]
+        ends = sorted({end for k in rows for end in (lengths.start[k], lengths.end[k])})
         for i in ends:
             for j in ends:
                 if i != j and f"{i} - {j}" in given:
@@ -226,25 +228,25 @@ def _unmet_requirements(
 ) -> list[Remark]:
     """Return remarks on requirements of part 1 that the data do not meet."""
     lines = list(dict.fromkeys(lengths.line))
-    found = []
+    lacking = []
     if len(lines) < MIN_LINES:
-        found.append(remark("lengths_lacking", lines=len(lines), needed=MIN_LINES))
+        lacking.append(remark("lengths_lacking", lines=len(lines), needed=MIN_LINES))
     of_line: dict[str, FloatArray] = {}
     for line in lines:
-        rows = np.array([k for k, one in enumerate(lengths.line) if one == line])
+        rows = np.array([k for k, owner in enumerate(lengths.line) if owner == line])
         if len(rows) < MIN_LENGTHS:
-            found.append(remark("lengths_lacking", line=line, lengths=len(rows), needed=MIN_LENGTHS))
+            lacking.append(remark("lengths_lacking", line=line, lengths=len(rows), needed=MIN_LENGTHS))
         longest = directions[rows[np.argmax(lengths.length[rows])]]
         of_line[line] = longest / np.linalg.norm(longest)
         off = np.linalg.norm(np.cross(directions[rows], of_line[line]), axis=1)
         if (off > np.sin(np.deg2rad(SAME_DIRECTION_DEG)) * np.linalg.norm(directions[rows], axis=1)).any():
-            found.append(remark("line_not_straight", line=line))
+            lacking.append(remark("line_not_straight", line=line))
     for i, first in enumerate(lines):
         for second in lines[i + 1 :]:
             cosine = min(1.0, abs(float(of_line[first] @ of_line[second])))
             if np.rad2deg(np.arccos(cosine)) < SAME_DIRECTION_DEG:
-                found.append(remark("lengths_lacking", parallel=(first, second)))
+                lacking.append(remark("lengths_lacking", parallel=(first, second)))
     longest = float(lengths.length.max())
     if longest < MIN_LONGEST * diagonal:
-        found.append(remark("lengths_lacking", longest=(longest, unit), diagonal=(diagonal, unit)))
-    return found
+        lacking.append(remark("lengths_lacking", longest=(longest, unit), diagonal=(diagonal, unit)))
+    return lacking

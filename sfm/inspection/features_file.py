@@ -157,15 +157,15 @@ class FeaturesFile(Section):
 
     def tables(self) -> tuple[str, ...]:
         """Return the names of the tables of nominal points."""
-        named = [
-            self.alignment.nominal if self.alignment else None,
-            *(one.nominal for one in self.tolerances),
-        ]
+        named = [self.alignment.nominal if self.alignment else None]
+        named += [tolerance.nominal for tolerance in self.tolerances]
         return tuple(dict.fromkeys(name for name in named if name is not None))
 
     def meshes(self) -> tuple[str, ...]:
         """Return the names of the meshes."""
-        return tuple(dict.fromkeys(one.mesh for one in self.tolerances if one.mesh is not None))
+        return tuple(
+            dict.fromkeys(tolerance.mesh for tolerance in self.tolerances if tolerance.mesh is not None)
+        )
 
 
 NEEDED = {
@@ -208,10 +208,10 @@ def _refuse_contradictions(path: Path, features: FeaturesFile) -> None:
     kinds = (("group", features.groups), ("shape", features.shapes), ("tolerance", features.tolerances))
     for kind, entries in kinds:
         seen: set[str] = set()
-        for one in entries:
-            if one.name in seen:
-                raise SurveyFileError(f"{path}: {kind} '{one.name}' is a duplicate")
-            seen.add(one.name)
+        for entry in entries:
+            if entry.name in seen:
+                raise SurveyFileError(f"{path}: {kind} '{entry.name}' is a duplicate")
+            seen.add(entry.name)
     alignment = features.alignment
     if alignment is not None:
         for key in NEEDED[alignment.method]:
@@ -220,9 +220,9 @@ def _refuse_contradictions(path: Path, features: FeaturesFile) -> None:
     for tolerance in features.tolerances:
         given = [key for key in ("shape", "nominal", "mesh") if getattr(tolerance, key) is not None]
         if len(given) != 1:
-            found = " and ".join(given) or "none"
+            stated = " and ".join(given) or "none"
             raise SurveyFileError(
-                f"{path}: tolerance {tolerance.name}: found {found}, needed one of shape, nominal and mesh"
+                f"{path}: tolerance {tolerance.name}: found {stated}, needed one of shape, nominal and mesh"
             )
         if tolerance.mesh is not None and tolerance.points is None:
             raise SurveyFileError(f"{path}: tolerance {tolerance.name}: a mesh needs the points to be judged")

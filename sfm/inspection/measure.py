@@ -105,26 +105,33 @@ class Measurement:
     @property
     def verdict(self) -> Verdict:
         """Whether all tolerances are proven to be kept."""
-        judged = [found for one in self.tolerances for found in self._of_tolerance(one)]
+        judged = [said for tolerance in self.tolerances for said in self._of_tolerance(tolerance)]
         return judge((*judged, *self.remarks), HEADLINES_OF_TOLERANCES if self.tolerances else HEADLINES)
 
-    def _of_tolerance(self, one: Deviations) -> Iterator[Remark]:
-        total = len(one.points)
-        if one.count(OUT):
+    def _of_tolerance(self, tolerance: Deviations) -> Iterator[Remark]:
+        total = len(tolerance.points)
+        if tolerance.count(OUT):
             names = [
                 self.points.names[j]
-                for j, decision in zip(one.points, one.decision, strict=True)
+                for j, decision in zip(tolerance.points, tolerance.decision, strict=True)
                 if decision == OUT
             ]
-            yield remark("out_of_tolerance", tolerance=one.name, out=len(names), total=total, points=names)
-        if one.count(UNDECIDED):
             yield remark(
-                "tolerance_undecided", tolerance=one.name, undecided=one.count(UNDECIDED), total=total
+                "out_of_tolerance", tolerance=tolerance.name, out=len(names), total=total, points=names
             )
-        if one.count(UNKNOWN):
-            yield remark("tolerance_unknown", tolerance=one.name, unknown=one.count(UNKNOWN), total=total)
-        if one.missing:
-            yield remark("nominal_missing", tolerance=one.name, points=one.missing)
+        if tolerance.count(UNDECIDED):
+            yield remark(
+                "tolerance_undecided",
+                tolerance=tolerance.name,
+                undecided=tolerance.count(UNDECIDED),
+                total=total,
+            )
+        if tolerance.count(UNKNOWN):
+            yield remark(
+                "tolerance_unknown", tolerance=tolerance.name, unknown=tolerance.count(UNKNOWN), total=total
+            )
+        if tolerance.missing:
+            yield remark("nominal_missing", tolerance=tolerance.name, points=tolerance.missing)
 
 
 def measure_result(
@@ -151,8 +158,10 @@ def measure_result(
     points = measured_points(result)
     if not len(points.names):
         raise GeometryError(f"{result.name}: no point has coordinates, nothing can be measured")
-    for one in features.hidden_points:
-        points = with_hidden_point(points, one.name, one.start, one.end, one.distance, one.sigma)
+    for hidden in features.hidden_points:
+        points = with_hidden_point(
+            points, hidden.name, hidden.start, hidden.end, hidden.distance, hidden.sigma
+        )
     work = _Work(result, features, paths, read_mesh, points)
     return work.measured()
 
@@ -170,14 +179,16 @@ class _Work:
     ) -> None:
         self.result, self.features, self.paths, self.read_mesh = result, features, paths, read_mesh
         self.points = points
-        self.patterns = {one.name: one.points for one in features.groups}
+        self.patterns = {group.name: group.points for group in features.groups}
         self.shapes: dict[str, ShapeFit] = {}
         self.tables = {name: _nominal(paths[name]) for name in features.tables()}
         self.rays = _rays(result)
 
     def measured(self) -> Measurement:
         features = self.features
-        groups = tuple((one.name, self.chosen((one.name,), f"group {one.name}")) for one in features.groups)
+        groups = tuple(
+            (group.name, self.chosen((group.name,), f"group {group.name}")) for group in features.groups
+        )
         alignment = None
         if features.alignment is not None:
             if features.alignment.method == "features":
@@ -187,7 +198,7 @@ class _Work:
             self.rays = self.rays[0], alignment.aligned_from_object.apply(self.rays[1])
         self.fit_shapes()
         quantities = tuple(self.quantities())
-        tolerances = tuple(self.tolerance(one) for one in features.tolerances)
+        tolerances = tuple(self.tolerance(tolerance) for tolerance in features.tolerances)
         return Measurement(
             self.result.name,
             self.points,
@@ -202,37 +213,37 @@ class _Work:
 
     def chosen(self, patterns: tuple[str, ...], what: str) -> IntArray:
         """Return the points that names, patterns and groups select."""
-        flat = [one for pattern in patterns for one in self.patterns.get(pattern, (pattern,))]
+        flat = [name for pattern in patterns for name in self.patterns.get(pattern, (pattern,))]
         return self.points.matching(flat, what)
 
     def fit_shapes(self) -> None:
-        self.shapes = {one.name: self.shape(one) for one in self.features.shapes}
+        self.shapes = {settings.name: self.shape(settings) for settings in self.features.shapes}
 
-    def shape(self, one: ShapeSettings) -> ShapeFit:
-        rows = self.chosen(one.points, f"shape {one.name}")
-        weights = one.weights or self.features.measure.weights
+    def shape(self, settings: ShapeSettings) -> ShapeFit:
+        rows = self.chosen(settings.points, f"shape {settings.name}")
+        weights = settings.weights or self.features.measure.weights
 
         def fitted(offset: float) -> ShapeFit:
             return fit_shape(
                 self.points,
-                one.kind,
+                settings.kind,
                 rows,
-                name=one.name,
+                name=settings.name,
                 weights=weights,
-                hold=_held(one.hold),
-                robust=one.robust,
+                hold=_held(settings.hold),
+                robust=settings.robust,
                 offset=offset,
             )
 
         first = fitted(0.0)
-        return first if one.offset == 0 else fitted(one.offset * self.side(one, first))
+        return first if settings.offset == 0 else fitted(settings.offset * self.side(settings, first))
 
-    def side(self, one: ShapeSettings, fit: ShapeFit) -> float:
+    def side(self, settings: ShapeSettings, fit: ShapeFit) -> float:
         """Return the side of a shape on which its targets are: 1 for the side of its normals, else -1."""
         xyz = self.points.xyz[fit.points]
         normals = fit.shape.design(xyz)[1][:, -1]
-        if one.side != "cameras":
-            view = self.points.xyz[self.points.index(one.side)]
+        if settings.side != "cameras":
+            view = self.points.xyz[self.points.index(settings.side)]
             return 1.0 if float(np.einsum("ni,ni->n", view - xyz, normals).mean()) >= 0 else -1.0
         point, camera = self.rays
         place = np.full(len(self.points.names), -1)
@@ -241,44 +252,48 @@ class _Work:
         towards = np.einsum("ri,ri->r", camera - xyz[k], normals[k])[k >= 0]
         share = float((towards > 0).mean()) if len(towards) else 0.5
         if max(share, 1 - share) < SEEN_FROM:
-            found = f"{share:.0%} of the rays come from one side" if len(towards) else "no photographs"
+            seen = f"{share:.0%} of the rays come from one side" if len(towards) else "no photographs"
             raise GeometryError(
-                f"shape {one.name}: offset: {found}; needed side = the name of a point on the side of the "
-                "targets"
+                f"shape {settings.name}: offset: {seen}; needed side = the name of a point on the side of "
+                "the targets"
             )
         return 1.0 if share > 0.5 else -1.0
 
-    def aligned(self, one: AlignmentSettings) -> Alignment:
-        if one.method == "3-2-1":
-            assert one.plane is not None and one.line is not None and one.origin is not None
-            return align_321(self.points, list(one.plane), list(one.line), one.origin)
-        if one.method == "features":
-            assert one.z_axis is not None and one.x_axis is not None and one.origin is not None
-            primary = self.shape_named(one.z_axis, "alignment: z_axis")
-            if len(one.x_axis) == 1:
-                x_axis = self.direction(self.shape_named(one.x_axis[0], "alignment: x_axis"))
-            elif len(one.x_axis) == 2:
-                x_axis = difference(*(self.place(name) for name in one.x_axis))
+    def aligned(self, settings: AlignmentSettings) -> Alignment:
+        if settings.method == "3-2-1":
+            assert settings.plane is not None and settings.line is not None and settings.origin is not None
+            return align_321(self.points, list(settings.plane), list(settings.line), settings.origin)
+        if settings.method == "features":
+            assert settings.z_axis is not None and settings.x_axis is not None and settings.origin is not None
+            primary = self.shape_named(settings.z_axis, "alignment: z_axis")
+            if len(settings.x_axis) == 1:
+                x_axis = self.direction(self.shape_named(settings.x_axis[0], "alignment: x_axis"))
+            elif len(settings.x_axis) == 2:
+                start, end = map(self.place, settings.x_axis)
+                x_axis = difference(start, end)
             else:
                 raise GeometryError(
-                    f"alignment: x_axis names {len(one.x_axis)}, expected one shape or two points or shapes"
+                    f"alignment: x_axis names {len(settings.x_axis)}, expected one shape or two points or "
+                    "shapes"
                 )
             flat = primary.shape.kind.name == "plane"
             return align_features(
                 self.direction(primary),
                 x_axis,
-                self.place(one.origin),
+                self.place(settings.origin),
                 on_plane=primary.function[primary.parameters.rows("point")] if flat else None,
             )
-        assert one.nominal is not None
-        nominal = self.tables[one.nominal]
-        if one.points is not None:
-            wanted = {self.points.names[j] for j in self.chosen(one.points, "alignment: points")}
+        assert settings.nominal is not None
+        nominal = self.tables[settings.nominal]
+        if settings.points is not None:
+            wanted = {self.points.names[j] for j in self.chosen(settings.points, "alignment: points")}
             rows = np.array([k for k, name in enumerate(nominal.names) if name in wanted], dtype=np.int64)
             covariance = None if nominal.covariance is None else nominal.covariance[rows]
             nominal = Nominal(tuple(nominal.names[k] for k in rows), nominal.xyz[rows], covariance)
-        weights = one.weights or self.features.measure.weights
-        return align_points(self.points, nominal, scale=one.scale, weights=weights, robust=one.robust)
+        weights = settings.weights or self.features.measure.weights
+        return align_points(
+            self.points, nominal, scale=settings.scale, weights=weights, robust=settings.robust
+        )
 
     def shape_named(self, name: str, what: str) -> ShapeFit:
         if name not in self.shapes:
@@ -299,13 +314,15 @@ class _Work:
         return point_function(self.points, name)
 
     def quantities(self) -> list[Quantity]:
-        found = []
-        for one in self.features.distances:
+        quantities = []
+        for pair in self.features.distances:
             try:
-                function = self.distance(one.start, one.end)
+                function = self.distance(pair.start, pair.end)
             except GeometryError as error:
-                raise GeometryError(f"distance {one.name}: {error}") from error
-            found.append(self.quantity(one.name, f"distance {one.start} to {one.end}", "length", function))
+                raise GeometryError(f"distance {pair.name}: {error}") from error
+            quantities.append(
+                self.quantity(pair.name, f"distance {pair.start} to {pair.end}", "length", function)
+            )
         for angle in self.features.angles:
             a, b = angle.between
             if angle.at is not None:
@@ -320,7 +337,7 @@ class _Work:
                     flip = np.array([[-1.0]])
                     function = function.times(flip, np.pi / 2 - function.value)
                 what = f"angle between {a} and {b}"
-            found.append(self.quantity(angle.name, what, "angle", function))
+            quantities.append(self.quantity(angle.name, what, "angle", function))
         for asked in self.features.heights:
             plane = self.shape_named(asked.above, f"height {asked.name}")
             if plane.shape.kind.name != "plane":
@@ -332,21 +349,23 @@ class _Work:
                 name = self.points.names[j]
                 function = height(point_function(self.points, name), place, self.direction(plane))
                 what = f"height of {name} above {asked.above}"
-                found.append(self.quantity(f"{asked.name} {name}", what, "length", function))
-        return found
+                quantities.append(self.quantity(f"{asked.name} {name}", what, "length", function))
+        return quantities
 
     def distance(self, start: str, end: str) -> Function:
         """Return the distance of two positions, or of a position from a plane or an axis."""
-        for one, other in ((start, end), (end, start)):
+        for position, other in ((start, end), (end, start)):
             fit = self.shapes.get(other)
-            if fit is None or (one in self.shapes and self.shapes[one].shape.kind.name in WITH_AXIS):
+            if fit is None or (
+                position in self.shapes and self.shapes[position].shape.kind.name in WITH_AXIS
+            ):
                 continue
             where = fit.function[fit.parameters.rows(fit.shape.kind.place)]
             if fit.shape.kind.name == "plane":
-                found = height(self.place(one), where, self.direction(fit))
-                return found.times(np.array([[1.0 if found.value[0] >= 0 else -1.0]]), np.abs(found.value))
+                signed = height(self.place(position), where, self.direction(fit))
+                return signed.times(np.array([[1.0 if signed.value[0] >= 0 else -1.0]]), np.abs(signed.value))
             if fit.shape.kind.name in ("line", "cylinder"):
-                return distance_from_axis(self.place(one), where, self.direction(fit))
+                return distance_from_axis(self.place(position), where, self.direction(fit))
         return distance(self.place(start), self.place(end))
 
     def quantity(self, name: str, what: str, kind: str, function: Function) -> Quantity:
@@ -356,33 +375,40 @@ class _Work:
         sigma = float(np.sqrt(max(variance, 0.0))) if not np.isnan(variance) else float("nan")
         return Quantity(name, what, kind, float(function.value[0]), sigma, tuple(remarks))
 
-    def tolerance(self, one: ToleranceSettings) -> Deviations:
-        lower = -one.upper if one.lower is None else one.lower
-        coverage = one.coverage or self.features.measure.coverage
-        chosen = None if one.points is None else self.chosen(one.points, f"tolerance {one.name}")
-        if one.shape is not None:
-            fit = self.shape_named(one.shape, f"tolerance {one.name}")
+    def tolerance(self, settings: ToleranceSettings) -> Deviations:
+        lower = -settings.upper if settings.lower is None else settings.lower
+        coverage = settings.coverage or self.features.measure.coverage
+        chosen = (
+            None if settings.points is None else self.chosen(settings.points, f"tolerance {settings.name}")
+        )
+        if settings.shape is not None:
+            fit = self.shape_named(settings.shape, f"tolerance {settings.name}")
             return deviations_from_shape(
-                self.points, fit, name=one.name, lower=lower, upper=one.upper, coverage=coverage
+                self.points, fit, name=settings.name, lower=lower, upper=settings.upper, coverage=coverage
             )
-        if one.nominal is not None:
-            nominal = self.tables[one.nominal]
+        if settings.nominal is not None:
+            nominal = self.tables[settings.nominal]
             return deviations_from_points(
-                self.points, nominal, name=one.name, upper=one.upper, coverage=coverage, chosen=chosen
+                self.points,
+                nominal,
+                name=settings.name,
+                upper=settings.upper,
+                coverage=coverage,
+                chosen=chosen,
             )
-        assert one.mesh is not None and chosen is not None
+        assert settings.mesh is not None and chosen is not None
         if self.read_mesh is None:
-            raise GeometryError(f"tolerance {one.name}: nothing here reads the mesh {one.mesh}")
+            raise GeometryError(f"tolerance {settings.name}: nothing here reads the mesh {settings.mesh}")
         return deviations_from_mesh(
             self.points,
-            Mesh(*self.read_mesh(self.paths[one.mesh])),
+            Mesh(*self.read_mesh(self.paths[settings.mesh])),
             chosen,
-            name=one.name,
-            against=one.mesh,
+            name=settings.name,
+            against=settings.mesh,
             lower=lower,
-            upper=one.upper,
+            upper=settings.upper,
             coverage=coverage,
-            offset=one.offset,
+            offset=settings.offset,
         )
 
     def remarks(self) -> Iterator[Remark]:

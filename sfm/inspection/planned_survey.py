@@ -157,7 +157,7 @@ def read_plan(folder: Path) -> PlannedSurvey:
     refuse_links_out(folder)
     plan = read_json(folder / "plan.json", _Plan, "a plan")
     where = folder / "plan.json"
-    cameras = tuple(_camera(where, one) for one in plan.cameras)
+    cameras = tuple(_camera(where, camera) for camera in plan.cameras)
     rig = _rig(where, plan.mounts, cameras)
     angles, path = ("omega_deg", "phi_deg", "kappa_deg"), folder / "exterior.csv"
     texts = ("image",) if rig is None else ("image", "camera", "moment")
@@ -186,9 +186,9 @@ def read_plan(folder: Path) -> PlannedSurvey:
     normals = v[:, 3:6].copy()
     known = {*points, *stations.names}
     tables = tuple(_table(where, kind, lines) for kind, lines in plan.survey_observations.items())
-    for one in tables:
-        for name in (name for column in one.named for name in column if name not in known):
-            raise SurveyFileError(f"{where}: {one.kind}: '{name}' is not in the plan")
+    for observations in tables:
+        for name in (name for column in observations.named for name in column if name not in known):
+            raise SurveyFileError(f"{where}: {observations.kind}: '{name}' is not in the plan")
     return PlannedSurvey(
         plan.name,
         plan.unit,
@@ -229,24 +229,26 @@ def _camera(where: Path, c: _Camera) -> Camera:
 
 def _rig(where: Path, mounts: Sequence[_Mount], cameras: tuple[Camera, ...]) -> Mounts | None:
     """Return the rig of a plan; None for a single camera."""
-    if [one.camera for one in mounts] != [camera.name for camera in cameras][: len(mounts)] or (
+    if [mount.camera for mount in mounts] != [camera.name for camera in cameras][: len(mounts)] or (
         len(cameras) > 1 and len(mounts) != len(cameras)
     ):
         raise SurveyFileError(f"{where}: mounts: needed one for each camera, in the order of the cameras")
     if not mounts:
         return None
-    value = np.array([one.value for one in mounts])
+    value = np.array([mount.value for mount in mounts])
     return Mounts(
         value[:, :3],
         np.array([rotation_from_angles(*np.radians(row)) for row in value[:, 3:]]),
-        np.array([[one.sigma is None or any(one.sigma)] * 6 for one in mounts]),
-        tuple(one.rig for one in mounts),
+        np.array([[mount.sigma is None or any(mount.sigma)] * 6 for mount in mounts]),
+        tuple(mount.rig for mount in mounts),
     )
 
 
 def _given_mounts(mounts: Sequence[_Mount]) -> MountObservations:
     """Return the given mounts, except for the reference camera."""
-    on = [a for a, one in enumerate(mounts) if one.sigma is not None and any((*one.value, *one.sigma))]
+    on = [
+        a for a, mount in enumerate(mounts) if mount.sigma is not None and any((*mount.value, *mount.sigma))
+    ]
     value = np.array([mounts[a].value for a in on]).reshape(-1, 6) / IN_FILES
     sigma = np.array([mounts[a].sigma for a in on]).reshape(-1, 6) / IN_FILES
     covariance = np.eye(6) * sigma[:, None, :] ** 2
@@ -326,7 +328,12 @@ def write_simulation(
         lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
         lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}"]
     for kind, of in TABLES.items():
-        rows = [row for one in network.observations if type(one) is of for row in one.table_rows(network)]
+        rows = [
+            row
+            for observations in network.observations
+            if type(observations) is of
+            for row in observations.table_rows(network)
+        ]
         if rows:
             file = f"{kind.replace(' ', '_')}.csv"
             _write(folder / file, (*of.texts, *of.columns()), rows)
@@ -387,7 +394,7 @@ def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes
 
 def _camera_section(camera: Camera, images: list[str]) -> list[str]:
     """Return the lines of a camera; its free parameters start at 0."""
-    free = [name for name, one in zip(camera.names, camera.free, strict=True) if one]
+    free = [name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free]
     values = zip(camera.names, camera.parameters.tolist(), strict=True)
     held = [f"{name} = {value!r}" for name, value in values if name not in free and name != "c"]
     globs = [name.replace("[", "[[]").replace("*", "[*]").replace("?", "[?]") for name in images]
@@ -407,7 +414,7 @@ def _rig_section(folder: Path, network: Network, truth: Estimate) -> list[str]:
     _write(folder / MOMENTS, ("image", "moment"), zip(network.images, network.moment.tolist(), strict=True))
     lines = ["[[rig]]", f"name = {json.dumps(rig)}", f"cameras = {json.dumps(cameras)}"]
     lines += [f'moment = "{MOMENTS}"']
-    (given,) = (one for one in network.observations if isinstance(one, MountObservations))
+    (given,) = (kind for kind in network.observations if isinstance(kind, MountObservations))
     if len(given):
         sigma = np.sqrt(np.diagonal(given.covariance, axis1=1, axis2=2))
         values = np.hstack([IN_FILES * given.values, IN_FILES * sigma]).tolist()
@@ -466,10 +473,10 @@ def compare_with_plan(
     apart = np.linalg.norm(true[:, None] - true[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     nearest = np.where(np.isfinite(away), away, np.inf).argmin(axis=1)
-    found = (away[np.arange(len(away)), nearest] < MAX_NEIGHBOUR_FRACTION * apart.min(axis=1)) & np.isfinite(
-        plan.sigma[:, 0]
-    )
-    j, k = nearest[found], np.flatnonzero(found)
+    identified = (
+        away[np.arange(len(away)), nearest] < MAX_NEIGHBOUR_FRACTION * apart.min(axis=1)
+    ) & np.isfinite(plan.sigma[:, 0])
+    j, k = nearest[identified], np.flatnonzero(identified)
     a, Q = result.adjustment, result.solution.point_covariance
     motion = fit_motions(xyz[j], true[k], open_motions(a, j))
     error = motion.apply(xyz[j]) - true[k]
@@ -478,7 +485,7 @@ def compare_with_plan(
         raise SurveyFileError("simulation: the result has no standard deviations")
     sigma = motion.scale * np.sqrt(np.trace(Q[j], axis1=1, axis2=2) / 3)
     return AchievedPrecision(
-        int(found.sum()),
+        int(identified.sum()),
         len(plan.points),
         float(np.median(sigma / predicted)),
         float((error**2).mean() / (predicted**2).mean()),
@@ -490,12 +497,14 @@ def compare_with_plan(
 
 def _mount_error(plan: PlannedSurvey, result: Solution, scale: float) -> float | None:
     """Return the mean square of the true errors of the adjusted mounts over their standard deviations."""
-    rig, found, Q = plan.stations.rig, result.estimate.mounts, result.mount_covariance
-    if rig is None or found is None or Q is None or not found.free.any():
+    rig, adjusted, Q = plan.stations.rig, result.estimate.mounts, result.mount_covariance
+    if rig is None or adjusted is None or Q is None or not adjusted.free.any():
         return None
     unit = np.repeat([scale, 1.0], 3)
-    values = [np.hstack([one.position, angles_from_rotation(one.rotation)]) for one in (found, rig)]
+    values = [
+        np.hstack([mounts.position, angles_from_rotation(mounts.rotation)]) for mounts in (adjusted, rig)
+    ]
     error = unit * values[0] - values[1]
     error[:, 3:] = (error[:, 3:] + np.pi) % (2 * np.pi) - np.pi
-    w = error[found.free] / (unit * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)))[found.free]
+    w = error[adjusted.free] / (unit * np.sqrt(np.diagonal(Q, axis1=1, axis2=2)))[adjusted.free]
     return float((w**2).mean())

@@ -108,8 +108,8 @@ def design_network(
         raise GeometryError(
             f"plan: at most {counted(max_photographs, 'photograph')}, needed {MIN_PHOTOGRAPHS} or more"
         )
-    found = candidates(planned, camera, allowed, seeing, count=count)
-    return _Designer(planned, camera, seeing, wanted, found, max_photographs, bars, given).run()
+    room = candidates(planned, camera, allowed, seeing, count=count)
+    return _Designer(planned, camera, seeing, wanted, room, max_photographs, bars, given).run()
 
 
 class _Designer:
@@ -121,17 +121,17 @@ class _Designer:
         camera: Camera,
         seeing: Seeing,
         wanted: WantedPrecision,
-        found: Candidates,
+        room: Candidates,
         most: int,
         bars: Sequence[ScaleBarPlan],
         given: Callable[[Network], Network] | None,
     ) -> None:
         self.planned, self.camera, self.seeing, self.wanted = planned, camera, seeing, wanted
-        self.found, self.most, self.bars, self.given = found, most, bars, given
-        self.rows = image_rows(planned, camera, found.stations, found.sight)
+        self.room, self.most, self.bars, self.given = room, most, bars, given
+        self.rows = image_rows(planned, camera, room.stations, room.sight)
         self.single = np.einsum("mnai,mnaj->mnij", self.rows, self.rows)
         self.prior = np.eye(3) / planned.size**2  # weight of a point that no photograph shows yet
-        self.seeable = found.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
+        self.seeable = room.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
         self.scale = np.where(self.seeable, 1 / wanted.point_variance(planned), 0.0)
         self.ratio = np.ones(len(planned.names))
 
@@ -157,7 +157,7 @@ class _Designer:
             short,
             bool(short <= 1),
             "" if short <= 1 else self._limit(prediction, len(chosen)),
-            len(self.found.stations),
+            len(self.room.stations),
         )
 
     def _cofactors(self, chosen: Sequence[int]) -> FloatArray:
@@ -166,9 +166,9 @@ class _Designer:
 
     def _available(self, chosen: Sequence[int]) -> BoolArray:
         """Return the candidates that may be taken: each station once, either upright or rolled."""
-        open_ = np.ones(len(self.found.stations), dtype=bool)
+        open_ = np.ones(len(self.room.stations), dtype=bool)
         taken = np.array(chosen, dtype=np.int64)
-        half = self.found.count
+        half = self.room.count
         open_[taken] = False
         open_[(taken + half) % (2 * half)] = False
         # if the camera is calibrated, half of the photographs are rolled
@@ -197,11 +197,11 @@ class _Designer:
             prediction = predict_network(
                 self.planned,
                 self.camera,
-                self.found.stations.of(which).renamed(),
+                self.room.stations.of(which).renamed(),
                 self.seeing,
                 bars=self.bars,
                 given=self.given,
-                sight=self.found.sight.of(which),
+                sight=self.room.sight.of(which),
             )
         except GeometryError:  # too few photographs yet
             return None, float("inf")

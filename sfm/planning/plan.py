@@ -91,8 +91,8 @@ class Plan:
     @property
     def reached(self) -> bool:
         """Whether the prediction meets all requirements, and every point is determined."""
-        whole = self.prediction.determined.all() and not self.prediction.adjustment.undetermined
-        return self.shortfall <= 1 and bool(whole)
+        determined = self.prediction.determined.all() and not self.prediction.adjustment.undetermined
+        return self.shortfall <= 1 and bool(determined)
 
 
 def plan_of(
@@ -174,9 +174,9 @@ def describe_plan(
         unusable_photographs(prediction),
         separate_groups(prediction),
         tuple(
-            found
+            calibration
             for a in range(len(prediction.cameras))
-            if (found := calibratability(prediction, seeing, a)) is not None
+            if (calibration := calibratability(prediction, seeing, a)) is not None
         ),
         contributions(prediction),
         size,
@@ -237,6 +237,14 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
     uncoded = [s.station for s in plan.shots if s.coded < MIN_CODES]
     if uncoded:
         yield remark("plan_has_few", photographs=uncoded, needed=MIN_CODES)
+    assumed = _assumptions(plan)
+    if assumed:
+        yield remark("plan_assumes", assumed=assumed)
+
+
+def _assumptions(plan: Plan) -> list[str]:
+    """Return what the plan assumes where it states nothing."""
+    p = plan.prediction
     assumed = {
         "known scale": p.adjustment.expected_defect == MOTIONS,
         "no surface": p.planned.mesh is None,
@@ -244,8 +252,7 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
         "precision of targets": plan.seeing.sigma_px is None,
         "no depth of field": plan.seeing.depth is None,
     }
-    if any(assumed.values()):
-        yield remark("plan_assumes", assumed=[name for name, is_assumed in assumed.items() if is_assumed])
+    return [name for name, is_assumed in assumed.items() if is_assumed]
 
 
 @dataclass(frozen=True)

@@ -153,9 +153,9 @@ class Prediction:
         In object unit^2; 0 for motions that are datum, as with inner constraints.
         """
         a = self.adjustment
-        some = spread_evenly(self.point[self.determined])
-        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
-        X = a.estimate.points[some]
+        sample = spread_evenly(self.point[self.determined])
+        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), sample)
+        X = a.estimate.points[sample]
         centre, size = X.mean(axis=0), float(np.ptp(X, axis=0).max())
         to_motions = np.linalg.pinv(similarity_motions(X, centre=centre, size=size).reshape(-1, 7))
         C = to_motions @ Q @ to_motions.T
@@ -168,9 +168,9 @@ class Prediction:
     def length_sigma(self) -> float:
         """Largest sigma of a length between two of at most MAX_JOINT determined points, object unit."""
         a = self.adjustment
-        some = spread_evenly(self.point[self.determined])
-        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), some)
-        return largest_length_sigma(a.estimate.points[some], Q)
+        sample = spread_evenly(self.point[self.determined])
+        Q = marginal_of(a).joint(np.zeros(0, dtype=np.int64), sample)
+        return largest_length_sigma(a.estimate.points[sample], Q)
 
 
 @checked_arguments()
@@ -245,14 +245,14 @@ def predict_network(
         _refuse_contradictions(network, estimate)
     photograph = np.full(len(stations), -1, dtype=np.int64)
     photograph[photographs] = np.arange(len(photographs))
-    found = Prediction(planned, stations, sight, predict(network, estimate), place, photograph)
-    if not found.determined.any():
+    prediction = Prediction(planned, stations, sight, predict(network, estimate), place, photograph)
+    if not prediction.determined.any():
         raise GeometryError(
             f"plan: {counted(len(photographs), 'photograph')} determine none of the points, needed "
             "stations in different"
             f" places, there are {stations.of(photographs).places}"
         )
-    return found
+    return prediction
 
 
 def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
@@ -331,7 +331,7 @@ def largest_length_sigma(xyz: FloatArray, covariance: FloatArray) -> float:
 
 
 def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBarPlan]) -> ScaleBars:
-    found: list[tuple[int, int, float, float]] = []
+    planned_bars: list[tuple[int, int, float, float]] = []
     for bar in bars:
         i, j = (index_of(planned.names, name, "point of a scale bar") for name in (bar.start, bar.end))
         if i == j or not (np.isfinite(bar.sigma) and bar.sigma > 0):
@@ -341,10 +341,10 @@ def _scale_bars(planned: PlannedObject, place: IntArray, bars: Sequence[ScaleBar
             )
         if place[i] >= 0 and place[j] >= 0:
             length = float(np.linalg.norm(planned.xyz[i] - planned.xyz[j]))
-            found.append((int(place[i]), int(place[j]), length, bar.sigma))
-    if not found:
+            planned_bars.append((int(place[i]), int(place[j]), length, bar.sigma))
+    if not planned_bars:
         return ScaleBars()
-    rows = np.array(found)
+    rows = np.array(planned_bars)
     return ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
 
 

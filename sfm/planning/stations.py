@@ -272,7 +272,7 @@ def shots(
         coded: indices of the coded targets, see `choose_coded`.
         focus: focus distance, object unit; None = equally sharp at the nearest and the farthest point.
     """
-    found = []
+    photographs = []
     if focus is None:
         depth = np.concatenate(
             [(stations.position[i] - xyz[seen[i]]) @ stations.rotation[i, :, 2] for i in range(len(stations))]
@@ -282,7 +282,7 @@ def shots(
         R, X0 = stations.rotation[i], stations.position[i]
         axis = -R[:, 2]
         depth = (xyz[seen[i]] - X0) @ axis
-        found.append(
+        photographs.append(
             Shot(
                 name,
                 X0,
@@ -295,7 +295,7 @@ def shots(
                 int(seen[i, coded].sum()),
             )
         )
-    return tuple(found)
+    return tuple(photographs)
 
 
 def roll_deg(rotation: FloatArray) -> float:

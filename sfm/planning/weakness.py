@@ -159,8 +159,8 @@ def separate_groups(prediction: Prediction) -> tuple[tuple[str, ...], ...]:
         if count == len(of_group):
             break
     groups = [np.flatnonzero(group == k) for k in range(count)]
-    groups.sort(key=lambda one: (-len(one), int(one[0])))
-    return tuple(tuple(network.images[k] for k in one) for one in groups)
+    groups.sort(key=lambda members: (-len(members), int(members[0])))
+    return tuple(tuple(network.images[k] for k in members) for members in groups)
 
 
 @checked_arguments()
@@ -203,7 +203,7 @@ def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 
             np.max((np.nanmax(depth, axis=1) - np.nanmin(depth, axis=1)) / np.nanmean(depth, axis=1))
         ),
         correlations=tuple(pair for pair in correlations(a) if pair.first in rows),
-        with_exterior=tuple(one for one in orientation_correlations(a) if one.parameter in rows),
+        with_exterior=tuple(pair for pair in orientation_correlations(a) if pair.parameter in rows),
         undetermined=tuple(a.undetermined),
     )
 
@@ -231,8 +231,8 @@ def _angle_sigma_px(camera: Camera, covariance: FloatArray, xy: FloatArray) -> f
     A small shift of the principal point cannot be distinguished from a rotation of the camera, and need not
     be. Therefore the effect of a rotation is removed.
     """
-    some = xy[:: 1 + len(xy) // MAX_PLACES]
-    Q = projection_covariance(camera, covariance, some, some)
+    places = xy[:: 1 + len(xy) // MAX_PLACES]
+    Q = projection_covariance(camera, covariance, places, places)
     return float(np.sqrt(np.nanmean(np.einsum("kii->ki", Q))))
 
 
@@ -260,14 +260,14 @@ class Contribution:
 def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
     """Return the contributions of the rig and of each kind of observation to a plan."""
     a = prediction.adjustment
-    found = []
+    parts = []
     if a.estimate.mounts is not None and a.network.moment is not None:
         moments = len(np.unique(a.network.moment))
-        found.append(_contribution_of(a, RIG, moments, *_without_rig(a.network, a.estimate)))
+        parts.append(_contribution_of(a, RIG, moments, *_without_rig(a.network, a.estimate)))
     for name in dict.fromkeys(kind.name for kind in a.network.kinds if len(kind)):
         count = sum(len(kind) for kind in a.network.kinds if kind.name == name)
-        found.append(_contribution_of(a, name, count, *_without(a.network, a.estimate, name)))
-    return tuple(found)
+        parts.append(_contribution_of(a, name, count, *_without(a.network, a.estimate, name)))
+    return tuple(parts)
 
 
 def _contribution_of(
@@ -282,16 +282,16 @@ def _contribution_of(
     left = np.zeros(0, dtype=bool) if less is None else _determined(less)
     names = () if less is None else less.network.points
     place = {point: j for j, point in enumerate(names) if left[j]}
-    both = [(j, place[point]) for j, point in enumerate(a.network.points) if known[j] and point in place]
-    if less is None or len(both) < MIN_SHAPE:
+    common = [(j, place[point]) for j, point in enumerate(a.network.points) if known[j] and point in place]
+    if less is None or len(common) < MIN_SHAPE:
         every = spread_evenly(np.flatnonzero(known))
         sigma = sigma_beside(a, every, open_motions(a, every))
         return Contribution(name, count, 0, 0, False, int(known.sum()), np.inf, sigma)
-    whole, part = spread_evenly(np.array(both, dtype=np.int64)).T
+    in_all, part = spread_evenly(np.array(common, dtype=np.int64)).T
     motions = open_motions(less, part)
-    before, after = sigma_beside(less, part, motions), sigma_beside(a, whole, motions)
-    shifts, rotations, scale = open_counts(less, part) - open_counts(a, whole)
-    points = int(known.sum()) - len(both)
+    before, after = sigma_beside(less, part, motions), sigma_beside(a, in_all, motions)
+    shifts, rotations, scale = open_counts(less, part) - open_counts(a, in_all)
+    points = int(known.sum()) - len(common)
     return Contribution(name, count, int(shifts), int(rotations), bool(scale), points, before, after)
 
 
@@ -299,7 +299,9 @@ def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, 
     """Return a network without the observations of a kind."""
     mounts = estimate.mounts
     if name == MountObservations.name and mounts is not None:
-        given = [a for one in network.observations if isinstance(one, MountObservations) for a in one.camera]
+        given = [
+            a for kind in network.observations if isinstance(kind, MountObservations) for a in kind.camera
+        ]
         free = mounts.free.copy()
         free[given] = True
         estimate = replace(estimate, mounts=replace(mounts, free=free))

@@ -62,26 +62,26 @@ def measure(
     asked, paths = (None, {}) if features is None else read_features_file(features, allow_outside=outside)
     with working_on(str(source)):
         result = read_comparable(source, from_format)
-        found = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
-    page = write_page(found, out, also=partial(_write_drawings, found), result=result)
-    print_verdict(found.verdict)
-    print(describe_measured(found))
-    for fit in found.shapes:
+        measurement = measure_result(result, asked, paths=paths, read_mesh=read_mesh)
+    page = write_page(measurement, out, also=partial(_write_drawings, measurement), result=result)
+    print_verdict(measurement.verdict)
+    print(describe_measured(measurement))
+    for fit in measurement.shapes:
         said = [
             f"{name} {' +- '.join(with_sigma(value, sigma))} {unit}"
-            for name, axis, value, sigma, unit in parameter_rows(fit, found.unit)
+            for name, axis, value, sigma, unit in parameter_rows(fit, measurement.unit)
             if not axis
         ]
         what = f"{fit.shape.kind.name} {fit.name}: {', '.join((*said, ''))}"
-        print(f"{what}form error {fit.form_error:.3g} {found.unit}, {counted(fit.used.sum(), 'point')}")
-    rows = quantity_table(found).rows
+        print(f"{what}form error {fit.form_error:.3g} {measurement.unit}, {counted(fit.used.sum(), 'point')}")
+    rows = quantity_table(measurement).rows
     for name, what, _, _, value, sigma, unit, remark in rows[:MAX_PRINTED]:
         line = f"{name} ({what}): {value} +- {sigma} {unit}"
         print(f"{line}{f'; {remark}' if remark else ''}")
     if len(rows) > MAX_PRINTED:
         print(f"and {len(rows) - MAX_PRINTED} more in {page.with_name('quantities.csv')}")
     print(f"Report: {page}")
-    exit_by(found.verdict)
+    exit_by(measurement.verdict)
 
 
 def accept(
@@ -133,7 +133,7 @@ def accept(
     with working_on(str(source)):
         result = read_result(source)
         bars, control = read_scale_sources(source)
-    found = accept_result(
+    acceptance = accept_result(
         result,
         read_lengths(lengths),
         a=a,
@@ -144,14 +144,14 @@ def accept(
         coverage=coverage,
         diagonal=diagonal,
     )
-    page = write_page(found, out)
-    print_verdict(found.verdict)
-    print(f"largest error of a length: {found.largest:.4g} {found.unit}")
+    page = write_page(acceptance, out)
+    print_verdict(acceptance.verdict)
+    print(f"largest error of a length: {acceptance.largest:.4g} {acceptance.unit}")
     print(f"Report: {page}")
-    exit_by(found.verdict)
+    exit_by(acceptance.verdict)
 
 
-def _write_drawings(found: Measurement, folder: Path) -> None:
+def _write_drawings(measurement: Measurement, folder: Path) -> None:
     """Write the files of a measurement for other programs: covariance, point cloud and drawing."""
     import numpy as np
 
@@ -159,11 +159,11 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
     from sfm.files.csv_tables import write_ply
     from sfm.report.measurement import point_sigma, write_point_covariance
 
-    points = found.points
-    sigma = point_sigma(found)
-    layers = [found.group_of(j) or "points" for j in range(len(points.names))]
+    points = measurement.points
+    sigma = point_sigma(measurement)
+    layers = [measurement.group_of(j) or "points" for j in range(len(points.names))]
     lines, circles, texts = [], [], []
-    for fit in found.shapes:
+    for fit in measurement.shapes:
         shape = fit.shape
         texts.append((fit.name, f"{shape.kind.name} {fit.name}", shape.origin))
         if shape.kind.name in ("line", "cylinder", "cone", "paraboloid"):
@@ -172,7 +172,7 @@ def _write_drawings(found: Measurement, folder: Path) -> None:
             lines.append(DxfLine(fit.name, *ends))
         if shape.kind.name in ("circle", "cylinder", "torus"):
             circles.append(DxfCircle(fit.name, shape.origin, shape.axis, float(shape.form[0])))
-    write_point_covariance(found, folder)
+    write_point_covariance(measurement, folder)
     known = sigma if np.isfinite(sigma).all() else None
     write_ply(folder / "points.ply", points.xyz, names=points.names, sigma=known)
     write_dxf(folder / "measurement.dxf", names=points.names, xyz=points.xyz, layers=layers, lines=lines,
@@ -242,9 +242,11 @@ def view(
         paths = photographs_in(images, scene.photographs)
     elif (source / PICTURES).is_dir() and (source / PICTURES).resolve().is_relative_to(source.resolve()):
         names = overlay_names(scene.photographs)
-        found = photographs_in(source / PICTURES, names)
+        pictures = photographs_in(source / PICTURES, names)
         paths = {
-            image: found[name] for image, name in zip(scene.photographs, names, strict=True) if name in found
+            image: pictures[name]
+            for image, name in zip(scene.photographs, names, strict=True)
+            if name in pictures
         }
     else:
         paths = {}

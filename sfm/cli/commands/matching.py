@@ -81,7 +81,7 @@ def match_command(
         names, xy, start = ("1",), _parse_point(str(point)), None
     left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
     with whole_outputs(out, picture) as (table_file, picture_part):
-        found = match_points(
+        matches = match_points(
             left,
             right,
             xy,
@@ -92,15 +92,15 @@ def match_command(
         )
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:
-            drawing = draw_patches(names, left, right, found, template_px)
+            drawing = draw_patches(names, left, right, matches, template_px)
             picture_part.write_bytes(picture_file(drawing))
         if table_file is not None:
-            text = matches_json(names, found) if as_json else matches_table(names, found).csv
+            text = matches_json(names, matches) if as_json else matches_table(names, matches).csv
             table_file.write_bytes(text.encode())
-    matched = int(found.good.sum())
+    matched = int(matches.good.sum())
     if out is not None:
-        return f"{matched} of {len(found)} points matched: {out}\n", matched > 0
-    return matches_json(names, found) if as_json else matches_table(names, found).text, matched > 0
+        return f"{matched} of {len(matches)} points matched: {out}\n", matched > 0
+    return matches_json(names, matches) if as_json else matches_table(names, matches).text, matched > 0
 
 
 def read_points_to_match(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:

@@ -183,13 +183,13 @@ def resect(
         task, opposite = reversed(tasks) if opposite_signs else tasks
         warning = "" if camera is None else signs_warning(task, opposite)
     if method == "all":
-        found = resect_by_all(task)
-        text = comparison_table(found, task.c) + (f"\nwarning: {warning}" if warning else "")
-        values: object = comparison_json(found, task.c)
+        results = resect_by_all(task)
+        text = comparison_table(results, task.c) + (f"\nwarning: {warning}" if warning else "")
+        values: object = comparison_json(results, task.c)
     else:
-        one = resect_by(task, method)
-        one = replace(one, warning="; ".join(filter(None, (one.warning, warning))))
-        text, values = resection_text(one, task.c), resection_json(one, task.c)
+        result = resect_by(task, method)
+        result = replace(result, warning="; ".join(filter(None, (result.warning, warning))))
+        text, values = resection_text(result, task.c), resection_json(result, task.c)
     print(json.dumps(values, indent=2, allow_nan=False) if as_json else text)
 
 

@@ -289,7 +289,7 @@ def network_command(
         )
     if (camera is None) == (survey is None):
         raise SurveyFileError("plan: expected either --camera or --survey")
-    if survey is not None and any(one is not None for one in (c, camera_name, free)):
+    if survey is not None and any(option is not None for option in (c, camera_name, free)):
         raise SurveyFileError(f"--survey {survey}: --c-mm, --camera-name and --free belong to --camera")
     to_mm = METRES[unit] * 1000
     with working_on(planned), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
@@ -298,8 +298,8 @@ def network_command(
             taken = survey_plan(survey, object_, unit, free_mounts=free_mounts)
         else:
             taken = PlannedSetup((camera_of(str(camera), camera_name, c, free),))
-        one = taken.reference
-        depth = _depth_of_field(one, f_number, focus, confusion, to_mm)
+        reference = taken.reference
+        depth = _depth_of_field(reference, f_number, focus, confusion, to_mm)
         seeing = Seeing(
             max_incidence_deg=incidence,
             diameter=diameter,
@@ -310,8 +310,8 @@ def network_command(
         bars = (*taken.bars, *bars_of(scale_bar))
         name = Path(planned).stem if ":" not in planned else planned
         if stations is not None:
-            placed = taken.photographs(stations_of(stations, object_, one))
-            found = plan_of(
+            placed = taken.photographs(stations_of(stations, object_, reference))
+            network_plan = plan_of(
                 name,
                 unit,
                 object_,
@@ -331,7 +331,7 @@ def network_command(
             )
             design = design_network(
                 object_,
-                one,
+                reference,
                 allowed,
                 seeing,
                 wanted,
@@ -339,16 +339,18 @@ def network_command(
                 bars=bars,
                 given=taken.given,
             )
-            found = describe_plan(name, unit, design.prediction, seeing, wanted, design.shortfall, design)
-    page = write_page(found, out)
-    verdict = verdict_of_plan(found)
+            network_plan = describe_plan(
+                name, unit, design.prediction, seeing, wanted, design.shortfall, design
+            )
+    page = write_page(network_plan, out)
+    verdict = verdict_of_plan(network_plan)
     print_verdict(verdict)
-    for what, value in figures(found):
+    for what, value in figures(network_plan):
         print(f"  {what}: {value}")
-    for weak in found.weak[:MAX_WEAK]:
+    for weak in network_plan.weak[:MAX_WEAK]:
         print(f"  weak: point {weak.name}: {weak.reason}")
-    if len(found.weak) > MAX_WEAK:
-        print(f"  ... and {len(found.weak) - MAX_WEAK} more weak points, listed in the page")
+    if len(network_plan.weak) > MAX_WEAK:
+        print(f"  ... and {len(network_plan.weak) - MAX_WEAK} more weak points, listed in the page")
     print(f"Report: {page}")
     exit_by(verdict)
 
@@ -365,8 +367,8 @@ def _depth_of_field(
         return None
     pixel = float(camera.pixel_mm.mean())
     confusion = 2 * pixel if confusion_um is None else confusion_um / 1000
-    found = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
-    return DepthOfField(found.near / to_mm, found.far / to_mm, focus)
+    in_mm = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
+    return DepthOfField(in_mm.near / to_mm, in_mm.far / to_mm, focus)
 
 
 def _pair(values: tuple[float, ...]) -> tuple[float, float]:
@@ -413,15 +415,17 @@ def simulate_command(
                 result = run_survey(survey, compare_with="none", progress=True)
                 result.write(part / "result")
                 (part / ".result.lock").unlink(missing_ok=True)
-                found = compare_with_plan(planned, family, result, seed=seed)
-                text = json.dumps(asdict(found), indent=2, allow_nan=False)
+                achieved = compare_with_plan(planned, family, result, seed=seed)
+                text = json.dumps(asdict(achieved), indent=2, allow_nan=False)
                 (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
-    print(f"{found.points} of {found.planned} planned points measured")
-    print(f"sigma of points: {found.ratio:.3f} times the predicted (median)")
-    print(f"true errors: {found.error_ratio_squared**0.5:.3f} times the predicted, RMS")
-    print(f"sigma of an image coordinate: {found.sigma_px:.4f} px, predicted {found.predicted_px:.4f} px")
-    if found.mount_ratio_squared is not None:
-        rms = found.mount_ratio_squared**0.5
+    print(f"{achieved.points} of {achieved.planned} planned points measured")
+    print(f"sigma of points: {achieved.ratio:.3f} times the predicted (median)")
+    print(f"true errors: {achieved.error_ratio_squared**0.5:.3f} times the predicted, RMS")
+    print(
+        f"sigma of an image coordinate: {achieved.sigma_px:.4f} px, predicted {achieved.predicted_px:.4f} px"
+    )
+    if achieved.mount_ratio_squared is not None:
+        rms = achieved.mount_ratio_squared**0.5
         print(f"true errors of mounts: {rms:.3f} times their standard deviations, RMS")
     print(f"Report: {out / 'result' / 'report.html'}")
 
@@ -474,10 +478,10 @@ def more_command(
             image_points=replace(seen, covariance=seen.covariance * (sigma / stated) ** 2),
             scale_bars=given.bars,
         )
-        found = further_photographs(
+        further = further_photographs(
             network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
         )
-    page = page_of(found, result=stored)
+    page = page_of(further, result=stored)
     path = write_declared(page, out)
     print_verdict(page.verdict)
     print(page.text)

@@ -109,13 +109,13 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
         camera = camera.with_parameters(parameters)
     if free is None:
         return camera
-    wanted = [] if free.strip() in ("", "none") else [one.strip() for one in free.split(",")]
-    unknown = [one for one in wanted if one not in camera.names]
+    wanted = [] if free.strip() in ("", "none") else [parameter.strip() for parameter in free.split(",")]
+    unknown = [parameter for parameter in wanted if parameter not in camera.names]
     if unknown:
         raise SurveyFileError(
             f"--free {unknown[0]:.40}: camera {camera.name} ({camera.model}) has {', '.join(camera.names)}"
         )
-    return replace(camera, free=np.array([one in wanted for one in camera.names]))
+    return replace(camera, free=np.array([parameter in wanted for parameter in camera.names]))
 
 
 def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
@@ -148,13 +148,13 @@ def bars_of(texts: list[str] | None) -> tuple[ScaleBarPlan, ...]:
     """Return the scale bars of texts FROM,TO,SIGMA."""
     from sfm.planning.prediction import ScaleBarPlan
 
-    found = []
+    bars = []
     for text in texts or ():
         parts = [part.strip() for part in text.split(",")]
         if len(parts) != 3:
             raise SurveyFileError(f"--scale-bar {text:.60}: expected FROM,TO,SIGMA")
-        found.append(ScaleBarPlan(parts[0], parts[1], parse_numbers("--scale-bar", parts[2], 1)[0]))
-    return tuple(found)
+        bars.append(ScaleBarPlan(parts[0], parts[1], parse_numbers("--scale-bar", parts[2], 1)[0]))
+    return tuple(bars)
 
 
 def parse_numbers(what: str, text: str, count: int | None = None) -> tuple[float, ...]:
@@ -169,13 +169,13 @@ def parse_numbers(what: str, text: str, count: int | None = None) -> tuple[float
         SurveyFileError: there are more or fewer numbers than expected, or a value is not a finite number.
     """
     try:
-        found = tuple(float(part) for part in text.split(","))
+        numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
-        found = ()
-    if not found or not all(map(math.isfinite, found)) or (count is not None and len(found) != count):
+        numbers = ()
+    if not numbers or not all(map(math.isfinite, numbers)) or (count is not None and len(numbers) != count):
         wanted = "numbers" if count is None else counted(count, "number")
         raise SurveyFileError(f"{what} {text:.60}: expected {wanted} separated by commas")
-    return found
+    return numbers
 
 
 def _choose_camera(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera:
@@ -185,39 +185,45 @@ def _choose_camera(where: str, cameras: tuple[Camera, ...], name: str | None) ->
             f"{where}: has {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
             "--camera-name"
         )
-    found = [camera for camera in cameras if name in (None, camera.name)]
-    if not found:
+    named = [camera for camera in cameras if name in (None, camera.name)]
+    if not named:
         raise SurveyFileError(f"--camera-name {name}: {where} has {', '.join(names)[:80]}")
-    return found[0]
+    return named[0]
 
 
 def _camera_of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:
     from sfm.survey.inputs.survey import read_survey
 
     setups = read_survey(path).cameras
-    found = [one for one in setups if name in (None, one.name)]
-    if len(found) != 1:
-        names = ", ".join(one.name for one in setups)
+    named = [camera for camera in setups if name in (None, camera.name)]
+    if len(named) != 1:
+        names = ", ".join(camera.name for camera in setups)
         raise SurveyFileError(f"{path}: has cameras {names:.80}, choose one with --camera-name")
-    return _camera_of_settings(path, found[0], c_mm)
+    return _camera_of_settings(path, named[0], c_mm)
 
 
-def _camera_of_settings(path: Path, one: CameraSettings, c_mm: float | None = None) -> Camera:
+def _camera_of_settings(path: Path, settings: CameraSettings, c_mm: float | None = None) -> Camera:
     from sfm.camera import camera_from_values
 
-    c = c_mm if c_mm is not None else one.c_mm
+    c = c_mm if c_mm is not None else settings.c_mm
     if c is None:
-        raise SurveyFileError(f"{path}: camera {one.name} has no focal length, expected c_mm or --c-mm")
-    pixel = one.pixel_mm
-    if pixel is None and one.sensor_mm is not None and one.size_px is not None:
-        pixel = (one.sensor_mm[0] / one.size_px[0], one.sensor_mm[1] / one.size_px[1])
-    if one.size_px is None or pixel is None:
+        raise SurveyFileError(f"{path}: camera {settings.name} has no focal length, expected c_mm or --c-mm")
+    pixel = settings.pixel_mm
+    if pixel is None and settings.sensor_mm is not None and settings.size_px is not None:
+        pixel = (settings.sensor_mm[0] / settings.size_px[0], settings.sensor_mm[1] / settings.size_px[1])
+    if settings.size_px is None or pixel is None:
         raise SurveyFileError(
-            f"{path}: camera {one.name} needs size_px and pixel_mm, as a plan has no photographs that "
+            f"{path}: camera {settings.name} needs size_px and pixel_mm, as a plan has no photographs that "
             "state them"
         )
     return camera_from_values(
-        one.name, one.model, one.size_px, pixel, c_mm=c, free=one.may_be_free, values=(*one.fixed, *one.start)
+        settings.name,
+        settings.model,
+        settings.size_px,
+        pixel,
+        c_mm=c,
+        free=settings.may_be_free,
+        values=(*settings.fixed, *settings.start),
     )
 
 
@@ -293,7 +299,7 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     survey = read_survey(path)
     if survey.unit != unit:
         raise SurveyFileError(f"{path}: has unit '{survey.unit}', but the plan has '{unit}'; see --unit")
-    cameras = tuple(_camera_of_settings(path, one) for one in survey.cameras)
+    cameras = tuple(_camera_of_settings(path, camera) for camera in survey.cameras)
     rig = None if len(cameras) == 1 and not survey.rigs else planned_mounts(survey)
     if rig is not None and free_mounts:
         rig = replace(rig, free=np.tile(~rig.at_reference[:, None], (1, 6)))

@@ -57,18 +57,18 @@ def compare(
     if first.name == second.name:
         first, second = replace(first, name=str(a)), replace(second, name=str(b))
     names = tuple(name.strip() for name in control.split(",") if name.strip())
-    found = compare_results(first, second, align=align, control=names)
+    comparison = compare_results(first, second, align=align, control=names)
     place = {name: j for j, name in enumerate(first.network.points)}
-    xyz = first.estimate.points[[place[name] for name in found.points]]
-    page = write_page(found, out, xyz=xyz)
+    xyz = first.estimate.points[[place[name] for name in comparison.points]]
+    page = write_page(comparison, out, xyz=xyz)
     print(
-        f"{describe_pairing(found)}, {counted(len(found.images), 'common photograph')}; "
-        f"{describe_scale(found)}"
+        f"{describe_pairing(comparison)}, {counted(len(comparison.images), 'common photograph')}; "
+        f"{describe_scale(comparison)}"
     )
-    verdict = verdict_of_comparison(found)
+    verdict = verdict_of_comparison(comparison)
     print_verdict(verdict)
-    if found.points:
-        print(f"largest difference of a point: {largest_difference(found)}")
+    if comparison.points:
+        print(f"largest difference of a point: {largest_difference(comparison)}")
     print(f"Report: {page}")
     exit_by(verdict)
 
@@ -126,7 +126,7 @@ def convert(
     if to_format is None and ending and ending not in ENDINGS:
         raise SurveyFileError(
             f"{target}: unknown ending {ending}, expected {', '.join(ENDINGS)}, a folder for tables, or --to "
-            f"with one of {', '.join(one.name for one in FORMATS)}"
+            f"with one of {', '.join(known.name for known in FORMATS)}"
         )
     form = format_named(to_format or ENDINGS.get(ending, "tables"))
     refuse_taken(target, form)
@@ -142,13 +142,13 @@ def convert(
     changed, gone = with_cameras(content, network, estimate)
     changed = replace(changed, result=replace(changed.result, name=target.name))
     write_content(target, form.name, changed)
-    for camera, one in zip(cameras, conversions, strict=False):
+    for camera, conversion in zip(cameras, conversions, strict=False):
         if straighten:
             print(f"camera {camera.name}: image points corrected for {camera.model}, ideal camera written")
-        elif one.camera is not camera:
+        elif conversion.camera is not camera:
             print(
-                f"camera {camera.name}: {one.source_model} to {one.camera.model}, "
-                f"misfit {one.rms_px:.4f} px RMS, {one.max_px:.4f} px at most"
+                f"camera {camera.name}: {conversion.source_model} to {conversion.camera.model}, "
+                f"misfit {conversion.rms_px:.4f} px RMS, {conversion.max_px:.4f} px at most"
             )
     for note in content.notes:
         print(f"{source}: {note}")
@@ -228,13 +228,13 @@ def epochs(
             raise SurveyFileError(f"--group {name} is given twice")
         groups[name] = _split_names(points)
     for k, path in enumerate(results):
-        if path.resolve() in [one.resolve() for one in results[:k]]:
+        if path.resolve() in [earlier.resolve() for earlier in results[:k]]:
             raise SurveyFileError(f"epochs: {path} is given twice")
     given = [_read_epoch(path) for path in results]
     if len({epoch.name for epoch in given}) < len(given):  # folders of the same name in different folders
         given = [replace(epoch, name=str(path)) for epoch, path in zip(given, results, strict=True)]
     with working_on(" ".join(map(str, results))):
-        found = analyse_epochs(
+        series = analyse_epochs(
             given,
             reference=_split_names(reference),
             groups=groups,
@@ -242,10 +242,10 @@ def epochs(
             alpha=FALSE_ALARM if alpha is None else alpha,
             together=together,
         )
-    page = write_page(found, out)
-    verdict = verdict_of_epochs(found)
+    page = write_page(series, out)
+    verdict = verdict_of_epochs(series)
     print_verdict(verdict)
-    for pair in found.pairs:
+    for pair in series.pairs:
         print(" to ".join(pair.displacements.differences.names))
         print(f"  {describe_stable(pair.displacements)}")
         for block in pair.blocks:
@@ -365,7 +365,7 @@ def refine(
         if given is not None:
             targets = measure_model_targets(given, opened.network, opened.estimate, images, progress=progress)
             opened, targets = place_model(opened, targets.placement), targets.placed()
-        found = refine_model(
+        refinement = refine_model(
             opened.network,
             opened.estimate,
             images,
@@ -379,25 +379,25 @@ def refine(
             targets=targets,
             progress=progress,
         )
-    a = found.adjustment
-    interior = interior_rows(opened, found.start, found.estimate, a.covariance.interior)
+    a = refinement.adjustment
+    interior = interior_rows(opened, refinement.start, refinement.estimate, a.covariance.interior)
     update_model(
         opened,
-        found.estimate,
-        xy=found.xy,
-        measured=found.accepted,
-        images=found.images,
-        points=found.points_anew,
+        refinement.estimate,
+        xy=refinement.xy,
+        measured=refinement.accepted,
+        images=refinement.images,
+        points=refinement.points_anew,
     )
     numbers = Numbers(opened.image_ids, opened.point_ids, interior, *key_points_of(opened))
-    print(refinement_text(found), end="")
-    page = page_of(found, numbers=numbers, title=model.resolve().name)
+    print(refinement_text(refinement), end="")
+    page = page_of(refinement, numbers=numbers, title=model.resolve().name)
     with whole_folder(out) as folder:
         write_scene(folder, opened.scene)
         for name, text in texts_of(page).items():
             (folder / name).write_text(text, encoding="utf-8")
-    print(describe_key_points(found, numbers))
+    print(describe_key_points(refinement, numbers))
     print(f"Model: {out}")
     print(f"Report: {out / 'refinement.html'}")
-    if not found.dependable:
+    if not refinement.dependable:
         raise SystemExit(FAILED)

@@ -185,14 +185,14 @@ def _check_targets() -> str:
     from sfm.targets.detect import find_targets
     from sfm.warm_up import DOTS, drawn_photograph
 
-    found = find_targets(drawn_photograph(False), polarity="dark", codes="ring14")
-    if len(found) != len(DOTS):
-        raise KolinearError(f"{len(found)} of {len(DOTS)} dots found")
+    dots = find_targets(drawn_photograph(False), polarity="dark", codes="ring14")
+    if len(dots) != len(DOTS):
+        raise KolinearError(f"{len(dots)} of {len(DOTS)} dots found")
     centres = np.array(DOTS)
-    error = np.linalg.norm(found.xy[:, None] - centres, axis=2).min(axis=1).max()
+    error = np.linalg.norm(dots.xy[:, None] - centres, axis=2).min(axis=1).max()
     if error > CENTRE_PX:
         raise KolinearError(f"a dot is {error:.3f} px off, expected {CENTRE_PX} px at most")
-    return f"{counted(len(found), 'dot')} measured, {error:.4f} px off at most"
+    return f"{counted(len(dots), 'dot')} measured, {error:.4f} px off at most"
 
 
 @cache
@@ -212,11 +212,11 @@ def _check_adjustment() -> str:
 
     from sfm.remarks.remark import WRONG_SIGMAS
 
-    found, truth = _tested_network()
-    if not found.converged:
+    adjusted, truth = _tested_network()
+    if not adjusted.converged:
         raise KolinearError("the adjustment did not converge")
-    moved = np.linalg.norm(found.estimate.points - truth.points, axis=1)
-    sigma = np.sqrt(np.trace(found.covariance.points, axis1=1, axis2=2))
+    moved = np.linalg.norm(adjusted.estimate.points - truth.points, axis=1)
+    sigma = np.sqrt(np.trace(adjusted.covariance.points, axis1=1, axis2=2))
     worst = float((moved / sigma).max())
     if worst > WRONG_SIGMAS:
         raise KolinearError(f"a point is {worst:.1f} standard deviations off")

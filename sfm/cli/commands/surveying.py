@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -150,11 +150,10 @@ def run(
             pitch = None
     if survey_file.is_file():
         refuse_pitch(pitch, survey_file)
-    _run_survey(
-        survey_file,
-        images,
-        out,
-        jobs,
+    options = _RunOptions(
+        images=images,
+        out=out,
+        jobs=jobs,
         allow_outside=allow_outside,
         verbose=verbose,
         from_photographs=True,
@@ -163,6 +162,7 @@ def run(
         overwrite=overwrite,
         pictures_mb=pictures_mb,
     )
+    _run_survey(survey_file, options)
 
 
 def adjust(
@@ -181,8 +181,7 @@ def adjust(
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
     reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
     """
-    _run_survey(
-        survey_file,
+    options = _RunOptions(
         out=out,
         allow_outside=allow_outside,
         verbose=verbose,
@@ -191,6 +190,7 @@ def adjust(
         weighted=camera_weighted,
         overwrite=overwrite,
     )
+    _run_survey(survey_file, options)
 
 
 def run_file(survey_file: Path) -> Path:
@@ -199,27 +199,27 @@ def run_file(survey_file: Path) -> Path:
     Args:
         survey_file: the survey file.
     """
-    return _run_survey(survey_file, pictures_mb=15.0)
+    return _run_survey(survey_file, _RunOptions(pictures_mb=15.0))
 
 
-def _run_survey(
-    survey_file: Path,
-    images: Path | None = None,
-    out: Path | None = None,
-    jobs: int | None = None,
-    *,
-    allow_outside: bool = False,
-    verbose: bool = False,
-    from_photographs: bool | None = None,
-    camera: Path | None = None,
-    weighted: bool = False,
-    overwrite: bool = False,
-    pictures_mb: float = 0.0,
-) -> Path:
-    """Run a survey, write and print its result, and return the result folder.
+@dataclass(frozen=True)
+class _RunOptions:
+    """How a survey is run, and where its result is written."""
 
-    `from_photographs` is False for surveys with [observations]; if None, the survey file decides.
-    """
+    images: Path | None = None  # folder of the photographs; None: that of the survey file
+    out: Path | None = None  # folder of the result; None: out/NAME
+    jobs: int | None = None  # photographs at a time; None: one per core
+    allow_outside: bool = False  # whether the survey file may name files outside its folder
+    verbose: bool = False  # whether more is printed
+    from_photographs: bool | None = None  # False for surveys with [observations]; None: the file decides
+    camera: Path | None = None  # result with the interior orientation to use; None: that of the survey file
+    weighted: bool = False  # whether that orientation is observed, not fixed
+    overwrite: bool = False  # whether a result of other photographs is replaced
+    pictures_mb: float = 0.0  # largest size of the pictures in the report, 10^6 bytes
+
+
+def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
+    """Run a survey, write and print its result, and return the result folder."""
     begun = time.perf_counter()
     with loading():
         from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
@@ -252,7 +252,8 @@ def _run_survey(
     if survey_file.suffix.lower() in SUFFIXES:
         raise KolinearError(f"{survey_file}: is a photograph, not a survey file; give its folder")
     with working_on(str(survey_file)):
-        described = read_survey_file(survey_file, allow_outside=allow_outside)
+        described = read_survey_file(survey_file, allow_outside=options.allow_outside)
+    from_photographs = options.from_photographs
     if from_photographs is None:
         from_photographs = reads_photographs(described)
     if from_photographs and not reads_photographs(described):
@@ -266,26 +267,26 @@ def _run_survey(
         )
     with working_on(str(survey_file)):
         survey = survey_of_file(described)
-    if camera is not None:
-        with working_on(str(camera)):
-            if (camera / "cameras.csv").is_file():
-                calibrations = read_calibrations(camera)
+    if options.camera is not None:
+        with working_on(str(options.camera)):
+            if (options.camera / "cameras.csv").is_file():
+                calibrations = read_calibrations(options.camera)
             else:
-                cameras = read_result(camera).estimate.cameras
-                calibrations = tuple(Calibration.of_camera(one) for one in cameras)
-            survey = with_calibration(survey, calibrations, str(camera), weighted=weighted)
-    elif weighted:
+                cameras = read_result(options.camera).estimate.cameras
+                calibrations = tuple(Calibration.of_camera(calibrated) for calibrated in cameras)
+            survey = with_calibration(survey, calibrations, str(options.camera), weighted=options.weighted)
+    elif options.weighted:
         raise KolinearError("--camera-weighted: expected --camera RESULT")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
-    folder = _result_folder(survey, out)
-    origin = Origin(survey_file, images or survey_file.parent)
-    if not overwrite:
+    folder = _result_folder(survey, options.out)
+    origin = Origin(survey_file, options.images or survey_file.parent)
+    if not options.overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
     if from_photographs:
-        files = find_photographs(survey, images_dir=images)
+        files = find_photographs(survey, images_dir=options.images)
         name_photographs(survey, files)  # wrong folders and names are reported before anything is compiled
     compile_first()
-    jobs = jobs or cores()
+    jobs = options.jobs or cores()
     workers, store = 1, None
     if from_photographs:
         workers, store = jobs, MeasuredStore.of_user()
@@ -301,7 +302,7 @@ def _run_survey(
         log.start(survey.name, survey_file, **origin.written(folder))
         try:
             result = run_survey(
-                survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
+                survey, images_dir=options.images, jobs=workers, others=others, store=store, progress=log
             )
         except UnfinishedSurveyError as error:
             reached = error.reached
@@ -321,11 +322,11 @@ def _run_survey(
             write_colmap=colmap_writer(result),
             finish=lambda part: log.close_into(part, findings),
             jobs=workers,
-            budget_mb=pictures_mb,
+            budget_mb=options.pictures_mb,
             progress=log,
             plot_process=plots,
         )
-    if not print_result(findings, page, seconds=time.perf_counter() - begun, verbose=verbose):
+    if not print_result(findings, page, seconds=time.perf_counter() - begun, verbose=options.verbose):
         raise SystemExit(FAILED)
     return folder
 
@@ -426,7 +427,7 @@ def drafted_beside(
 def _photographs_of(file: Path) -> Path | None:
     """Return the folder of photographs that a drafted survey file states, or None."""
     text = file.read_text(encoding="utf-8", errors="replace")
-    line = next((one for one in text.splitlines() if one.startswith(PHOTOGRAPHS)), None)
+    line = next((row for row in text.splitlines() if row.startswith(PHOTOGRAPHS)), None)
     if line is None:
         return None
     try:

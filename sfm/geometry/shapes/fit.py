@@ -168,17 +168,8 @@ def _fit(
     robust: bool,
     offset: float,
 ) -> ShapeFit:
-    for j in rows[~np.isfinite(points.xyz[rows]).all(axis=1)][:1]:
-        raise GeometryError(f"point {points.names[j]} has no coordinates, expected numbers")
-    if not all(np.isfinite(np.asarray(one, dtype=float)).all() for one in (offset, *hold.values())):
-        raise GeometryError("a held value or the offset is not a finite number")
-    if weights not in WEIGHTS:
-        raise GeometryError(f"weights '{weights}', expected one of {', '.join(WEIGHTS)}")
-    if weights == "network" and points.covariance is None:
-        raise GeometryError('the standard deviations of the points are unknown, expected weights = "equal"')
+    _refuse_unusable(points, kind, rows, weights, (offset, *hold.values()))
     xyz = points.xyz[rows]
-    if len(rows) < kind.min_points:
-        raise GeometryError(f"{counted(len(rows), 'point')}, a {kind.name} needs {kind.min_points}")
     centroid = xyz.mean(axis=0)
     size = float(np.sqrt(((xyz - centroid) ** 2).sum(axis=1).mean()))
     if not size > 0:
@@ -223,10 +214,8 @@ def _fit(
         w[used] = fit.standardised
         sigma0 = np.sqrt(fit.omega / redundancy) if redundancy else np.nan
         if redundancy:
-            statistic, critical = (
-                fit.omega / redundancy,
-                critical_value(FALSE_ALARM, redundancy, points.redundancy),
-            )
+            statistic = fit.omega / redundancy
+            critical = critical_value(FALSE_ALARM, redundancy, points.redundancy)
     else:
         inverse: FloatArray = np.asarray(np.linalg.inv(A.T @ A))
         linear[:, used] = -np.einsum("up,pnc,nci->uni", inverse, A.T.reshape(-1, *d.shape), B)
@@ -265,6 +254,26 @@ def _fit(
     )
 
 
+def _refuse_unusable(
+    points: MeasuredPoints,
+    kind: Kind,
+    rows: IntArray,
+    weights: str,
+    given: Sequence[float | Sequence[float]],
+) -> None:
+    """Refuse points, weights and given numbers with which no shape can be fitted."""
+    for j in rows[~np.isfinite(points.xyz[rows]).all(axis=1)][:1]:
+        raise GeometryError(f"point {points.names[j]} has no coordinates, expected numbers")
+    if not all(np.isfinite(np.asarray(number, dtype=float)).all() for number in given):
+        raise GeometryError("a held value or the offset is not a finite number")
+    if weights not in WEIGHTS:
+        raise GeometryError(f"weights '{weights}', expected one of {', '.join(WEIGHTS)}")
+    if weights == "network" and points.covariance is None:
+        raise GeometryError('the standard deviations of the points are unknown, expected weights = "equal"')
+    if len(rows) < kind.min_points:
+        raise GeometryError(f"{counted(len(rows), 'point')}, a {kind.name} needs {kind.min_points}")
+
+
 def _covariance(points: MeasuredPoints, rows: IntArray) -> FloatArray:
     if points.correlated_among(rows):
         return points.covariance_of(rows)
@@ -300,7 +309,9 @@ def _held(
         numbers = np.asarray(value, dtype=float)
         wanted = 3 if name in (kind.place, "direction") else 1
         if name not in known or (kind.name == "cone" and name == "radius"):
-            of_cone = [one for one in known if not (kind.name == "cone" and one == "radius")]
+            of_cone = [
+                parameter for parameter in known if not (kind.name == "cone" and parameter == "radius")
+            ]
             raise GeometryError(f"hold '{name}', expected one of {', '.join(of_cone)}")
         if numbers.size != wanted or not np.isfinite(numbers).all():
             raise GeometryError(f"hold {name}: found {value}, expected {counted(wanted, 'finite number')}")
@@ -337,25 +348,25 @@ def _best_start(
     placed: bool,
 ) -> Shape:
     """Return the best of the likeliest starts after some refinement of each."""
-    some = x
+    sample = x
     if len(x) > START_POINTS:
-        some = x[np.linspace(0, len(x) - 1, START_POINTS).astype(np.int64)]
-    found: list[tuple[float, int, Shape]] = []
+        sample = x[np.linspace(0, len(x) - 1, START_POINTS).astype(np.int64)]
+    trials: list[tuple[float, int, Shape]] = []
     first = free.copy()  # a held form has false optima, so the form is free at first (0: an apex)
     first[6:] = form != 0
-    for start in start_shapes(kind, some, origin=origin, axis=axis)[:STARTS]:
+    for start in start_shapes(kind, sample, origin=origin, axis=axis)[:STARTS]:
         shape = with_held(start, origin, np.full(len(form), np.nan))
         for freed in (first, free) if (first != free).any() else (free,):
             shape, cost, _ = refine_orthogonal(
-                shape, some, free=freed, offset=offset, placed=placed, iterations=START_STEPS
+                shape, sample, free=freed, offset=offset, placed=placed, iterations=START_STEPS
             )
             if freed is not free:
                 shape = with_held(shape, origin, form)
         if np.isfinite(cost) and np.isfinite(shape.form).all():
-            found.append((cost, len(found), shape))
-    if not found:
+            trials.append((cost, len(trials), shape))
+    if not trials:
         raise GeometryError(f"its points do not determine a {kind.name}")
-    return min(found, key=lambda one: one[:2])[2]
+    return min(trials, key=lambda trial: trial[:2])[2]
 
 
 def _refuse_flat(kind: Kind, x: FloatArray, blocks: FloatArray, *, axis_held: bool) -> None:
@@ -422,6 +433,15 @@ class Parameters:
         return slice(first, first + self.names.count(name))
 
 
+def _apex(shape: Shape, at: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the apex of a cone, where its radius is 0 (along = -r / tan), and its derivatives, (3, 8)."""
+    R, (r, angle) = shape.rotation, shape.form
+    along = -r / np.tan(angle)
+    by_apex = at + along * direction
+    by_apex[:, 6:] = np.outer(R[:, 2], np.array([-1 / np.tan(angle), r / np.sin(angle) ** 2]))
+    return shape.origin + along * R[:, 2], by_apex
+
+
 def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     """Return the parameters of a shape.
 
@@ -441,12 +461,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     direction[:, 3], direction[:, 4] = -R[:, 1], R[:, 0]
     place, by_place = shape.origin, at
     if kind.name == "cone" and abs(form[1]) > 1e-9:
-        # the apex lies where the radius is 0: along = -r / tan
-        along = -form[0] / np.tan(form[1])
-        by_form = np.array([-1 / np.tan(form[1]), form[0] / np.sin(form[1]) ** 2])
-        place = shape.origin + along * R[:, 2]
-        by_place = at + along * direction
-        by_place[:, 6:] = np.outer(R[:, 2], by_form)
+        place, by_place = _apex(shape, at, direction)
     rows.append((kind.place, "coordinate", place, by_place))
     if kind.name != "sphere":
         rows.append(("direction", "direction", R[:, 2], direction))

@@ -274,8 +274,8 @@ def refine_orthogonal(
     nothing = np.zeros(3)
     shape = start.placed(nothing) if placed else start
 
-    def system(one: Shape) -> tuple[FloatArray, FloatArray]:
-        d, _, A = one.design(xyz)
+    def system(at: Shape) -> tuple[FloatArray, FloatArray]:
+        d, _, A = at.design(xyz)
         return ((d - offset) * root[:, None]).ravel(), (A[..., free] * root[:, None, None]).reshape(
             d.size, -1
         )

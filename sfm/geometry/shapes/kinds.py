@@ -177,8 +177,8 @@ def _foot_on_parabola(rho: FloatArray, z: FloatArray, f: float) -> FloatArray:
 
 SHIFTS, TILTS = (0, 1, 2), (3, 4)
 KINDS = {
-    one.name: one
-    for one in (
+    kind.name: kind
+    for kind in (
         Kind("line", "point", (), (0, 1, *TILTS), 2, 2, _line),
         Kind("plane", "point", (), (2, *TILTS), 1, 3, _plane),
         Kind("circle", "centre", ("radius",), (*SHIFTS, *TILTS), 2, 3, _circle),

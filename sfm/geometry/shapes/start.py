@@ -60,14 +60,14 @@ def start_shapes(
         tried = np.vstack([[normal, along, np.cross(normal, along)], half_sphere(directions)])
     if kind.name == "cone" and origin is not None:
         return _cones_at(xyz, origin, tried)
-    found = [shape for one in tried for shape in WITH_AXIS[kind.name](xyz, axes_along(one))]
-    return _best_first(found, xyz)
+    shapes = [shape for direction in tried for shape in WITH_AXIS[kind.name](xyz, axes_along(direction))]
+    return _best_first(shapes, xyz)
 
 
-def _best_first(found: list[Shape], xyz: FloatArray) -> list[Shape]:
+def _best_first(shapes: list[Shape], xyz: FloatArray) -> list[Shape]:
     """Return shapes sorted by their sum of squared distances, without those where it is not finite."""
-    costs = [float((shape.distances(xyz) ** 2).sum()) for shape in found]
-    return [found[k] for k in np.argsort(costs, kind="stable") if np.isfinite(costs[k])]
+    costs = [float((shape.distances(xyz) ** 2).sum()) for shape in shapes]
+    return [shapes[k] for k in np.argsort(costs, kind="stable") if np.isfinite(costs[k])]
 
 
 def principal_directions(xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -127,7 +127,7 @@ def _ellipses(xyz: FloatArray, R: FloatArray) -> list[Shape]:
     _, vectors = eig(M)
     vectors = vectors.real
     inside = 4 * vectors[0] * vectors[2] - vectors[1] ** 2
-    found = []
+    shapes = []
     if (inside > 0).any():
         first = vectors[:, np.argmax(inside)]
         a, b, c, d, e, f = np.concatenate([first, T @ first])
@@ -141,13 +141,13 @@ def _ellipses(xyz: FloatArray, R: FloatArray) -> list[Shape]:
                 turn = turn * [1, -1]
             axes = R.copy()
             axes[:, :2] = R[:, :2] @ turn
-            found.append(Shape(KINDS["ellipse"], R[:, :2] @ centre, axes, np.sqrt(squares)))
+            shapes.append(Shape(KINDS["ellipse"], R[:, :2] @ centre, axes, np.sqrt(squares)))
     circle = _circles(xyz, R)[0]
     radius = circle.form[0]
     for stretch in (1.3, 1 / 1.3):
         form = radius * np.array([stretch, 1 / stretch])
-        found.append(Shape(KINDS["ellipse"], circle.origin, R, form))
-    return found
+        shapes.append(Shape(KINDS["ellipse"], circle.origin, R, form))
+    return shapes
 
 
 def _cylinders(xyz: FloatArray, R: FloatArray) -> list[Shape]:
@@ -180,26 +180,26 @@ def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
 def _cones_at(xyz: FloatArray, apex: FloatArray, directions: FloatArray) -> list[Shape]:
     """Return cones with a given apex; the half angle for each direction is the mean angle to the points."""
     y = xyz - apex
-    found = []
+    shapes = []
     for axis in np.vstack([directions, -directions]):
         along = y @ axis
         angle = np.arctan2(np.linalg.norm(y - along[:, None] * axis, axis=1), along).mean()
         if angle < MAX_ANGLE:
-            found.append(Shape(KINDS["cone"], apex, axes_along(axis), np.array([0.0, angle])))
-    return _best_first(found, xyz)
+            shapes.append(Shape(KINDS["cone"], apex, axes_along(axis), np.array([0.0, angle])))
+    return _best_first(shapes, xyz)
 
 
 def _tori(xyz: FloatArray, R: FloatArray) -> list[Shape]:
     """Return tori about the circle that the points form as seen along this axis."""
     y = xyz @ R
     centre, major = _circle_in_plane(y[:, :2])
-    found = []
+    shapes = []
     for height in (y[:, 2].mean(), (y[:, 2].min() + y[:, 2].max()) / 2):
         ring = np.hypot(*(y[:, :2] - centre).T) - major
         minor = float(np.sqrt((ring**2 + (y[:, 2] - height) ** 2).mean()))
         origin = R @ np.array([*centre, height])
-        found.append(Shape(KINDS["torus"], origin, R, np.array([major, minor])))
-    return found
+        shapes.append(Shape(KINDS["torus"], origin, R, np.array([major, minor])))
+    return shapes
 
 
 def _paraboloids(xyz: FloatArray, R: FloatArray) -> list[Shape]:

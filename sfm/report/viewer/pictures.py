@@ -206,16 +206,17 @@ def _embed(
     crops = {k: crop for cut in read.values() for k, crop in cut.crops.items()}
     kept = store.add_fitting({k: crops[k] for k in order.tolist() if k in crops}, budget - 2)
     names = overlay_names(scene.photographs)
-    folder = f"{beside}/" if beside else ""
-    content = {names[i]: cut.file for i, cut in read.items() if cut.file}
-    content |= {f"crops_{names[i]}": cut.cells for i, cut in read.items() if cut.cells}
+    files = {i: names[i] for i, cut in read.items() if cut.file}
+    crop_files = {i: f"crops_{names[i]}" for i, cut in read.items() if cut.cells}
+    content = {name: read[i].file for i, name in files.items()}
+    content |= {name: read[i].cells for i, name in crop_files.items()}
     shown = list(_shown_crops(read.values(), kept))
     rays = sum(len(cut.frames) for cut in read.values())
     return Pictures(
         store.text(),
         len(read),
-        tuple(f"{folder}{names[i]}" if i in read and read[i].file else "" for i in range(m)),
-        tuple(f"{folder}crops_{names[i]}" if i in read and read[i].cells else "" for i in range(m)),
+        _paths(beside, files, m),
+        _paths(beside, crop_files, m),
         content,
         _places(thumbnail, m),
         _places(view, m),
@@ -225,6 +226,12 @@ def _embed(
         np.array([cell for *_, cell in shown], dtype=np.int64),
         tuple(_notes_of(len(read), m, len(view), len(kept), rays, bool(beside))),
     )
+
+
+def _paths(folder: str, names: Mapping[int, str], count: int) -> tuple[str, ...]:
+    """Return the path of the file of each photograph from the page, "" without a file."""
+    below = f"{folder}/" if folder else ""
+    return tuple(f"{below}{names[i]}" if i in names else "" for i in range(count))
 
 
 def _shown_crops(
