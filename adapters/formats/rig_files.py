@@ -98,7 +98,7 @@ def write_rig_files(folder: Path, content: Content) -> None:
         cameras = [_Mounted.of(result.estimate.cameras[a], mounts, a) for a in on]
         if len(on) < 2:
             raise OutputError(f"{folder}: rig {rig} has one camera, needed at least 2")
-        configs.append(_colmap(cameras, _prefixes(network, on, [camera.camera.name for camera in cameras])))
+        configs.append(_colmap(cameras, _prefixes(network, on, [mounted.camera.name for mounted in cameras])))
         for second in cameras[1:]:
             pair = f"{cameras[0].camera.name}-{second.camera.name}"
             add(f"opencv-{pair}.yml", "\n".join(_opencv(cameras[0].camera, second, unit)) + "\n")
@@ -239,7 +239,7 @@ def _prefixes(network: Network, on: list[int], names: list[str]) -> list[str]:
             end = re.sub(r"^[^\W\d_]*[\W_]*", "", end)  # from the end of the word in which it begins
             for a, name in together.items():
                 starts[a].add(name.removesuffix(end))
-    if any(len(starts) != 1 for starts in starts.values()):
+    if any(len(of_camera) != 1 for of_camera in starts.values()):
         return folders
     prefixes = [next(iter(starts[a])) for a in on]
     mixed = any(

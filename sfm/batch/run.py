@@ -229,7 +229,10 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
             read.append((file, read_survey_file(file, allow_outside=allow_outside)))
         except Exception as error:  # an unforeseen error only fails this survey
             read.append((file, error))
-    names = [_folder_name(file, survey) for file, survey in read]
+    names = []
+    for file, survey in read:
+        name = file.parent.name if file.name == SURVEY_NAME else file.stem
+        names.append(folder_name(survey.name if isinstance(survey, SurveyFile) else name))
     often = Counter(name.casefold() for name in names)
     plans = []
     for (file, survey), name in zip(read, names, strict=True):
@@ -238,11 +241,6 @@ def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
             name = f"{name}-{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
         plans.append(_Plan(file, name, survey))
     return tuple(plans)
-
-
-def _folder_name(file: Path, survey: SurveyFile | Exception) -> str:
-    name = file.parent.name if file.name == SURVEY_NAME else file.stem
-    return folder_name(survey.name if isinstance(survey, SurveyFile) else name)
 
 
 def _run(

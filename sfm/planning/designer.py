@@ -112,28 +112,26 @@ def design_network(
     return _Designer(planned, camera, seeing, wanted, room, max_photographs, bars, given).run()
 
 
+@dataclass
 class _Designer:
     """State of the design that its steps share."""
 
-    def __init__(
-        self,
-        planned: PlannedObject,
-        camera: Camera,
-        seeing: Seeing,
-        wanted: WantedPrecision,
-        room: Candidates,
-        most: int,
-        bars: Sequence[ScaleBarPlan],
-        given: Callable[[Network], Network] | None,
-    ) -> None:
-        self.planned, self.camera, self.seeing, self.wanted = planned, camera, seeing, wanted
-        self.room, self.most, self.bars, self.given = room, most, bars, given
-        self.rows = image_rows(planned, camera, room.stations, room.sight)
+    planned: PlannedObject
+    camera: Camera
+    seeing: Seeing
+    wanted: WantedPrecision
+    room: Candidates  # stations to choose from
+    most: int  # photographs
+    bars: Sequence[ScaleBarPlan]
+    given: Callable[[Network], Network] | None  # as in `predict_network`
+
+    def __post_init__(self) -> None:
+        self.rows = image_rows(self.planned, self.camera, self.room.stations, self.room.sight)
         self.single = np.einsum("mnai,mnaj->mnij", self.rows, self.rows)
-        self.prior = np.eye(3) / planned.size**2  # weight of a point that no photograph shows yet
-        self.seeable = room.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
-        self.scale = np.where(self.seeable, 1 / wanted.point_variance(planned), 0.0)
-        self.ratio = np.ones(len(planned.names))
+        self.prior = np.eye(3) / self.planned.size**2  # weight of a point that no photograph shows yet
+        self.seeable = self.room.sight.seen.sum(axis=0) >= 2 * MIN_RAYS  # upright and rolled
+        self.scale = np.where(self.seeable, 1 / self.wanted.point_variance(self.planned), 0.0)
+        self.ratio = np.ones(len(self.planned.names))
 
     def run(self) -> Design:
         chosen: list[int] = []

@@ -321,7 +321,8 @@ def further_photographs(
         count=candidate_count,
     )
     chosen = _chosen(planned, estimate.cameras[camera], room, before.covariance.points[rows], count)
-    names = _new_names(network.images, len(chosen))
+    numbered = (f"new {k + 1}" for k in range(len(network.images) + len(chosen)))
+    names = tuple(name for name in numbered if name not in network.images)[: len(chosen)]
     stations = replace(room.stations.of(chosen), names=names)
     sight = room.sight.of(chosen)
     i, j = np.nonzero(sight.seen)
@@ -405,9 +406,3 @@ def _chosen(
         QA = Q @ A.transpose(0, 2, 1)
         Q = Q - QA @ np.linalg.inv(np.eye(2) + A @ QA) @ QA.transpose(0, 2, 1)
     return np.array(chosen, dtype=np.int64)
-
-
-def _new_names(taken: tuple[str, ...], count: int) -> tuple[str, ...]:
-    """Return names of further photographs that are not taken."""
-    free = (f"new {k}" for k in range(1, len(taken) + count + 1) if f"new {k}" not in taken)
-    return tuple(next(free) for _ in range(count))

@@ -278,7 +278,7 @@ def _gain(plan: Plan) -> tuple[Part, ...]:
 def figures(plan: Plan) -> list[tuple[str, str]]:
     """Return the key figures of a plan, each with its unit."""
     p, a, unit = plan.prediction, plan.prediction.adjustment, plan.unit
-    reliabilities = reliability(a)
+    detected = reliability(a)
     d = found_displacement(p)[p.determined]
     r = a.redundancy_numbers[np.isfinite(a.redundancy_numbers)]
     worst, along = float(p.sigma[p.determined].max()), float(p.largest_sigma[p.determined].max())
@@ -302,8 +302,8 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
             "redundancy",
             f"{a.redundancy}; redundancy numbers {abs(r.min()):.2f} to {r.max():.2f}, mean {r.mean():.2f}",
         ),
-        ("detectable gross error", _spread(reliabilities.minimal_bias, "px")),
-        ("its effect if not detected", _spread(reliabilities.external, "sigmas of an unknown")),
+        ("detectable gross error", _spread(detected.minimal_bias, "px")),
+        ("its effect if not detected", _spread(detected.external, "sigmas of an unknown")),
         (
             "rule of Fraser",
             f"sigma = q S sigma_image / sqrt(k): q {p.q:.2f}, S {per_mm:.4g} {plan.unit} per mm, "
@@ -321,9 +321,9 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
     ]
     rows += describe_rigs(rigs_of(a, planned=True), plan.unit)
     for contribution in plan.contributions:
-        name = (
-            "scale bars and distances" if contribution.name == ScaleBars.name else contribution.name
-        )  # both are bars
+        name = contribution.name
+        if name == ScaleBars.name:
+            name = "scale bars and distances"  # both are bars
         rows.append((f"gain by {name}", _gain_in_words(contribution)))
     if a.undetermined:
         more = f"; and {len(a.undetermined) - 1} more" if len(a.undetermined) > 1 else ""
@@ -333,11 +333,9 @@ def figures(plan: Plan) -> list[tuple[str, str]]:
 
 def _gain_in_words(contribution: Contribution) -> str:
     """Return in words what a kind of observation adds, as "alone gives the scale; points 1.30 times ..."."""
-    precise = (
-        f"points {contribution.gain:.2f} times as precise"
-        if np.isfinite(contribution.gain)
-        else "nothing without it"
-    )
+    precise = "nothing without it"
+    if np.isfinite(contribution.gain):
+        precise = f"points {contribution.gain:.2f} times as precise"
     if not _given(contribution):
         return precise
     beside = "beside that " if contribution.shifts or contribution.rotations or contribution.scale else ""

@@ -163,7 +163,10 @@ def read_tasks(
         SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or c is not
             given.
     """
-    names, points, xy = _read_points(points_file)
+    units = tuple((f"{axis}_m", axis) for axis in "XYZ")
+    columns = ("X", "Y", "Z", "x_mm", "y_mm")
+    table = read_table(points_file, ("point",), columns, aliases=units, ignored=None)
+    names, points, xy = table.texts[0], table.values[:, :3], table.values[:, 3:]
     values = _read_camera(camera_file) if camera_file is not None else {}
     if c_mm is not None:
         values["c"] = c_mm
@@ -183,12 +186,6 @@ def read_tasks(
         return Task(names, xy, tangents, points, c, begin, tolerance_mm)
 
     return task(values), task(opposite)
-
-
-def _read_points(path: Path) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
-    units = tuple((f"{axis}_m", axis) for axis in "XYZ")
-    table = read_table(path, ("point",), ("X", "Y", "Z", "x_mm", "y_mm"), aliases=units, ignored=None)
-    return table.texts[0], table.values[:, :3], table.values[:, 3:]
 
 
 def _read_camera(path: Path) -> dict[str, float]:

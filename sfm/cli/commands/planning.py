@@ -25,7 +25,6 @@ from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
     from sfm.camera import Camera
-    from sfm.conventions import FloatArray
     from sfm.planning.visibility import DepthOfField
 
 MAX_WEAK = 5  # weak points listed on the terminal
@@ -263,6 +262,8 @@ def network_command(
     Lengths are in the unit of --unit.
     """
     with loading():
+        import numpy as np
+
         from sfm.cli.console import exit_by, print_verdict
         from sfm.conventions import METRES
         from sfm.files.open_folders import refuse_foreign_folder
@@ -324,11 +325,13 @@ def network_command(
             )
         else:
             taken.refuse_to_design()
-            allowed = StationLimits(
-                None if distance is None else _pair(parse_numbers("--distance", distance, 2)),
-                None if space is None else _parse_space(space),
-                floor,
-            )
+            least_and_most = box = None
+            if distance is not None:
+                least, most = parse_numbers("--distance", distance, 2)
+                least_and_most = (least, most)
+            if space is not None:
+                box = np.array(parse_numbers("--space", space, 6)).reshape(3, 2).T
+            allowed = StationLimits(least_and_most, box, floor)
             design = design_network(
                 object_,
                 reference,
@@ -369,16 +372,6 @@ def _depth_of_field(
     confusion = 2 * pixel if confusion_um is None else confusion_um / 1000
     in_mm = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
     return DepthOfField(in_mm.near / to_mm, in_mm.far / to_mm, focus)
-
-
-def _pair(values: tuple[float, ...]) -> tuple[float, float]:
-    return values[0], values[1]
-
-
-def _parse_space(text: str) -> FloatArray:
-    import numpy as np
-
-    return np.array(parse_numbers("--space", text, 6)).reshape(3, 2).T
 
 
 def simulate_command(

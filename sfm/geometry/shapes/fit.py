@@ -11,7 +11,7 @@ Photogrammetry and 3D Imaging, sec. 2.3.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -175,7 +175,9 @@ def _fit(
     if not size > 0:
         raise GeometryError(f"its {counted(len(rows), 'point')} coincide")
     x = (xyz - centroid) / size
-    Q = None if points.covariance is None else _covariance(points, rows)
+    Q = None
+    if points.covariance is not None:
+        Q = points.covariance_of(rows) if points.correlated_among(rows) else points.blocks[rows]
     _refuse_flat(kind, x, points.blocks[rows] / size**2, axis_held="direction" in hold)
     free, origin, axis, form = _held(kind, hold, centroid, size)
     placed = origin is None
@@ -272,12 +274,6 @@ def _refuse_unusable(
         raise GeometryError('the standard deviations of the points are unknown, expected weights = "equal"')
     if len(rows) < kind.min_points:
         raise GeometryError(f"{counted(len(rows), 'point')}, a {kind.name} needs {kind.min_points}")
-
-
-def _covariance(points: MeasuredPoints, rows: IntArray) -> FloatArray:
-    if points.correlated_among(rows):
-        return points.covariance_of(rows)
-    return points.blocks[rows]
 
 
 def _product(J: FloatArray, Q: FloatArray) -> FloatArray:
@@ -433,6 +429,21 @@ class Parameters:
         return slice(first, first + self.names.count(name))
 
 
+_Parameter = tuple[str, str, FloatArray, FloatArray]  # name, kind of value, values, derivatives
+
+
+def _form_parameters(kind: Kind, form: FloatArray) -> Iterator[_Parameter]:
+    """Yield the parameters of the form, with the diameter of shapes that have one."""
+    for k, name in enumerate(kind.form):
+        if kind.name == "cone" and name == "radius":
+            continue  # its radius near the centroid is of no use
+        derivatives = np.zeros((1, 6 + len(form)))
+        derivatives[0, 6 + k] = 1.0
+        yield name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives
+        if name == "radius" and kind.name in WITH_DIAMETER:
+            yield "diameter", "length", 2 * form[k : k + 1], 2 * derivatives
+
+
 def _apex(shape: Shape, at: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the apex of a cone, where its radius is 0 (along = -r / tan), and its derivatives, (3, 8)."""
     R, (r, angle) = shape.rotation, shape.form
@@ -454,7 +465,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     """
     kind, R, form = shape.kind, shape.rotation, shape.form
     q = len(form)
-    rows: list[tuple[str, str, FloatArray, FloatArray]] = []
+    rows: list[_Parameter] = []
     at = np.zeros((3, 6 + q))
     at[:, :3] = R
     direction = np.zeros((3, 6 + q))
@@ -473,14 +484,7 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
         by_focus = at + form[0] * direction
         by_focus[:, 6] = R[:, 2]
         rows.append(("focus", "coordinate", shape.origin + form[0] * R[:, 2], by_focus))
-    for k, name in enumerate(kind.form):
-        if kind.name == "cone" and name == "radius":
-            continue  # its radius near the centroid is of no use
-        derivatives = np.zeros((1, 6 + q))
-        derivatives[0, 6 + k] = 1.0
-        rows.append((name, "angle" if name == "half_angle" else "length", form[k : k + 1], derivatives))
-        if name == "radius" and kind.name in WITH_DIAMETER:
-            rows.append(("diameter", "length", 2 * form[k : k + 1], 2 * derivatives))
+    rows += _form_parameters(kind, form)
     names = tuple(name for name, _, value, _ in rows for _ in value)
     axes = tuple(axis for _, _, value, _ in rows for axis in ("XYZ" if len(value) == 3 else ("",)))
     kinds = tuple(kind for _, kind, value, _ in rows for _ in value)
