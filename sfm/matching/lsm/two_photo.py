@@ -143,7 +143,8 @@ def match_lsm(
             windows move by 0.01 px, in the same way in all matches of a template.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model keeps; by default the unit matrix.
-        along: for tilt: directions of the epipolar lines in the left photograph, of any length, (k, 2).
+        along: for tilt: directions of the epipolar lines in the left photograph, of any length, (k, 2); a
+            point without one (NaN or 0) is not matched.
         threads: number of threads that share the patches.
 
     Returns:
@@ -177,6 +178,8 @@ def match_lsm(
     lines = np.zeros((k, 2)) if model != "tilt" else np.array([] if along is None else along, dtype=float)
     if lines.shape != (k, 2):
         raise GeometryError(f"LSM: epipolar lines of shape {lines.shape}, needed ({k}, 2) for a tilt")
+    lines[~np.isfinite(lines).all(axis=1)] = 0.0  # no line, no match
+    lines /= np.maximum(np.abs(lines).max(axis=1, initial=0.0, keepdims=True), np.finfo(float).tiny)
     lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), np.finfo(float).tiny)
     warp = np.zeros((k, 3, 3))
     warp[:, : given.shape[1], : given.shape[1]] = given

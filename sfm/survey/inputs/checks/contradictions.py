@@ -232,6 +232,8 @@ def _of_rigs(survey: Described) -> Iterator[str]:
     known = {camera.name for camera in survey.cameras}
     owner: dict[str, str] = {}
     for rig in survey.rigs:
+        if len(rig.cameras) < 2:
+            yield f"rig {rig.name}: {counted(len(rig.cameras), 'camera')}, at least 2 are needed"
         for name in rig.cameras:
             if name not in known:
                 yield (
@@ -254,8 +256,6 @@ def _of_rigs(survey: Described) -> Iterator[str]:
 
 
 def _of_rig(rig: RigSettings, *, from_photographs: bool) -> Iterator[str]:
-    if len(rig.cameras) < 2:
-        yield f"{counted(len(rig.cameras), 'camera')}, at least 2 are needed"
     if rig.blocks and rig.mounts is not None:
         yield "mounts and blocks are both given, needed one: blocks find their own mounts"
     if "tolerance_s" in rig.model_fields_set and rig.moment != "exif":
