@@ -3,7 +3,7 @@
 `verdict.judge_survey` and `verdict.judge_adjustment` give a result its verdict. Each other module answers one
 question. `checks`: how good are the observations, and how precise the unknowns? `bundle_statistics`: what is
 the geometry of the network, and how well does it fit the given values? `calibrated_cameras`: how are the
-cameras calibrated and mounted? `cameras`: what is remarkable about them? `model_choice` takes the likeliest of
-several models of the same image points. `stated_precision`: do image points scatter as stated? `given`: are
-given values right?
+cameras calibrated and mounted? `cameras`: what is remarkable about them? `model_choice` takes the likeliest
+of several models of the same image points. `stated_precision`: do image points scatter as stated? `given`:
+are given values right?
 """

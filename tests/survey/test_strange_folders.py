@@ -179,10 +179,6 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("plan", "network", "plate:1000,700", *PLANNED),
         ("out", "out/plan", "out/.plan.lock"),
     ),
-    "validate": (
-        lambda f: ("validate", "--networks", 1, "--jobs", 1),
-        ("out", "out/validation", "out/.validation.lock"),
-    ),
     "refine": (lambda f: ("refine", model(f), "--images", f, "--out", "new/a"), ("new", "new/a")),
     "render": (
         lambda f: ("render", scene(f), "new/a"),
@@ -227,7 +223,7 @@ def test_settings_of_libraries_in_the_current_folder_are_refused(
 
 def test_nothing_that_takes_settings_is_imported_before_the_folder_is_looked_at(tmp_path: Path) -> None:
     (tmp_path / ".numba_config.yaml").write_text("opt: no number\n")
-    script = "import sys; from sfm.cli import main; sys.argv[1:] = ['validate']; main()"
+    script = "import sys; from sfm.cli import main; sys.argv[1:] = ['doctor']; main()"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     run = subprocess.run(
         [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True

@@ -16,6 +16,7 @@ import numpy as np
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
+from sfm.camera import project, tangents_from_pixel
 from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.errors import GeometryError
 from sfm.estimate import Estimate
@@ -28,7 +29,9 @@ from sfm.matching.lsm.coverage import (
 )
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.network import ImagePoints, Network, without_given
+from sfm.observations.kind import no_index
 from sfm.orientation.incremental.sequence import Orientation
+from sfm.orientation.intersection import intersect
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles
 from sfm.reduced_network import reduce_network
@@ -43,6 +46,7 @@ from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_p
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 from sfm.targets.codes.plates import TargetFamily
 from sfm.targets.codes.rings import CodeFamily
+from sfm.targets.detect import Targets
 
 # Windows that are tried; the first of those with about the best precision is taken. Noise that is
 # correlated over several pixels hides the texture of small windows. Over large ones a surface is curved:
@@ -241,7 +245,7 @@ def _with_targets(
     network: Network,
     estimate: Estimate,
 ) -> CoveredPixels:
-    """Return the masked pixels and those of coded targets.
+    """Return the masked pixels and those of coded targets, also where their codes are not read.
 
     Their pixels would take part twice. On blank paper with one straight edge, only noise holds a window along
     the edge. Windows at targets of a rendered sheet were three to seven times as far from it as others.
@@ -249,12 +253,38 @@ def _with_targets(
     if hidden is None:
         hidden = CoveredPixels([estimate.cameras[lens].size_px[::-1] for lens in network.camera])
     reach = family.outer if isinstance(family, CodeFamily) else 1.0  # of a target, in radii of its dot
-    found = dict(zip(photographs.names, photographs.targets, strict=True))
-    for i, name in enumerate(network.images):
-        if name in found:
-            coded = found[name].select(found[name].code >= 0)
-            hidden.cover(np.full(len(coded), i), coded.xy, 2 * reach * coded.semi_axes[:, 0])
+    at = {name: i for i, name in enumerate(network.images)}
+    seen = [
+        (at[name], targets)
+        for name, targets in zip(photographs.names, photographs.targets, strict=True)
+        if name in at and estimate.oriented[at[name]]
+    ]
+    coded = _coded_points(seen, network, estimate)
+    for i, targets in seen:
+        camera = estimate.cameras[network.camera[i]]
+        shown = project(camera, estimate.position[i], estimate.rotation[i], coded)
+        distance = np.linalg.norm(targets.xy[:, None] - shown, axis=2)
+        covered = (targets.code >= 0) | (distance < targets.semi_axes[:, :1]).any(axis=1)
+        sides = 2 * reach * targets.semi_axes[covered, 0]
+        hidden.cover(np.full(len(sides), i), targets.xy[covered], sides)
     return hidden
+
+
+def _coded_points(seen: Sequence[tuple[int, Targets]], network: Network, estimate: Estimate) -> FloatArray:
+    """Return the points of the codes that two photographs show, (n, 3)."""
+    image = np.concatenate(
+        [np.full(int((targets.code >= 0).sum()), i) for i, targets in seen] or [no_index()]
+    )
+    code = np.concatenate([targets.code[targets.code >= 0] for _, targets in seen] or [no_index()])
+    rays = [
+        tangents_from_pixel(estimate.cameras[network.camera[i]], targets.xy[targets.code >= 0])
+        for i, targets in seen
+    ]
+    point = np.unique(code, return_inverse=True)[1]
+    points = intersect(
+        np.concatenate(rays or [np.zeros((0, 2))]), image, point, estimate.position, estimate.rotation
+    ).points
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def _visible(hidden: CoveredPixels | None, found: CoveringPoints) -> CoveringPoints:

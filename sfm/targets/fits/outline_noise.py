@@ -246,8 +246,7 @@ def most_telling(sound: BoolArray, information: FloatArray) -> BoolArray:
 
     A photograph of texture shows more blobs than targets, whose faint edges tell little of an outline. They
     would make theirs the usual one: all targets would seem damaged, or as rough as the blobs.
-    If they tell as much as fewer than half as many equal ones, those below the mean do not count, unless too
-    few are left.
+    If they tell as much as fewer than half as many equal ones, those below the mean do not count.
 
     Args:
         sound: targets that are not unlike targets, shape (k,).
@@ -258,8 +257,7 @@ def most_telling(sound: BoolArray, information: FloatArray) -> BoolArray:
     w = information[sound]
     if w.sum() ** 2 >= len(w) / 2 * (w**2).sum():
         return sound
-    telling = np.asarray(sound & (information >= w.mean()))
-    return telling if telling.sum() >= MIN_POPULATION else sound
+    return np.asarray(sound & (information >= w.mean()))
 
 
 def common_shape(h: FloatArray, weight: FloatArray, sound: BoolArray) -> FloatArray:
