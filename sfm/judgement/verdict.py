@@ -140,7 +140,8 @@ def slight_as_tests(remarks: Sequence[Remark], *, sigma0_is_high: bool = False) 
 
     def is_slight(one: Remark) -> bool:
         grade = None if one.test is not None else one.row.severity
-        return isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
+        slight = isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
+        return slight and not sigma0_is_high
 
     return tuple(
         remark("slight_effect", cause=one.kind, shift=one.number("shift")) if is_slight(one) else one
