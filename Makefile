@@ -13,7 +13,7 @@ TIMED := adjustment matching resection stereo textured viewer_page wide_matching
 .PHONY: demo test docs study bench mutate setup clean
 
 demo: $(READY)
-	$(BIN)/python -m sfm.rendering.render datasets/demo/scene.toml build/demo
+	$(BIN)/python -m sfm.products.rendering.render datasets/demo/scene.toml build/demo
 	$(BIN)/kolinear run datasets/demo/survey.toml --images build/demo --out out/demo
 
 test: $(READY)
@@ -48,7 +48,7 @@ $(READY): constraints.txt pyproject.toml
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-compile -c constraints.txt -e '.[dev]'
 	@echo "Compiling the libraries and kernels (once) ..."
 	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib sfm adapters
-	@$(BIN)/python -m sfm.warm_up
+	@$(BIN)/python -m sfm.cli.warm_up
 	@touch $@
 
 clean:

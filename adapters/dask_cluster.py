@@ -38,8 +38,8 @@ from distributed.core import rpc
 from distributed.security import Security
 from threadpoolctl import threadpool_limits
 
-from sfm.errors import BackendError, KolinearError
 from sfm.files.user_cache import scratch_folder
+from sfm.model.errors import BackendError, KolinearError
 from sfm.runtime.executor import Call, Done, Event, Lost, Sent, Work
 
 # Worker deaths that Dask allows a call: one may be bad luck, and the call is tried on another worker.
@@ -238,7 +238,7 @@ class DaskEngine:
         return max(1, sum(threads.values()))
 
     def run(self, works: Iterable[Work], *, at_a_time: int) -> Iterator[Event]:
-        """Run all work and yield its events, see sfm.kernels.threads.Engine.
+        """Run all work and yield its events, see sfm.runtime.threads.Engine.
 
         Raises:
             BackendError: the scheduler or all workers are gone, or the workers lack Kolinear.

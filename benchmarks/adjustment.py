@@ -40,8 +40,8 @@ from threadpoolctl import threadpool_limits
 from benchmarks.networks import SIZE_PX, block, convergent
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 
 SLOW_S = 20.0  # longer runs are not repeated
 COST_TOLERANCE = 1e-6  # relative decrease of the cost at which both adjusters stop

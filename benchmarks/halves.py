@@ -36,13 +36,13 @@ from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.quality.correlations import estimate_error_correlation
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray
-from sfm.estimate import Estimate
-from sfm.network import Network, without_given
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, without_given
+from sfm.model.reduced_network import reduce_network
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
-from sfm.reduced_network import reduce_network
-from sfm.similarity import fit_similarity
 
 WAYS = ("random", "checker", "stripes", "near-far")
 STEPS = np.eye(2)  # px

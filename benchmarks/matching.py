@@ -13,9 +13,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from sfm.conventions import FloatArray
 from sfm.matching.correlation import match_ncc
 from sfm.matching.lsm.two_photo import match_lsm
+from sfm.model.conventions import FloatArray
 from tests.textures import REACH, Pairs, affine_pairs, random_texture, with_noise
 
 SIGMA = 2.0

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 
 NOISE_PX = 0.1
 SIZE_PX = (2000, 1500)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
 
 MODELS = ("opencv", "full_opencv")  # models that COLMAP also has
 ARRANGEMENTS = ("ring", "hemisphere", "strip", "close pairs")

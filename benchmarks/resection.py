@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pycolmap
 
-from sfm.conventions import FloatArray, rotation_from_vector
+from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.textbook.resection.zeng_wang import resect_triples_zeng_wang

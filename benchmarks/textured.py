@@ -24,13 +24,13 @@ from benchmarks.textured_scenes import RIPPLES, TexturedScene, render_scene, tex
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
 from sfm.comparison.solutions import rotation_angle_deg
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.similarity import fit_similarity
+from sfm.products.refining.refinement import refine_model
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.refining.refinement import refine_model
 
 HEAD = (
     "scene            method           images  points   centre mm  rotation mdeg  predicted mm  ratio"

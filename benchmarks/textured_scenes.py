@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from datasets.textured import render
-from sfm.camera import Camera, camera_from_values, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.compiling import compiled
+from sfm.model.camera import Camera, camera_from_values, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.runtime.compiling import compiled
 
 RIPPLES = {"smooth": (0.0, 1.0), "medium": (0.004, 0.15), "rough": (0.008, 0.08)}  # height and length, m
 SIZE_PX = (1024, 768)

@@ -37,11 +37,11 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import SAME_SIGMAS, reprojection, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import KolinearError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.similarity import fit_similarity
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import KolinearError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import fit_similarity
 
 T = TypeVar("T")
 Ended = Literal["same optimum", "ours higher", "ours failed", "ours lower", "the other failed", "both failed"]

@@ -24,12 +24,12 @@ import psutil
 from playwright.sync_api import sync_playwright
 from scipy.spatial import cKDTree
 
-from sfm.camera import camera_from_values
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import camera_from_values
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.solution import Solution
 from sfm.report.view_page import write_view
 from sfm.report.viewer.embedded import scene_of_stored
-from sfm.solution import Solution
 
 FRAMES = 60
 WARM_UP = 20  # frames in which the scene finds its frame rate

@@ -21,10 +21,10 @@ import numpy as np
 from benchmarks import textured_scenes
 from benchmarks.textured_scenes import PIXEL_MM, RIPPLES, TexturedScene, intensities, surface_at
 from datasets.textured import render
-from sfm.camera import camera_from_values, project
-from sfm.conventions import AnyArray, FloatArray
 from sfm.matching import conjugate
 from sfm.matching.conjugate import affinities_around, match_points
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import AnyArray, FloatArray
 
 SIZE_PX = (640, 480)
 # Angle between the viewing directions, rotation about the right one, degrees, and ratio of the distances.

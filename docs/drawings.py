@@ -1,7 +1,7 @@
 """Drawings on the page of conventions: frames, rotations and directions of distortion, as SVG in the page.
 
-The program computes the drawings where possible: `sfm.camera.project` gives the image point of the pinhole
-camera, `sfm.conventions.rotation_from_angles` rotates the axes, and the distortion models give the vectors.
+The program computes the drawings where possible: `sfm.model.camera.project` gives the image point of the pinhole
+camera, `sfm.model.conventions.rotation_from_angles` rotates the axes, and the distortion models give the vectors.
 Drawings use the colours of the page, so they are readable on a light and on a dark background.
 """
 
@@ -16,8 +16,8 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from sfm.camera import camera_from_values, pixel_from_tangents, tangents_from_pixel
-from sfm.conventions import FloatArray, image_from_pixel, pixel_from_image, rotation_from_angles
+from sfm.model.camera import camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.model.conventions import FloatArray, image_from_pixel, pixel_from_image, rotation_from_angles
 from sfm.targets.codes.plates import PlateFamily
 
 ARROW = 9.0  # length of an arrow head, in the unit of the drawing

@@ -1,6 +1,6 @@
 """Links from names of functions on the pages to their docstrings; a name that does not exist is an error.
 
-A name in code font such as `sfm.camera.project` needs no markup. The directive `functions` makes the target
+A name in code font such as `sfm.model.camera.project` needs no markup. The directive `functions` makes the target
 page, which documents every name on the pages of docs/, sorted by module.
 """
 

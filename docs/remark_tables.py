@@ -9,8 +9,8 @@ import re
 import sys
 from pathlib import Path
 
-from sfm.remarks.catalogue import SUBJECTS, TESTS
-from sfm.remarks.remark import FIELD, Grade, Kind, Unless
+from sfm.model.remarks.catalogue import SUBJECTS, TESTS
+from sfm.model.remarks.remark import FIELD, Grade, Kind, Unless
 
 BEGIN, END = "<!-- remarks: written by docs/remark_tables.py -->", "<!-- end of remarks -->"
 VARIES = "…"

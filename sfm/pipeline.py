@@ -13,11 +13,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sfm.errors import GeometryError
-from sfm.kernels.threads import own_threads
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import GeometryError
 from sfm.photographs.masks import Masks
-from sfm.result import SurveyResult
 from sfm.runtime.progress import SILENT, Progress, StageClock
+from sfm.runtime.threads import own_threads
 from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.assembly import ALONE, OtherPrograms, assemble_result, compare_solution
 from sfm.survey.inputs.from_exif import exterior_from_exif, moments_from_exif

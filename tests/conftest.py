@@ -29,10 +29,10 @@ atexit.register(shutil.rmtree, CACHES, ignore_errors=True)
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels before the first test, which would wait for it and read that it is done."""
-    from sfm.kernels.warmed import is_warm
+    from sfm.runtime.warmed import is_warm
 
     if not hasattr(session.config, "workerinput") and not is_warm():
-        from sfm.warm_up import main
+        from sfm.cli.warm_up import main
 
         main()
 

@@ -9,9 +9,9 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sfm.batch.job import Comparers, SurveyRow
 from sfm.cli.commands.batching import InProcess
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.products.batch.job import Comparers, SurveyRow
 from sfm.runtime.executor import Send
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.camera import camera_from_values, project
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 
 SIZE_PX = (1536, 1024)
 PIXEL_MM = (0.0156, 0.0156)  # a sensor of 24 mm

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from sfm.judgement.survey_result import SurveyResult
 from sfm.judgement.verdict import judge_survey
 from sfm.report import findings
-from sfm.result import SurveyResult
 
 
 def findings_of(result: SurveyResult) -> findings.Findings:

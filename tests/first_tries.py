@@ -15,8 +15,8 @@ import numpy as np
 from typer.testing import CliRunner
 
 from sfm.cli.app import app
-from sfm.errors import KolinearError
-from sfm.network import ImagePoints
+from sfm.model.errors import KolinearError
+from sfm.model.network import ImagePoints
 from tests.surveys import OBSERVED, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 

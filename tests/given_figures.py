@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
-from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import Reference
 from sfm.judgement.given.points import GivenPoints, PlacedPoints, judge_points
-from sfm.network import ObjectPoints
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ObjectPoints
+from sfm.model.similarity import Similarity
 from tests.synthetic import make_network, seed_of
 
 CAMERA = make_network(seed_of("given figures"))[1].cameras[0]  # which takes no part

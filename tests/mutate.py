@@ -70,9 +70,9 @@ ROOMS = (  # modules, and folders with all that are in them
     "sfm/orientation/resection/least_squares.py",
     "sfm/orientation/resection/ransac.py",
     "sfm/orientation/intersection.py",
-    "sfm/similarity.py",
-    "sfm/epochs/displacements.py",
-    "sfm/conventions.py",
+    "sfm/model/similarity.py",
+    "sfm/products/epochs/displacements.py",
+    "sfm/model/conventions.py",
     "sfm/targets/codes/rings.py",
     "sfm/targets/codes/dot_plates.py",
 )

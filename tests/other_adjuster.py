@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.model.conventions import FloatArray
 
 
 def moments_of_area(outline: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,10 +7,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import AnyArray, FloatArray, rotation_from_vector
-from sfm.rendering.render import corner_rays, render_photograph
-from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, discs, join_marks, rectangles
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import AnyArray, FloatArray, rotation_from_vector
+from sfm.products.rendering.render import corner_rays, render_photograph
+from sfm.products.rendering.scene import (
+    CircularTargets,
+    Faces,
+    Marks,
+    Optics,
+    Scene,
+    discs,
+    join_marks,
+    rectangles,
+)
 from sfm.targets.codes.plates import GRIDS, PlateFamily
 from sfm.targets.codes.tags import opencv_dictionary, tag_family, tag_modules
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.camera import project
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.estimate import Estimate, Mounts
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import ImagePoints, Network
 from tests.synthetic import SIZE_PX, make_network
 
 

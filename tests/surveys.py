@@ -9,15 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import AnyArray, FloatArray, angles_from_rotation
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.remarks.catalogue import given_values
-from sfm.remarks.remark import Remark
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import AnyArray, FloatArray, angles_from_rotation
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.catalogue import given_values
+from sfm.model.remarks.remark import Remark
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
 from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.targets.codes.plates import code_family

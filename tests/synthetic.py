@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.distortion.models import COLMAP, MODELS
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
-from sfm.solution import Solution
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.model.distortion.models import COLMAP, MODELS
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.solution import Solution
 
 SIZE_PX = (2000, 1500)
 PIXEL_MM = (0.005, 0.005)

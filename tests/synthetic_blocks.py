@@ -9,10 +9,10 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from tests.synthetic import seed_of
 
 SIZE_PX, NOISE_PX = (2000, 1500), 0.1

@@ -30,8 +30,8 @@ def test_every_example_of_the_page_is_one_that_runs(names: dict[str, object]) ->
 def test_colmap_is_given_what_the_page_says(names: dict[str, object], tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     from adapters.colmap.camera_models import write_model
-    from sfm.estimate import Estimate
-    from sfm.network import Network
+    from sfm.model.estimate import Estimate
+    from sfm.model.network import Network
 
     camera, R, X0 = (names[name] for name in ("opencv", "R", "X0"))
     network = names["network"]

@@ -10,17 +10,17 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.formats.result_tables import read_image_points, read_result, read_targets
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import SurveyFileError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import SurveyFileError
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.rendering.render import write_photographs
-from sfm.rendering.scene_file import Staging, read_scene
+from sfm.products.rendering.render import write_photographs
+from sfm.products.rendering.scene_file import Staging, read_scene
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
 from sfm.report.viewer.embedded import scene_of_result, scene_of_stored
 from sfm.report.viewer.pictures import Marks
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_vector
-from sfm.rendering.render import corner_rays, render_photograph
-from sfm.rendering.scene import Optics
+from sfm.model.conventions import rotation_from_vector
+from sfm.products.rendering.render import corner_rays, render_photograph
+from sfm.products.rendering.scene import Optics
 from sfm.targets.codes.plates import PlateFamily
-from tests.inspection.test_acceptance import accepted, volume
 from tests.places import DATASETS, ROOT
 from tests.plates import camera, plate_scene, stations
+from tests.products.inspection.test_acceptance import accepted, volume
 from tests.synthetic import seed_of
 
 

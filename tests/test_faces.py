@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.geometry import MeasuredPoints, Nominal, point_function
-from tests.epochs.scenes import POINTS, epoch
+from sfm.products.geometry import MeasuredPoints, Nominal, point_function
 from tests.places import ROOMS, ROOT
+from tests.products.epochs.scenes import POINTS, epoch
 from tests.synthetic import make_network, seed_of
 
 OWN = [("sfm", sfm), *((f"sfm.{room}", getattr(sfm, room)) for room in ROOMS)]
@@ -138,12 +138,12 @@ def test_an_argument_of_another_type_is_refused_by_its_name(name: str) -> None:
         lambda: sfm.adjustment.w_test(ADJUSTMENT, alpha=7.0),
         lambda: sfm.comparison.robust_weights(np.zeros((5, 3)), np.zeros((3, 2)), np.ones(5, dtype=bool)),
         lambda: sfm.comparison.robust_weights(np.zeros((5, 3)), np.zeros((15, 2)), np.zeros(5, dtype=bool)),
-        lambda: sfm.geometry.fit_shape(MEASURED, "plane", [99]),
-        lambda: sfm.geometry.decide(np.zeros(3), np.zeros(2), 0.0, 1.0, 2.0),
-        lambda: sfm.geometry.deviations_from_points(
+        lambda: sfm.products.geometry.fit_shape(MEASURED, "plane", [99]),
+        lambda: sfm.products.geometry.decide(np.zeros(3), np.zeros(2), 0.0, 1.0, 2.0),
+        lambda: sfm.products.geometry.deviations_from_points(
             MEASURED, Nominal(("a",), XYZ[:1]), name="a", upper=1.0, chosen=[-1]
         ),
-        lambda: sfm.geometry.distance(point_function(MEASURED, "a"), point_function(MEASURED, "x")),
+        lambda: sfm.products.geometry.distance(point_function(MEASURED, "a"), point_function(MEASURED, "x")),
         lambda: sfm.matching.match_points(STACK, GREY, PLACE),
         lambda: sfm.matching.match_ncc(GREY, GREY, PLACE, [PLACE]),
         lambda: sfm.matching.find_tie_points([GREY], []),
@@ -170,8 +170,8 @@ def test_an_argument_of_another_type_is_refused_by_its_name(name: str) -> None:
         lambda: sfm.textbook.match_along_line(GREY, GREY, PLACE, [XYZ]),
         lambda: sfm.textbook.trilaterate(XYZ, [1, 2, 3], 1.0),
         lambda: sfm.textbook.pope_hinsken(XYZ[:3], XYZ[:3], [1, 2]),
-        lambda: sfm.planning.object_of_points(("a",), XYZ, None),
-        lambda: sfm.epochs.analyse_epochs([]),
+        lambda: sfm.products.planning.object_of_points(("a",), XYZ, None),
+        lambda: sfm.products.epochs.analyse_epochs([]),
     ],
 )
 def test_arguments_of_another_shape_are_refused_in_one_line(call: Callable[[], Any]) -> None:
@@ -187,7 +187,7 @@ def test_lists_are_taken_for_arrays() -> None:
         found.position, sfm.orientation.resect_robust(TANGENTS, XYZ, tolerance=0.001).position
     )
     fits = [
-        sfm.geometry.fit_shape(MEASURED, "plane", some, weights="equal")
+        sfm.products.geometry.fit_shape(MEASURED, "plane", some, weights="equal")
         for some in (["a", "b", "c"], [0, 1, 2])
     ]
     np.testing.assert_array_equal(fits[0].distances, fits[1].distances)
@@ -211,7 +211,7 @@ def test_methods_of_resection_take_rays_and_points(method: str) -> None:
 
 
 def test_steps_of_zeng_and_wang_lead_to_the_position() -> None:
-    position, turn = np.array([1.0, 1.0, 10.0]), sfm.conventions.rotation_from_angles(0.1, -0.2, 0.3)
+    position, turn = np.array([1.0, 1.0, 10.0]), sfm.model.conventions.rotation_from_angles(0.1, -0.2, 0.3)
     tangents = sfm.orientation.tangents_of(position, turn, XYZ[:3])
     rays = np.column_stack([tangents, -np.ones(3)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

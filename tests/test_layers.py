@@ -14,46 +14,53 @@ from tests.places import ROOT
 LAYERS = (
     (
         *(
-            "sfm.arguments",
-            "sfm.conventions",
-            "sfm.errors",
-            "sfm.distributions",
-            "sfm.likelihood",
-            "sfm.camera",
-            "sfm.distortion",
-            "sfm.estimate",
-            "sfm.network",
-            "sfm.observations",
-            "sfm.reduced_network",
-            "sfm.similarity",
+            "sfm.model.arguments",
+            "sfm.model.conventions",
+            "sfm.model.errors",
+            "sfm.model.distributions",
+            "sfm.model.likelihood",
+            "sfm.model.camera",
+            "sfm.model.distortion",
+            "sfm.model.estimate",
+            "sfm.model.network",
+            "sfm.model.observations",
+            "sfm.model.reduced_network",
+            "sfm.model.similarity",
         ),
-        *("sfm.runtime", "sfm.files", "sfm.kernels", "sfm.photographs"),
-        *("sfm.solution", "sfm.observation_residuals", "sfm.display", "sfm.remarks"),
+        *("sfm.runtime", "sfm.files", "sfm.runtime", "sfm.photographs"),
+        *("sfm.model.solution", "sfm.model.observation_residuals", "sfm.model.display", "sfm.model.remarks"),
     ),
     ("sfm.targets", "sfm.matching", "sfm.orientation", "sfm.adjustment"),
     ("sfm.judgement.hypotheses",),  # of an adjustment; the rest of the room judges results
     (
         "sfm.textbook",
         "sfm.comparison",
-        "sfm.geometry",
-        "sfm.epochs",
-        "sfm.planning",
-        "sfm.rendering",
-        "sfm.printing",
+        "sfm.products.geometry",
+        "sfm.products.epochs",
+        "sfm.products.planning",
+        "sfm.products.rendering",
+        "sfm.products.printing",
     ),
-    ("sfm.result",),
+    ("sfm.judgement.survey_result",),
     ("sfm.judgement",),
-    ("sfm.survey", "sfm.inspection"),
+    ("sfm.survey", "sfm.products.inspection"),
     ("sfm.report",),
     ("sfm.pipeline",),
-    ("sfm.batch", "sfm.cli", "sfm.api", "sfm.warm_up"),
+    ("sfm.products.batch", "sfm.cli", "sfm.products.public_functions", "sfm.cli.warm_up"),
 )
 CV2_ROOMS = (
-    *("sfm.photographs", "sfm.targets", "sfm.matching", "sfm.rendering", "sfm.printing", "sfm.report"),
+    *(
+        "sfm.photographs",
+        "sfm.targets",
+        "sfm.matching",
+        "sfm.products.rendering",
+        "sfm.products.printing",
+        "sfm.report",
+    ),
     *("sfm.orientation", "sfm.survey", "sfm.textbook"),
 )
 CV2_THREADS = "adapters.dask_cluster"  # holds OpenCV to one thread per worker, as it does BLAS
-TERMINAL = ("sfm.batch.table", "sfm.runtime.progress_bar")
+TERMINAL = ("sfm.products.batch.table", "sfm.runtime.progress_bar")
 STAGES = (  # of a survey, in the order of `sfm.pipeline`
     ("sfm.survey.inputs",),
     ("sfm.survey.measuring", "sfm.survey.target_network"),
@@ -140,11 +147,11 @@ def test_measuring_depends_on_nothing_else() -> None:
             left += imported(MODULES[name])
     rooms = {".".join(name.split(".")[:2]) for name in found}
     assert rooms == {
-        "sfm.arguments",
-        "sfm.conventions",
-        "sfm.distributions",
-        "sfm.errors",
-        "sfm.kernels",
+        "sfm.model.arguments",
+        "sfm.model.conventions",
+        "sfm.model.distributions",
+        "sfm.model.errors",
+        "sfm.runtime",
         "sfm.photographs",
         "sfm.targets",
     }
@@ -152,7 +159,11 @@ def test_measuring_depends_on_nothing_else() -> None:
 
 def test_only_the_command_line_and_the_public_functions_import_adapters() -> None:
     for name, path in MODULES.items():
-        if name.startswith("sfm") and not belongs(name, "sfm.cli") and name != "sfm.api":
+        if (
+            name.startswith("sfm")
+            and not belongs(name, "sfm.cli")
+            and name != "sfm.products.public_functions"
+        ):
             assert not [o for o in imported(path) if o.split(".")[0] == "adapters"], name
 
 
@@ -175,7 +186,7 @@ def test_libraries_stay_in_their_rooms() -> None:
             )
         assert not re.search(
             r"^(from|import) scipy(\.| import )stats", path.read_text(encoding="utf-8"), re.MULTILINE
-        ), f"{name}: sfm.distributions spares a second of importing"
+        ), f"{name}: sfm.model.distributions spares a second of importing"
         if libraries & {"matplotlib"}:
             assert name.startswith("sfm.report"), f"{name} imports matplotlib"
         if libraries & {"typer", "rich"}:
@@ -186,7 +197,7 @@ def test_the_rules_would_notice() -> None:
     assert layer_of("sfm.targets.detect") == 1
     assert layer_of("sfm.survey.inputs.start") == 6
     assert layer_of("sfm.surveying") is None
-    assert "sfm.errors" in imported(MODULES["sfm.cli"])
+    assert "sfm.model.errors" in imported(MODULES["sfm.cli"])
 
 
 def test_no_two_rooms_import_one_another() -> None:

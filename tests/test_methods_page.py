@@ -16,7 +16,7 @@ from tests.places import ROOT
 PAGE = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
 ROOMS = (
     *("sfm.orientation", "sfm.textbook", "sfm.matching"),
-    *("sfm.comparison", "sfm.planning", "sfm.geometry"),
+    *("sfm.comparison", "sfm.products.planning", "sfm.products.geometry"),
 )
 MENTIONED = tuple(dict.fromkeys(re.findall(r"`(sfm(?:\.\w+)+)`", PAGE)))
 

@@ -10,9 +10,9 @@ import pytest
 
 import sfm
 from sfm.cli.commands.batching import InProcess
-from sfm.errors import BackendError, KolinearError, MissingLibraryError
-from sfm.kernels import warmed
-from sfm.remarks.remark import Remark
+from sfm.model.errors import BackendError, KolinearError, MissingLibraryError
+from sfm.model.remarks.remark import Remark
+from sfm.runtime import warmed
 from sfm.runtime.executor import Call, Done, Event, Lost, Send, Sent, Work
 from tests.commands import kolinear
 from tests.surveys import write_observed_survey
@@ -100,7 +100,7 @@ def test_doctor_calls_the_core_sound(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_a_camera_that_was_not_looked_up_is_reported() -> None:
     unknown: list[Remark] = []
-    assert sfm.api.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
+    assert sfm.products.public_functions.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
     (one,) = unknown
     assert one.kind == "camera_assumed" and one.names("cameras") == ("OLYMPUS C4040Z",)
     assert one.names("reason") == (INSTALL_PYCOLMAP,)

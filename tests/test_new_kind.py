@@ -12,10 +12,10 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.conventions import FloatArray
-from sfm.estimate import values_of
-from sfm.observations.point_pairs import PointPairs
-from sfm.observations.tables import TABLES
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import values_of
+from sfm.model.observations.point_pairs import PointPairs
+from sfm.model.observations.tables import TABLES
 from sfm.pipeline import run_survey
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report

@@ -9,10 +9,10 @@ import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
 from adapters.formats.photomodeler import read_photomodeler
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.remarks.remark import kinds_of, of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore

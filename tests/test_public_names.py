@@ -19,9 +19,9 @@ import pytest
 import sfm
 from adapters.colmap.camera_models import write_model
 from sfm.comparison.camera_conversion import convert_cameras
-from sfm.errors import UnknownNameError
 from sfm.files import csv_tables
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import UnknownNameError
 from tests.places import ROOMS
 from tests.surveys import write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of

@@ -11,7 +11,7 @@ import typer
 
 from adapters.formats.registry import FORMATS
 from sfm.cli.app import app
-from sfm.distortion.models import COLMAP, GENERAL_MODELS
+from sfm.model.distortion.models import COLMAP, GENERAL_MODELS
 from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import BESIDE, SurveyFile, read_survey_file
@@ -36,7 +36,7 @@ def test_readme_is_short_and_has_the_commands_to_install() -> None:
     assert len(lines) < 150
     for line in ("make demo", "make test", "py -m venv .venv", "pip install -c constraints.txt -e .[all]"):
         assert line in "\n".join(lines[:50]), line
-    for line in ("py -m venv .venv", "pip install -c constraints.txt -e .[dev]", "python -m sfm.warm_up"):
+    for line in ("py -m venv .venv", "pip install -c constraints.txt -e .[dev]", "python -m sfm.cli.warm_up"):
         assert line in page("install.md"), line
 
 

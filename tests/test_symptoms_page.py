@@ -1,7 +1,7 @@
 """docs/symptoms.md has every message: the remarks of the catalogue, and an entry for each error.
 
 An entry is text in backticks in the first column of the tables of errors, … stands for what varies. The
-messages are read from the source: what every error of `sfm.errors` says, and the sentences of the rooms that
+messages are read from the source: what every error of `sfm.model.errors` says, and the sentences of the rooms that
 find why a photograph cannot be used.
 """
 
@@ -14,8 +14,8 @@ from functools import cache
 
 import pytest
 
-from sfm import errors
-from sfm.remarks.catalogue import KINDS
+from sfm.model import errors
+from sfm.model.remarks.catalogue import KINDS
 from sfm.targets.outlines import Flag
 from tests.places import ROOT, load_page_code
 
@@ -24,7 +24,7 @@ MIN_WORDS = 4  # of what the rooms below say; shorter texts are parts of sentenc
 REASONS = (
     "sfm/files/globs.py",
     "sfm/survey/diagnosis",
-    "sfm/survey/drafting/camera_groups.py",
+    "sfm/products/drafting/camera_groups.py",
     "sfm/survey/measuring/targets.py",
     "sfm/survey/orientation.py",
     "sfm/survey/adjusting/settling.py",

@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from sfm.conventions import METRES, UNITS, find_unit, finer_unit, rotation_from_vector
+from sfm.model.conventions import METRES, UNITS, find_unit, finer_unit, rotation_from_vector
 from sfm.survey.inputs.settings import Unit
 from tests.synthetic import seed_of
 

@@ -118,7 +118,7 @@ def test_a_survey_of_rendered_photographs_runs_from_the_wheel(
     told = run(kolinear, "doctor", folder=tmp_path, home=home)
     assert "This installation works." in told and "is not installed" not in told.split("dask")[0]
     scene = ("demo/scene.toml", "photographs")
-    run(programs / "python", "-P", "-m", "sfm.rendering.render", *scene, folder=tmp_path, home=home)
+    run(programs / "python", "-P", "-m", "sfm.products.rendering.render", *scene, folder=tmp_path, home=home)
     survey = ("demo/survey.toml", "--images", "photographs", "--out", "result")
     run(kolinear, "run", *survey, folder=tmp_path, home=home)
     summary = json.loads((tmp_path / "result" / "summary.json").read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import FloatArray
+from sfm.model.conventions import FloatArray
 
 WAVES = 160
 MEAN, CONTRAST = 128.0, 40.0

@@ -23,13 +23,13 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.reconstruction import estimate_of, reconstruction, residuals_of, sensor_of
-from sfm.camera import Camera
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.errors import BackendError, MissingLibraryError, one_line
-from sfm.estimate import Estimate
 from sfm.files.plain_text import as_plain
-from sfm.network import Network
+from sfm.model.camera import Camera
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import BackendError, MissingLibraryError, one_line
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 
 NEEDED_VERSION = (4, 2)
 # From the default trust region radius of 1e4 Ceres converges slowly: 46 steps on 400 photographs, 6 with 1e8.

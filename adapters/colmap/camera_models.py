@@ -22,14 +22,14 @@ from pydantic import Field
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
-from sfm.conventions import BoolArray, IntArray
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate, Mounts
 from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shorten
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
-from sfm.network import ImagePoints, Network
+from sfm.model.conventions import BoolArray, IntArray
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import ImagePoints, Network
 
 SIDE_FILE = "kolinear.json"
 

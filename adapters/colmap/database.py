@@ -28,13 +28,13 @@ from scipy.sparse.csgraph import connected_components
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import MAX_ID, MODELS
 from adapters.colmap.reconstruction import HALF_PIXEL, as_opencv, camera_of, colmap_camera
-from sfm.camera import Camera
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import OutputError, SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, as_plain, is_name
 from sfm.files.whole_files import refuse_full, whole_file
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.camera import Camera
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.network import ImagePoints, Network, rows_of
 
 TABLES = ("cameras", "images", "keypoints", "matches", "two_view_geometries")
 HEADER_BYTES = 100

@@ -21,11 +21,11 @@ from PIL.TiffImagePlugin import IFDRational
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import read_model
-from sfm.camera import project
-from sfm.errors import BackendError, one_line
-from sfm.estimate import Estimate
 from sfm.files.user_cache import scratch_folder
-from sfm.network import Network, rows_of
+from sfm.model.camera import project
+from sfm.model.errors import BackendError, one_line
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
 
 SIDE_PX = (1000, 750)  # width and height of the small picture
 FOCAL_MM = 10  # its known focal length

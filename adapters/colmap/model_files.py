@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from adapters.reading.text_lines import Lines
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_SIDE_PX
+from sfm.model.errors import SurveyFileError
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 OLDER = ("rigs", "frames")  # missing in models by COLMAP before version 3.12

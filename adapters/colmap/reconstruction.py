@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 
 from adapters.colmap.model_files import MODELS as COLMAP_MODELS
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray
-from sfm.distortion.models import MODELS, Role
-from sfm.errors import BackendError
-from sfm.estimate import Estimate, Mounts
-from sfm.network import Network, rows_of
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.errors import BackendError
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
 AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours

@@ -17,10 +17,10 @@ import numpy as np
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
 from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_from_rig, camera_of, colmap_parameters
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.estimate import Estimate
-from sfm.network import Network, rows_of
-from sfm.similarity import Similarity
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
+from sfm.model.similarity import Similarity
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adapters.reading.text_lines import MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
-from sfm.camera import camera_from_values
-from sfm.distortion.models import Role
-from sfm.errors import OutputError
-from sfm.estimate import Estimate
 from sfm.files.csv_tables import MAX_ROWS
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import camera_from_values
+from sfm.model.distortion.models import Role
+from sfm.model.errors import OutputError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 
 CAMERA_VALUES = 9
 MODELS = ("opencv", "radial")  # permitted camera models

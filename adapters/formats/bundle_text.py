@@ -32,8 +32,9 @@ from typing import NamedTuple
 import numpy as np
 
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, Lines, write_lines
-from sfm.camera import camera_from_values
-from sfm.conventions import (
+from sfm.files.plain_text import shorten
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import (
     FloatArray,
     IntArray,
     angles_from_rotation,
@@ -41,10 +42,9 @@ from sfm.conventions import (
     pixel_from_image,
     rotation_from_angles,
 )
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.files.plain_text import shorten
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, rows_of
 
 INTERIOR = "interior.txt"
 OF_SIGMAS = "re"  # end of the name of their file in the thesis

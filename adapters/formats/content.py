@@ -13,13 +13,13 @@ from zlib import crc32
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.errors import OutputError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, InteriorObservations, Network, ObjectPoints
-from sfm.reduced_network import reduce_network
-from sfm.solution import NO_SCALE, UNCODED, Solution
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import OutputError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.model.reduced_network import reduce_network
+from sfm.model.solution import NO_SCALE, UNCODED, Solution
 
 PAIRS = ((0, 1), (0, 2), (1, 2))  # of coordinates, for cXY, cXZ and cYZ
 

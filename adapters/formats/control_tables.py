@@ -16,14 +16,14 @@ import numpy as np
 from pydantic import Field
 
 from adapters.formats.content import PAIRS
-from sfm.conventions import BoolArray, FloatArray
-from sfm.estimate import Estimate
 from sfm.files.csv_tables import read_header, read_table
 from sfm.files.plain_text import Content, csv_text, read_json
 from sfm.files.result_tables import CONTROL_POINTS, GIVEN
-from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.observation_residuals import given_residuals, given_rows
-from sfm.solution import CONTROL_COVARIANCE
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.model.observation_residuals import given_residuals, given_rows
+from sfm.model.solution import CONTROL_COVARIANCE
 
 AXES, SIGMAS = ("X", "Y", "Z"), ("sX", "sY", "sZ")
 COVARIANCES, CHECKS = ("cXY", "cXZ", "cYZ"), ("checkX", "checkY", "checkZ")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.reading.text_lines import write_lines
-from sfm.conventions import FloatArray
+from sfm.model.conventions import FloatArray
 
 LAYER_CHARACTERS = 31  # maximum length of a name in release 12
 TEXT_HEIGHT = 0.01  # of the size of the drawing

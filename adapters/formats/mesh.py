@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from adapters.reading.text_lines import Lines
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.plain_text import shorten
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import SurveyFileError
 
 MAX_BYTES = 1_000_000_000
 STL_HEADER, STL_RECORD = 84, 50  # bytes

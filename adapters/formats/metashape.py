@@ -30,14 +30,14 @@ import numpy as np
 
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, write_lines
 from adapters.reading.xml_lines import Node, Taken, read_xml
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray
-from sfm.distortion.models import MODELS
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.files.plain_text import MAX_PIXEL_MM, shorten
-from sfm.network import ImagePoints, Network, ObjectPoints, rows_of
-from sfm.similarity import Similarity
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import FloatArray
+from sfm.model.distortion.models import MODELS
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints, rows_of
+from sfm.model.similarity import Similarity
 
 HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus Kolinear's, px
 MARKER_SIGMA_PX = 0.1  # Metashape's default for markers placed by hand

@@ -40,14 +40,14 @@ import numpy as np
 
 from adapters.formats.content import Content
 from adapters.reading.text_lines import MAX_BLOCK_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_angles
-from sfm.display import counted
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.files.plain_text import MAX_SIDE_PX, shorten
-from sfm.network import ImagePoints, Network, ObjectPoints
-from sfm.solution import UNCODED, Solution
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.model.display import counted
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.solution import UNCODED, Solution
 
 MODELS = ("brown", "brown_dbat")  # permitted camera models; they differ in what is minimised
 HALF_PIXEL = 0.5  # PhotoModeler's pixel coordinates minus Kolinear's, px

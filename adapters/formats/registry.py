@@ -41,16 +41,16 @@ from adapters.formats.rig_files import write_rig_files
 from adapters.formats.sba_text import read_sba, write_sba_folder
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
-from sfm.camera import Camera
-from sfm.display import counted
-from sfm.distortion.models import MODELS, Role
-from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.files.csv_tables import write_ply
 from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.whole_files import whole_file, whole_folder
-from sfm.network import Network, empty_estimate
-from sfm.solution import Solution
+from sfm.model.camera import Camera
+from sfm.model.display import counted
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.errors import KolinearError, OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, empty_estimate
+from sfm.model.solution import Solution
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
 Writer = Callable[[Path, Network, Estimate], None]

@@ -19,11 +19,6 @@ from pydantic import Field
 from adapters.colmap.camera_models import SIDE_FILE, NamedCamera, read_side_file
 from adapters.formats.content import Content
 from adapters.formats.control_tables import Statistics, read_given, read_known_points, write_given
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
-from sfm.distortion.models import MODELS
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.files import result_tables as tables
 from sfm.files.covariance_file import (
     read_covariance,
@@ -36,11 +31,16 @@ from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import Content as Json
 from sfm.files.plain_text import Name, Pixel, Side, Text, as_plain, or_none, read_json
 from sfm.files.result_tables import TARGETS, read_rigs, write_rigs
-from sfm.network import ImagePoints, InteriorObservations, Network, Source
-from sfm.reduced_network import CORRELATION_LIMIT
-from sfm.remarks.remark import Quantity, Remark
-from sfm.remarks.verdict import Verdict
-from sfm.solution import MEASURED, SeenTargets, Solution
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles
+from sfm.model.distortion.models import MODELS
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, InteriorObservations, Network, Source
+from sfm.model.reduced_network import CORRELATION_LIMIT
+from sfm.model.remarks.remark import Quantity, Remark
+from sfm.model.remarks.verdict import Verdict
+from sfm.model.solution import MEASURED, SeenTargets, Solution
 
 SIGMAS, SIGMAS_PX = ("sX", "sY", "sZ"), ("sx_px", "sy_px")
 PRINCIPAL_DISTANCES = ("c", "fx", "fy")

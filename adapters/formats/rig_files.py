@@ -40,12 +40,12 @@ from scipy.spatial.transform import Rotation
 
 from adapters.colmap.reconstruction import AXES, COLMAP_NAMES, colmap_parameters
 from adapters.formats.content import Content
-from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import METRES, FloatArray, rotation_from_vector, skew
-from sfm.errors import OutputError
-from sfm.estimate import Mounts
 from sfm.files.open_folders import disk_errors
-from sfm.network import Network
+from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.conventions import METRES, FloatArray, rotation_from_vector, skew
+from sfm.model.errors import OutputError
+from sfm.model.estimate import Mounts
+from sfm.model.network import Network
 
 GRID = 9  # grid points along each side of a photograph
 

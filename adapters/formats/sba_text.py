@@ -21,11 +21,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, rows_of
 
 AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in Kolinear's
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line

@@ -18,12 +18,12 @@ import numpy as np
 
 from adapters.formats.content import Content
 from adapters.formats.control_tables import CONTROL, write_known_points
-from sfm.camera import Camera
-from sfm.conventions import METRES, angles_from_rotation
-from sfm.estimate import Estimate
 from sfm.files.plain_text import csv_text
 from sfm.files.result_tables import MOMENTS
-from sfm.network import Network
+from sfm.model.camera import Camera
+from sfm.model.conventions import METRES, angles_from_rotation
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 
 MIN_CONTROL = 3  # points that fix position, attitude and scale
 EXTERIOR = ("image", "X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")

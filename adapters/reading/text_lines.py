@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, MAX_ROWS, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_NAME, is_name, shorten
 from sfm.files.whole_files import whole_file
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import SurveyFileError
 
 MAX_LINES = 2 * MAX_ROWS  # as for tables
 MAX_LINE = 10_000_000  # characters; the image points of a photograph can be on one line

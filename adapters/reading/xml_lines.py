@@ -14,10 +14,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.errors import SurveyFileError, one_line
 from sfm.files.csv_tables import MAX_NUMBER
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import SurveyFileError, one_line
 
 MAX_XML_BYTES = 4_000_000_000
 MAX_KEPT_BYTES = 1_000_000_000  # of memory; an export with 100,000 cameras takes half of it

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import FloatArray
-from sfm.rendering.render import write_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, join_marks
-from sfm.rendering.scene_file import Staging
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import FloatArray
+from sfm.products.rendering.render import write_photographs
+from sfm.products.rendering.scene import CircularTargets, Faces, Light, Optics, Scene, coded_ring, join_marks
+from sfm.products.rendering.scene_file import Staging
 from sfm.targets.codes.plates import code_family
 
 EPOCHS = {"first": 0.0, "second": 0.15, "third": 0.4}  # sag at mid-span, mm

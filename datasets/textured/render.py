@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.camera import Camera, camera_from_values, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray
 
 SIZE_PX = (1000, 800)
 PIXEL_MM = (0.006, 0.006)

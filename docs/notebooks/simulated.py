@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import sfm
-from sfm.camera import project
-from sfm.conventions import FloatArray
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray
 
 NOISE_PX = 0.1
 LENS = (("K1", 4e-4), ("x0", 0.06), ("y0", -0.04))

@@ -37,14 +37,14 @@ from sfm.adjustment.engine.observed import ObservedKind, observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
-from sfm.arguments import checked_arguments
-from sfm.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.kernels.threads import own_threads
-from sfm.network import Network
-from sfm.observations.pose import exterior_jacobian
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.observations.pose import exterior_jacobian
+from sfm.runtime.threads import own_threads
 
 # Distance from the origin, in extents of the network, at which an axis is reduced: three digits are lost.
 MAX_EXTENTS = 1000.0

@@ -34,10 +34,10 @@ from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.normals import Equations, solve_transposed, times_reduced
 from sfm.adjustment.engine.observed import ObservedKind, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import DivergedError, GeometryError
-from sfm.kernels.compiling import kernel
-from sfm.network import Network
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.errors import DivergedError, GeometryError
+from sfm.model.network import Network
+from sfm.runtime.compiling import kernel
 
 MIN_CARRIERS = 3  # points needed to fix position, attitude and scale
 # Share of the largest component of a null vector from which a parameter counts as open.

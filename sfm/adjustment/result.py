@@ -9,15 +9,15 @@ from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted, html_table, text_table
-from sfm.distributions import FALSE_ALARM, LEVEL, Levels
-from sfm.estimate import Estimate, values_of
-from sfm.network import Network
-from sfm.observations.kind import Group
-from sfm.remarks.remark import Remark
-from sfm.remarks.verdict import Verdict
-from sfm.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted, html_table, text_table
+from sfm.model.distributions import FALSE_ALARM, LEVEL, Levels
+from sfm.model.estimate import Estimate, values_of
+from sfm.model.network import Network
+from sfm.model.observations.kind import Group
+from sfm.model.remarks.remark import Remark
+from sfm.model.remarks.verdict import Verdict
+from sfm.model.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
 
 # Relative rounding of an image coordinate. Computed coordinates are exact to about 1e-15, or to 1e-10 if
 # errors of control strain their network; measured coordinates are exact to 1e-7 at best.

@@ -47,17 +47,17 @@ from sfm.adjustment.quality.statistics import (
     standardised_residuals,
 )
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted
-from sfm.distortion.models import MODELS, Role
-from sfm.distributions import FALSE_ALARM, Levels, level_of_single, normal_sf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.kernels.threads import own_threads
-from sfm.network import Network
-from sfm.reduced_network import check_network, check_number
-from sfm.remarks.remark import Remark, remark
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.distributions import FALSE_ALARM, Levels, level_of_single, normal_sf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.reduced_network import check_network, check_number
+from sfm.model.remarks.remark import Remark, remark
+from sfm.runtime.threads import own_threads
 
 FREE = Datum("free")
 MIN_HOLD = 0.01  # largest weight of the image points of a photograph below which none of them fits

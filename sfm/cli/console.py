@@ -11,9 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from sfm.cli.commands.starting import FAILED
-from sfm.display import MAX_LISTED, counted, listed, program_name, wrapped
-from sfm.remarks.remark import Severity
-from sfm.remarks.verdict import Line, Verdict
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.display import MAX_LISTED, counted, listed, program_name, wrapped
+from sfm.model.remarks.remark import Severity
+from sfm.model.remarks.verdict import Line, Verdict
 from sfm.report.findings import Findings
 from sfm.report.page import Banner
 from sfm.report.phrases import (
@@ -29,7 +30,6 @@ from sfm.report.phrases import (
     words_left_out,
 )
 from sfm.report.unfinished import verdict
-from sfm.result import SurveyResult
 from sfm.survey.unfinished import UnfinishedSurvey
 
 COLOURS = {"good": "green", "fair": "yellow", "bad": "red"}

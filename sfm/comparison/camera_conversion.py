@@ -16,14 +16,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted
-from sfm.distortion.models import CONVERTIBLE, MAX_PARAMETERS, MODELS, Model, Role, observe
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.kernels.compiling import compiled
-from sfm.network import Network, rows_of
+from sfm.model.camera import (
+    Camera,
+    camera_from_values,
+    pixel_from_tangents,
+    pixel_jacobian,
+    tangents_from_pixel,
+)
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.distortion.models import CONVERTIBLE, MAX_PARAMETERS, MODELS, Model, Role, observe
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
+from sfm.runtime.compiling import compiled
 
 PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts of a camera without distortion
 GRID_STEPS = 32  # fit points along the longer side: four per period of a misfit that varies as r^9 at most
@@ -54,7 +60,7 @@ def convert_camera(
 
     Args:
         camera: interior orientation to convert.
-        model: a name in sfm.distortion.models.CONVERTIBLE.
+        model: a name in sfm.model.distortion.models.CONVERTIBLE.
         region_px: x_min, y_min, x_max, y_max of the region of the fit, px, (4,); the whole photograph if not
             given.
         held: parameters of the model that must be 0; others compensate as far as possible. If b1 is held,

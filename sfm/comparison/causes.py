@@ -45,10 +45,10 @@ from sfm.comparison.stable_points import (
     robust_weights,
     tests_in_datum,
 )
-from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray, UnitFactor, find_unit
-from sfm.distributions import LEVEL
-from sfm.errors import GeometryError
-from sfm.similarity import MAX_COLLINEAR_RATIO, Similarity, extended_axes, fit_similarity, mean_distance
+from sfm.model.conventions import SWELLING, BoolArray, FloatArray, IntArray, UnitFactor, find_unit
+from sfm.model.distributions import LEVEL
+from sfm.model.errors import GeometryError
+from sfm.model.similarity import MAX_COLLINEAR_RATIO, Similarity, extended_axes, fit_similarity, mean_distance
 
 NEIGHBOURS = 6  # of each point, which form triangles with it
 TRIANGLES = 100  # of the first set that are tried

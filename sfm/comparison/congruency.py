@@ -33,11 +33,11 @@ from sfm.comparison.stable_points import (
     single_tests,
     tests_in_datum,
 )
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted
-from sfm.distributions import FALSE_ALARM
-from sfm.errors import GeometryError
-from sfm.similarity import extended_axes, mean_distance, similarity_motions
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.distributions import FALSE_ALARM
+from sfm.model.errors import GeometryError
+from sfm.model.similarity import extended_axes, mean_distance, similarity_motions
 
 MOTIONS = {"none": 0, "rigid": 6, "similarity": 7}  # number of parameters of motions that are not a change
 MIN_STABLE = 4  # points of a datum: three define it, and one more checks it

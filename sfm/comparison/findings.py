@@ -8,10 +8,10 @@ import numpy as np
 
 from sfm.comparison.causes import Cause
 from sfm.comparison.significance import ResultComparison
-from sfm.conventions import FloatArray
-from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
-from sfm.remarks.verdict import Level, Verdict, judge
-from sfm.solution import MAX_POINTS
+from sfm.model.conventions import FloatArray
+from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.remarks.verdict import Level, Verdict, judge
+from sfm.model.solution import MAX_POINTS
 
 HEADLINES: Mapping[Level, str] = {
     "good": "The points do not differ significantly.",

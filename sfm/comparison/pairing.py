@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.network import rows_of
-from sfm.similarity import Similarity, extended_axes, fit_similarity, mean_distance
-from sfm.solution import MAX_POINTS, UNCODED, Solution
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.network import rows_of
+from sfm.model.similarity import Similarity, extended_axes, fit_similarity, mean_distance
+from sfm.model.solution import MAX_POINTS, UNCODED, Solution
 
 ROUNDING = 1e-9  # of the extent of the object: largest error of double precision and of written digits
 MAX_HELD_VARIANCE = 1e-12  # of the mean variance; a coordinate with less is held fixed

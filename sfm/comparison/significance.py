@@ -19,8 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera
 from sfm.comparison.causes import Cause, find_cause
 from sfm.comparison.congruency import Congruency, congruency
@@ -34,14 +32,16 @@ from sfm.comparison.pairing import (
 )
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
-from sfm.conventions import METRES, BoolArray, FloatArray, IntArray
-from sfm.display import html_table, text_table
-from sfm.distributions import FALSE_ALARM
-from sfm.errors import GeometryError
-from sfm.network import Network
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import Similarity, fit_similarity
-from sfm.solution import Solution
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera
+from sfm.model.conventions import METRES, BoolArray, FloatArray, IntArray
+from sfm.model.display import html_table, text_table
+from sfm.model.distributions import FALSE_ALARM
+from sfm.model.errors import GeometryError
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import Similarity, fit_similarity
+from sfm.model.solution import Solution
 
 FREE_DATUMS = ("free", "")  # in which the covariance of single points gives about the same test
 ALIGNMENTS = ("points", "cameras", "control", "none")

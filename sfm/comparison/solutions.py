@@ -16,17 +16,17 @@ from typing import Protocol
 import numpy as np
 
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
 from sfm.comparison.pairing import rounding_of
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, rows_of
+from sfm.model.similarity import Similarity, fit_similarity
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.intersection import intersect
-from sfm.similarity import Similarity, fit_similarity
 
 MIN_RAYS = 2
 EFFECT_STEPS = 9  # positions along each side of the photograph where interior orientations are compared

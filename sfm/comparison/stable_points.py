@@ -21,11 +21,11 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.linalg.lapack import dpotri
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.distributions import FALSE_ALARM, chi2_isf, f_isf
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.distributions import FALSE_ALARM, chi2_isf, f_isf
+from sfm.model.errors import GeometryError
 
 ROBUST_ROUNDS = 100  # of weighting, which converges long before
 SINGULAR = 1e-12  # share of a covariance before a transformation, below which rounding is left of it

@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import csv_text
-from sfm.solution import MAX_POINTS, Solution
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import SurveyFileError
+from sfm.model.solution import MAX_POINTS, Solution
 
 NAME = "point_covariance.npy"
 ARRAYS = "covariances.npz"

@@ -19,10 +19,10 @@ from typing import TextIO
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import OutputError, SurveyFileError
 from sfm.files.plain_text import MAX_NAME, as_plain, from_cell, is_plain
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import OutputError, SurveyFileError
 
 SIGMAS = ("sx", "sy", "sz")
 COLOURS = ("red", "green", "blue")

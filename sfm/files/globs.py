@@ -10,8 +10,8 @@ from difflib import get_close_matches
 from glob import has_magic
 from pathlib import Path
 
-from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
+from sfm.model.errors import SurveyFileError
 
 MAX_ENTRIES = 500_000  # files and folders that are examined
 BELOW = "**"  # a folder and everything below it

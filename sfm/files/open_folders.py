@@ -30,8 +30,8 @@ from typing import Any
 
 from filelock import lock_descriptor, unlock_descriptor
 
-from sfm.display import listed
-from sfm.errors import FolderInUseError, OutputError, SurveyFileError
+from sfm.model.display import listed
+from sfm.model.errors import FolderInUseError, OutputError, SurveyFileError
 
 MANIFEST = "manifest.json"
 WRITER = "kolinear"

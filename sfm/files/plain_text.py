@@ -33,7 +33,7 @@ from pydantic import (
     ValidationError,
 )
 
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
 
 MAX_TOML_BYTES = 1_000_000  # people write such files; a larger file is something else
 MAX_SAID = 200  # characters of the parser's message

@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_angles
-from sfm.errors import SurveyFileError
-from sfm.estimate import Mounts
 from sfm.files.csv_tables import CsvTable, read_header, read_table
 from sfm.files.plain_text import csv_blocks, csv_text
-from sfm.network import ImagePoints, Network
-from sfm.solution import Solution
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation, rotation_from_angles
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Mounts
+from sfm.model.network import ImagePoints, Network
+from sfm.model.solution import Solution
 
 MOUNTS, MOMENTS = "mounts.csv", "moments.csv"
 VALUES = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-from sfm.errors import OutputError
 from sfm.files.open_folders import locked
+from sfm.model.errors import OutputError
 
 PREFIX = "kolinear-scratch-"
 LOCK = ".lock"

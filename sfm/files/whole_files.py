@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sfm.errors import KolinearError, OutputError
 from sfm.files.open_folders import (
     MANIFEST,
     disk_errors,
@@ -29,6 +28,7 @@ from sfm.files.open_folders import (
     refuse_links,
     sha256_of,
 )
+from sfm.model.errors import KolinearError, OutputError
 
 SYNCED = 8  # files that are flushed to the disk at a time
 ROOM_BYTES = 1 << 20  # size of a trial file, which shows why a library could not write

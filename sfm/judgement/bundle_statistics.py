@@ -37,11 +37,11 @@ from sfm.adjustment.quality.variance_components import (
     by_source,
 )
 from sfm.adjustment.result import Adjustment, computed_once
-from sfm.conventions import FloatArray, IntArray
 from sfm.judgement.calibrated_cameras import families, family_of_photographs
 from sfm.judgement.checks import rms_of_groups
-from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
-from sfm.observations.control_and_bars import InteriorObservations, ObjectPoints, ScaleBars
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
+from sfm.model.observations.control_and_bars import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import ray_angles
 
 WEAK_DEG = 10.0  # below this angle a point is eleven times less precise along its rays than across

@@ -11,12 +11,12 @@ import numpy as np
 
 from sfm.adjustment.quality.correlations import observed_part, projection_map
 from sfm.adjustment.result import Adjustment, computed_once
-from sfm.camera import Camera, camera_families, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.distortion.models import MODELS, Parameter, Role
 from sfm.judgement.checks import root_mean_square
+from sfm.judgement.survey_result import SeenPlate, SurveyResult
 from sfm.matching.epipolar import essential_matrices
-from sfm.result import SeenPlate, SurveyResult
+from sfm.model.camera import Camera, camera_families, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.model.distortion.models import MODELS, Parameter, Role
 
 TINY = float(np.finfo(float).tiny)
 

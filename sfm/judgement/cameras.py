@@ -9,11 +9,11 @@ import numpy as np
 
 from sfm.adjustment.quality.consistency import Consistency, larger_than_the_others
 from sfm.adjustment.quality.statistics import more_than_chance
-from sfm.conventions import FloatArray
-from sfm.distortion.models import Role
 from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamera
-from sfm.remarks.remark import EXPECTED_SIGMAS, Quantity, Remark, remark, unless_note
-from sfm.result import PhotographTargets, SurveyResult
+from sfm.judgement.survey_result import PhotographTargets, SurveyResult
+from sfm.model.conventions import FloatArray
+from sfm.model.distortion.models import Role
+from sfm.model.remarks.remark import EXPECTED_SIGMAS, Quantity, Remark, remark, unless_note
 
 DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, variance_components
 from sfm.adjustment.result import Adjustment, computed_once
-from sfm.conventions import FloatArray, IntArray
-from sfm.observations.kind import is_observed
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.observations.kind import is_observed
 
 MAX_LISTED = 10  # largest residuals
 TOLD_APART = 0.01  # relative difference beyond which sigma0 of the image points is stated separately

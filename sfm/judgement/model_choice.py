@@ -5,7 +5,7 @@ the solution of another model, the parameters that it adds, and what is reported
 solves the models and takes the solution with the most evidence, which is the gain minus the price. A choice
 that a test has decided before has evidence without limit.
 
-The price is that of the further parameters (`sfm.likelihood.price_of`), and ln of the number of alternatives
+The price is that of the further parameters (`sfm.model.likelihood.price_of`), and ln of the number of alternatives
 over the level. Chance makes a wrong model likelier than the right one by the factor 1 / level in a share of
 at most `level` of all cases. Another solution with no further parameters has no price.
 
@@ -22,9 +22,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from sfm.distributions import FALSE_ALARM, Levels
-from sfm.errors import GeometryError
-from sfm.likelihood import price_of
+from sfm.model.distributions import FALSE_ALARM, Levels
+from sfm.model.errors import GeometryError
+from sfm.model.likelihood import price_of
 
 Solution = TypeVar("Solution")
 Model = TypeVar("Model")

@@ -18,9 +18,9 @@ import numpy as np
 
 from sfm.adjustment.quality.consistency import MIN_UNEVEN_RATIO
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
-from sfm.distributions import chi2_isf, normal_ppf
-from sfm.remarks.remark import Remark, remark
+from sfm.model.conventions import FloatArray
+from sfm.model.distributions import chi2_isf, normal_ppf
+from sfm.model.remarks.remark import Remark, remark
 
 STEP = 0.01  # relative difference below which two stated standard deviations are equal
 MEDIAN = float(chi2_isf(0.5, 1))  # m, of chi-square with one degree of freedom

@@ -26,9 +26,6 @@ from sfm.adjustment.quality.variance_components import (
     INTERIOR,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import METRES, BoolArray
-from sfm.display import counted, program_name
-from sfm.distributions import binomial_sf, normal_ppf
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
 from sfm.judgement.cameras import camera_remarks, edges_of, sharpness_remarks
@@ -41,11 +38,14 @@ from sfm.judgement.checks import (
     sigma0_of,
 )
 from sfm.judgement.stated_precision import stated_precision_remarks
-from sfm.network import rows_of
-from sfm.observation_residuals import GivenResiduals, GivenValue
-from sfm.remarks.remark import Grade, Remark, remark, unless_note
-from sfm.remarks.verdict import Level, Verdict, judge
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import METRES, BoolArray
+from sfm.model.display import counted, program_name
+from sfm.model.distributions import binomial_sf, normal_ppf
+from sfm.model.network import rows_of
+from sfm.model.observation_residuals import GivenResiduals, GivenValue
+from sfm.model.remarks.remark import Grade, Remark, remark, unless_note
+from sfm.model.remarks.verdict import Level, Verdict, judge
 
 MM = 1e-3  # m
 JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "scale bars": "scale"}

@@ -1,6 +1,5 @@
 """The public names of `sfm.matching`, a row each."""
 
-from sfm.kernels.sampling import resample as resample
 from sfm.matching.conjugate import match_points as match_points
 from sfm.matching.conjugate_patches import ConjugatePoints as ConjugatePoints
 from sfm.matching.correlation import NccMatches as NccMatches
@@ -23,3 +22,4 @@ from sfm.matching.tracks.interest import InterestPoints as InterestPoints
 from sfm.matching.tracks.interest import NaturalPoints as NaturalPoints
 from sfm.matching.tracks.interest import foerstner_points as foerstner_points
 from sfm.matching.tracks.interest import natural_points as natural_points
+from sfm.runtime.sampling import resample as resample

@@ -21,9 +21,6 @@ from itertools import combinations
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
-from sfm.errors import GeometryError
 from sfm.matching.conjugate_patches import (
     METHODS,
     ConjugatePoints,
@@ -45,6 +42,9 @@ from sfm.matching.correlation import (
 )
 from sfm.matching.radiometry import grey_of, grey_of_8_bit, shrink_photograph
 from sfm.matching.tracks.features import match_features, sift_features
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
 
 TILE_PX = 128  # side of the squares whose spectra are averaged
 LOBE = 2  # frequencies on either side over which the window of a tile spreads each frequency

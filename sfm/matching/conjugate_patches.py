@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.sampling import AFTER, BEFORE
 from sfm.matching.correlation import (
     START_CORRELATION,
     LsmFlag,
@@ -30,6 +28,8 @@ from sfm.matching.lsm.patch_equations import MARGIN, linear_part
 from sfm.matching.lsm.surface_planes import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import equalise_histogram, grey_of
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.sampling import AFTER, BEFORE
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
 MAX_BIAS_PX = 1.0  # of a match whose surface is curved

@@ -15,12 +15,12 @@ from enum import IntFlag
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled, compiled_fast
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.runtime.compiling import compiled, compiled_fast
 
 
 class NccFlag(IntFlag):

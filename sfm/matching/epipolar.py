@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.arguments import check_indices, checked_arguments
-from sfm.camera import project, ray_directions, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray, skew
-from sfm.estimate import Estimate
-from sfm.kernels.compiling import compiled
+from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.camera import project, ray_directions, tangents_from_pixel
+from sfm.model.conventions import FloatArray, IntArray, skew
+from sfm.model.estimate import Estimate
+from sfm.runtime.compiling import compiled
 
 VERTICES = 65  # of a path; between two of them ordinary distortion bends it by less than 0.1 px
 

@@ -18,9 +18,9 @@ from threading import Lock
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import GeometryError, PhotographError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError, PhotographError
 
 MEMORY_BYTES = 200_000_000  # of photographs kept as they were read: 16 of 12 megapixels with 8 bit
 GREY_BYTES = 100_000_000  # of photographs kept in single precision

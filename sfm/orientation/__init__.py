@@ -10,7 +10,7 @@
 - `intersect`: object points from the rays of oriented photographs.
 - `orient_absolute`: a model onto control.
 
-Rays are tangents u = -U/W, v = -V/W; `sfm.camera.tangents_from_pixel` computes them from pixels. Other
+Rays are tangents u = -U/W, v = -V/W; `sfm.model.camera.tangents_from_pixel` computes them from pixels. Other
 methods for resection, pairs and scanned photographs are in `sfm.textbook`.
 
     >>> import numpy as np

@@ -1,5 +1,7 @@
 """The public names of `sfm.orientation`, a row each."""
 
+from sfm.model.similarity import AbsoluteOrientation as AbsoluteOrientation
+from sfm.model.similarity import orient_absolute as orient_absolute
 from sfm.orientation.incremental.sequence import Orientation as Orientation
 from sfm.orientation.incremental.sequence import orient as orient
 from sfm.orientation.intersection import Intersection as Intersection
@@ -18,5 +20,3 @@ from sfm.orientation.resection.least_squares import tangents_of as tangents_of
 from sfm.orientation.resection.ransac import RobustResection as RobustResection
 from sfm.orientation.resection.ransac import expected_trials as expected_trials
 from sfm.orientation.resection.ransac import resect_robust as resect_robust
-from sfm.similarity import AbsoluteOrientation as AbsoluteOrientation
-from sfm.similarity import orient_absolute as orient_absolute

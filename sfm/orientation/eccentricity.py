@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import MAD_TO_SIGMA, FloatArray, IntArray
-from sfm.network import sum_rows
+from sfm.model.conventions import MAD_TO_SIGMA, FloatArray, IntArray
+from sfm.model.network import sum_rows
 
 STEPS = 30  # largest number of Gauss-Newton steps; six to ten are usual
 SETTLED = 1e-8  # last change of the normal, rad, and relative change of the radius

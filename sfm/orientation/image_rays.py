@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray, skew
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, rows_of
 from sfm.orientation.intersection import Intersection, intersect
 
 PLANAR_POINTS = 4

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.arguments import check_indices, checked_arguments
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import solve_scaled
+from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import solve_scaled
 
 MAX_STEPS = 20
 CONVERGED = 1e-13  # last step, relative to the distance of the point

@@ -13,12 +13,10 @@ import cv2
 import numpy as np
 from scipy.special import fdtri
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import cross, solve_scaled, turn
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 from sfm.orientation.image_rays import (
     PLANAR_POINTS,
     decompose_homography,
@@ -27,6 +25,8 @@ from sfm.orientation.image_rays import (
 )
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import rotation_from_position
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import cross, solve_scaled, turn
 
 UNKNOWNS = 5
 MAX_STEPS = 30

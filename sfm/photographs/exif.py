@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import ExifTags, Image
 
-from sfm.conventions import FloatArray
-from sfm.errors import PhotographError
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import PhotographError
 
 # warnings.catch_warnings is not thread-safe, and several threads read photographs.
 _PILLOW = Lock()

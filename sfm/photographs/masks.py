@@ -18,9 +18,9 @@ from threading import Lock
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import why_no_folder
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_mask
 

@@ -12,9 +12,9 @@ from typing import overload
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray
-from sfm.errors import PhotographError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray
+from sfm.model.errors import PhotographError
 from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 
 # PhotographError states the fault of a file; OpenCV's warnings on private TIFF tags do not help.

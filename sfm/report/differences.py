@@ -10,8 +10,8 @@ import numpy as np
 
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import InteriorDifference, ResultComparison
-from sfm.conventions import FloatArray
-from sfm.display import counted
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plots import plot
 from sfm.report.page import (

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.display import counted, listed
-from sfm.distributions import POWER
-from sfm.epochs.displacements import Displacements
-from sfm.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted, listed
+from sfm.model.distributions import POWER
+from sfm.products.epochs.displacements import Displacements
+from sfm.products.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
 from sfm.report.figures.comparisons import difference_figure, plot_series
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import plot

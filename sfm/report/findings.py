@@ -32,11 +32,11 @@ from sfm.judgement.checks import (
     precision_of,
     sigma0_of,
 )
+from sfm.judgement.survey_result import SurveyResult
 from sfm.judgement.verdict import with_remark as judge_with_remark
-from sfm.remarks.remark import Remark
-from sfm.remarks.verdict import Verdict
+from sfm.model.remarks.remark import Remark
+from sfm.model.remarks.verdict import Verdict
 from sfm.report.protocol import Protocol, protocol_of
-from sfm.result import SurveyResult
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.display import counted
-from sfm.planning.plan import Further
-from sfm.remarks.verdict import Line
+from sfm.model.display import counted
+from sfm.model.remarks.verdict import Line
+from sfm.model.solution import Solution
+from sfm.products.planning.plan import Further
 from sfm.report.page import Banner, Column, Note, Page, Section, Table
 from sfm.report.phrases import length_of
 from sfm.report.planning import exterior_table, shot_columns, shot_rows
 from sfm.report.viewer.embedded import scene_of_stored, viewer_of
 from sfm.report.viewer.pictures import Pictures
-from sfm.solution import Solution
 
 HIDDEN = Line("note", "Obstructions at a new station are not known: check the view before you photograph.")
 

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.display import counted
 from sfm.files.result_tables import GIVEN
 from sfm.judgement.bundle_statistics import Given
-from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.judgement.survey_result import ControlCheck, PlacedEquipment
+from sfm.model.display import counted
+from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -34,7 +35,6 @@ from sfm.report.phrases import (
     with_exponent,
     with_sigma,
 )
-from sfm.result import ControlCheck, PlacedEquipment
 
 HEADINGS = {
     "control point": "Control",

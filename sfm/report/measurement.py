@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.display import counted, plural
 from sfm.files.covariance_file import write_covariance
-from sfm.geometry.alignment import Alignment
-from sfm.geometry.shapes.fit import ShapeFit
-from sfm.geometry.tolerance import DECISIONS, Deviations
-from sfm.inspection.acceptance import Acceptance
-from sfm.inspection.measure import Measurement
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted, plural
+from sfm.model.solution import MAX_POINTS, Solution
+from sfm.products.geometry.alignment import Alignment
+from sfm.products.geometry.shapes.fit import ShapeFit
+from sfm.products.geometry.tolerance import DECISIONS, Deviations
+from sfm.products.inspection.acceptance import Acceptance
+from sfm.products.inspection.measure import Measurement
 from sfm.report.figures.comparisons import deviation_figure, length_error_figure
 from sfm.report.figures.plots import plot
 from sfm.report.page import (
@@ -36,7 +37,6 @@ from sfm.report.page import (
 )
 from sfm.report.phrases import fixed, general, signed, significant, with_sigma
 from sfm.report.viewer.embedded import measurement_viewer
-from sfm.solution import MAX_POINTS, Solution
 
 PICTURE = (
     "Length measurement error over length. Bars are the expanded uncertainty of the calibration, lines the "

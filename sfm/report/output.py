@@ -33,9 +33,6 @@ from typing import Any, Self
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray
-from sfm.display import counted, listed
-from sfm.errors import OutputError, SurveyFileError
 from sfm.files.covariance_file import write_covariance
 from sfm.files.csv_tables import read_table
 from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, refuse_foreign_folder
@@ -43,7 +40,11 @@ from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
 from sfm.judgement.checks import adjusted_sigmas, root_mean_square
-from sfm.remarks.remark import remark
+from sfm.judgement.survey_result import StageTime, SurveyResult
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted, listed
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.remarks.remark import remark
 from sfm.report.figures.overlays import Overlay, draw_overlays
 from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
@@ -56,7 +57,6 @@ from sfm.report.tables.summary import write_summary
 from sfm.report.unfinished import verdict
 from sfm.report.viewer.embedded import scene_of_result, viewer_of
 from sfm.report.viewer.pictures import BUDGET_MB, cut_pictures
-from sfm.result import StageTime, SurveyResult
 from sfm.runtime.progress import SILENT, Progress, give_back_memory
 from sfm.survey.unfinished import UnfinishedSurvey
 

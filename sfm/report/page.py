@@ -17,10 +17,10 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from sfm.display import aligned, counted
 from sfm.files.plain_text import csv_text, or_none
 from sfm.files.result_tables import ResultTable
-from sfm.remarks.verdict import Line, Verdict
+from sfm.model.display import aligned, counted
+from sfm.model.remarks.verdict import Line, Verdict
 from sfm.report.figures.plot_data import Plot
 from sfm.report.phrases import significant
 from sfm.report.viewer.embedded import Viewer

@@ -25,9 +25,9 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-from sfm.display import NO_BREAK, bound
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_folder
+from sfm.model.display import NO_BREAK, bound
 from sfm.report.figures.plot_data import Plot
 from sfm.report.page import (
     Cards,

@@ -12,16 +12,16 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import GlobalTest
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import SUPERSCRIPTS, FloatArray
-from sfm.conventions import finer_unit as finer_unit
-from sfm.display import NO_BREAK, counted, listed
-from sfm.distributions import normal_ppf
 from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
 from sfm.judgement.checks import Precision, Sigma0
-from sfm.remarks.remark import probability as probability
-from sfm.remarks.remark import significant as significant
+from sfm.judgement.survey_result import ControlCheck, SurveyResult
+from sfm.model.conventions import SUPERSCRIPTS, FloatArray
+from sfm.model.conventions import finer_unit as finer_unit
+from sfm.model.display import NO_BREAK, counted, listed
+from sfm.model.distributions import normal_ppf
+from sfm.model.remarks.remark import probability as probability
+from sfm.model.remarks.remark import significant as significant
 from sfm.report.findings import Findings
-from sfm.result import ControlCheck, SurveyResult
 
 MIN_PLAIN_VALUE = 1e-3  # parameters below it are written with an exponent
 ROUNDING = 1e-10  # standard deviation over value below which it counts as zero

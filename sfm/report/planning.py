@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.quality.statistics import reliability
-from sfm.camera import Camera
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.display import counted
-from sfm.distributions import LEVEL, POWER
 from sfm.files.result_tables import IN_FILES
 from sfm.judgement.calibrated_cameras import rigs_of
-from sfm.observations.control_and_bars import ScaleBars
-from sfm.observations.pose import MountObservations
-from sfm.observations.tables import TABLES
-from sfm.planning import MIN_PIXELS
-from sfm.planning.plan import Plan, verdict_of_plan
-from sfm.planning.prediction import found_displacement
-from sfm.planning.stations import Shot, Stations
-from sfm.planning.weakness import Calibratability, Contribution
+from sfm.model.camera import Camera
+from sfm.model.conventions import FloatArray, angles_from_rotation
+from sfm.model.display import counted
+from sfm.model.distributions import LEVEL, POWER
+from sfm.model.observations.control_and_bars import ScaleBars
+from sfm.model.observations.pose import MountObservations
+from sfm.model.observations.tables import TABLES
+from sfm.products.planning import MIN_PIXELS
+from sfm.products.planning.plan import Plan, verdict_of_plan
+from sfm.products.planning.prediction import found_displacement
+from sfm.products.planning.stations import Shot, Stations
+from sfm.products.planning.weakness import Calibratability, Contribution
 from sfm.report.page import (
     YES,
     Column,

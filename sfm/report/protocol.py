@@ -17,10 +17,6 @@ import numpy as np
 from sfm.adjustment.quality.gross_errors.robust import HUBER, TUKEY
 from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.result import Adjustment
-from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
-from sfm.conventions import FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.distributions import f_sf
 from sfm.judgement.bundle_statistics import Given
 from sfm.judgement.checks import (
     ControlCoordinate,
@@ -28,7 +24,11 @@ from sfm.judgement.checks import (
     compare_coordinate,
     standard_deviations,
 )
-from sfm.result import ControlCheck, SurveyResult
+from sfm.judgement.survey_result import ControlCheck, SurveyResult
+from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.distortion.models import Role
+from sfm.model.distributions import f_sf
 
 EDGE_STEPS = 9  # positions along a side of the photograph at which distortion is evaluated
 

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import IntArray
-from sfm.display import counted
 from sfm.judgement.bundle_statistics import given_of
 from sfm.judgement.checks import rms_of_groups, standard_deviations
-from sfm.remarks.verdict import judge
+from sfm.model.conventions import IntArray
+from sfm.model.display import counted
+from sfm.model.remarks.verdict import judge
+from sfm.products.refining.oriented_windows import PREFIX
+from sfm.products.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
+from sfm.products.refining.windows import MIN_RAYS
 from sfm.report.given import given_parts
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes, columns, file_columns
 from sfm.report.phrases import general, significant
-from sfm.survey.refining.oriented_windows import PREFIX
-from sfm.survey.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
-from sfm.survey.refining.windows import MIN_RAYS
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from zlib import crc32
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, angles_from_rotation
-from sfm.display import counted
-from sfm.errors import GeometryError, OutputError
 from sfm.files.whole_files import whole_file
 from sfm.matching.conjugate_patches import ConjugatePoints
+from sfm.model.conventions import AnyArray, angles_from_rotation
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError, OutputError
 from sfm.orientation.resection.least_squares import ResectionSolution
 from sfm.report.page import Column, Table, plain
 from sfm.textbook.resection.by_method import ResectionResult

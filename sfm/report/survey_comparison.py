@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
-from sfm.display import counted, program_name
 from sfm.judgement.checks import point_sigma
-from sfm.remarks.remark import of_kind
+from sfm.model.display import counted, program_name
+from sfm.model.remarks.remark import of_kind
 from sfm.report.findings import Findings
 from sfm.report.page import Column, Heading, Note, Paragraph, Part, Statement, Table, columns, facts
 from sfm.report.phrases import finer_unit, fixed, general, scientific, significant, words_left_out

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlation
-from sfm.conventions import FloatArray
-from sfm.display import counted, listed
-from sfm.distributions import POWER
 from sfm.files.result_tables import VARIANCE_COMPONENTS
 from sfm.judgement.bundle_statistics import WEAK_DEG, Coverage, Geometry
 from sfm.judgement.calibrated_cameras import InteriorParameter
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted, listed
+from sfm.model.distributions import POWER
 from sfm.report.findings import Findings
 from sfm.report.given import given_parts
 from sfm.report.page import (

@@ -14,9 +14,10 @@ from importlib.metadata import version
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import angles_from_rotation
-from sfm.display import agreeing, counted, program_name
 from sfm.files.result_tables import LEFT_OUT
+from sfm.judgement.survey_result import sort_likeliest_first
+from sfm.model.conventions import angles_from_rotation
+from sfm.model.display import agreeing, counted, program_name
 from sfm.report import survey_quality as quality_of
 from sfm.report.figures.overlays import Overlay
 from sfm.report.figures.plot_data import Plot
@@ -57,7 +58,6 @@ from sfm.report.phrases import (
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.tables.csv_files import left_out_rows, table_stems
 from sfm.report.viewer.embedded import Viewer
-from sfm.result import sort_likeliest_first
 
 MAX_LISTED = 60  # rejected points and thumbnails on the page
 MAX_OPEN = 60  # object points that are shown without a click

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.display import counted
 from sfm.files.open_folders import disk_errors
 from sfm.files.whole_files import refuse_existing, whole_file
-from sfm.remarks.verdict import Line
+from sfm.model.display import counted
+from sfm.model.remarks.verdict import Line
 from sfm.report.page import Banner, Column, FoldedParts, Page, Section, Table, axes, facts
 from sfm.report.pages import html
 from sfm.report.phrases import fixed

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sfm.errors import KolinearError, one_line
+from sfm.model.errors import KolinearError, one_line
 
 BAD_INPUT = 2  # exit code if a person must correct something
 FAULT = 70  # exit code; EX_SOFTWARE of sysexits.h

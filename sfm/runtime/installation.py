@@ -18,7 +18,7 @@ import os
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 
-from sfm.errors import InstallationError, KolinearError
+from sfm.model.errors import InstallationError, KolinearError
 
 SETTINGS = (".numba_config.yaml", "matplotlibrc")
 FOREIGN = (os.path.join("sfm", "binarysearch.py"), os.path.join("adapters", "composition.py"))

@@ -15,13 +15,13 @@ import numpy as np
 from sfm.adjustment.quality.correlations import exterior_correlations, strong_correlations
 from sfm.comparison.solutions import Baseline, BaselineComparison, compare_baseline
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
-from sfm.conventions import IntArray
-from sfm.errors import KolinearError, MissingLibraryError
-from sfm.estimate import Estimate
+from sfm.judgement.survey_result import CheckPoint, SeenPlate, StageTime, SurveyResult
 from sfm.judgement.verdict import judge_survey
-from sfm.network import Network
-from sfm.remarks.remark import Remark, remark
-from sfm.result import CheckPoint, SeenPlate, StageTime, SurveyResult
+from sfm.model.conventions import IntArray
+from sfm.model.errors import KolinearError, MissingLibraryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark, remark
 from sfm.runtime.progress import StageClock
 from sfm.survey.adjusting.solution import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result

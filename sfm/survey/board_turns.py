@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.camera import Camera, project
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import f_isf
-from sfm.estimate import Estimate
-from sfm.network import rows_of
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import fit_similarity
+from sfm.model.camera import Camera, project
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import f_isf
+from sfm.model.estimate import Estimate
+from sfm.model.network import rows_of
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import fit_similarity
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.target_network import build_network, name_coded

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import pixel_curvature, pixel_jacobian
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.judgement.survey_result import Eccentricity
+from sfm.model.camera import pixel_curvature, pixel_jacobian
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, rows_of
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
-from sfm.remarks.remark import Remark, remark
-from sfm.result import Eccentricity
 from sfm.survey.inputs.given import Diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey

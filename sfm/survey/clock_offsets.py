@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.conventions import IntArray
-from sfm.distributions import f_isf
-from sfm.estimate import Estimate
+from sfm.model.conventions import IntArray
+from sfm.model.distributions import f_isf
+from sfm.model.estimate import Estimate
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.rigs import middle_rotation, with_moments

@@ -20,14 +20,14 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import KNOWN_WITHOUT, Camera, corner_shift
-from sfm.distortion.models import MODELS, Role
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
-from sfm.network import Network, without_given
-from sfm.reduced_network import reduce_network, select_supported
-from sfm.remarks.remark import Remark, remark
+from sfm.model.camera import KNOWN_WITHOUT, Camera, corner_shift
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, without_given
+from sfm.model.reduced_network import reduce_network, select_supported
+from sfm.model.remarks.remark import Remark, remark
 from sfm.survey.inputs.calibration import plate_family
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import CameraSettings

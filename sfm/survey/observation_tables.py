@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import listed
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
-from sfm.network import Network
-from sfm.observations.kind import PHOTOGRAPH, POINT, Group, RowKind, TableKind
-from sfm.observations.rigid_frames import RigidFrames
-from sfm.observations.tables import TABLES
-from sfm.remarks.remark import Remark, remark
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import listed
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import Network
+from sfm.model.observations.kind import PHOTOGRAPH, POINT, Group, RowKind, TableKind
+from sfm.model.observations.rigid_frames import RigidFrames
+from sfm.model.observations.tables import TABLES
+from sfm.model.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
 from sfm.survey.inputs.given import AXES, ScaleBar, refuse_tiny_sigmas
 

@@ -21,19 +21,19 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values
-from sfm.conventions import BoolArray, IntArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.model_choice import Choice, solve_likeliest
-from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import BoolArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.likelihood import areas_of_photographs, log_likelihood
+from sfm.model.network import ExteriorObservations, Network, ObjectPoints, ScaleBars, rows_of
+from sfm.model.reduced_network import reduce_network
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, MIN_POINTS, Judge, Orientation, orient
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import fit_similarity
 from sfm.survey.board_turns import agree_on_turns
 from sfm.survey.circles import circle_misfit
 from sfm.survey.clock_offsets import agree_on_clocks

@@ -21,16 +21,23 @@ from typing import TypeVar
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_angles, rotation_from_vector, skew
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate, values_of
-from sfm.network import Network
-from sfm.observations.control_and_bars import ScaleBars
-from sfm.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
-from sfm.observations.pose import MountObservations
-from sfm.result import ControlCheck
-from sfm.similarity import Similarity, fit_similarity, nearest_rotation
+from sfm.judgement.survey_result import ControlCheck
+from sfm.model.conventions import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    rotation_from_angles,
+    rotation_from_vector,
+    skew,
+)
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate, values_of
+from sfm.model.network import Network
+from sfm.model.observations.control_and_bars import ScaleBars
+from sfm.model.observations.kind import PHOTOGRAPH, POINT, Kind, TableKind, inverse_of_observed
+from sfm.model.observations.pose import MountObservations
+from sfm.model.similarity import Similarity, fit_similarity, nearest_rotation
 
 K = TypeVar("K", bound=Kind)
 Weighted = TableKind | ScaleBars  # with one standard deviation for each value

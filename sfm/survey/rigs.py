@@ -19,13 +19,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray, rotation_from_angles
-from sfm.display import counted, listed
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate, Mounts
-from sfm.network import Network
-from sfm.observations.pose import MountObservations
-from sfm.similarity import Similarity, nearest_rotation
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_angles
+from sfm.model.display import counted, listed
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import Network
+from sfm.model.observations.pose import MountObservations
+from sfm.model.similarity import Similarity, nearest_rotation
 from sfm.survey.inputs.settings import RigSettings
 from sfm.survey.inputs.survey import Survey
 

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import project
-from sfm.conventions import FloatArray, IntArray
-from sfm.estimate import Estimate
 from sfm.matching.tracks.correspondence import match_targets
-from sfm.network import ImagePoints, Network, ScaleBars
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.diagnosis.codes_found import missing_plates, sides_not_found, small_codes
 from sfm.survey.inputs.given import ScaleBar

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import BoolArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.network import Network
+from sfm.judgement.survey_result import FailedImage, PhotographTargets, StageTime
+from sfm.model.conventions import BoolArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark
 from sfm.orientation.incremental.sequence import NotOrientedError
-from sfm.remarks.remark import Remark
-from sfm.result import FailedImage, PhotographTargets, StageTime
 from sfm.runtime.progress import StageClock
 from sfm.survey.assembly import settings_by_table
 from sfm.survey.inputs.measurements import Measurements, remarks_on_contradicting

@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import KolinearError, PhotographError
-from sfm.kernels.sampling import as_grey
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import KolinearError, PhotographError
+from sfm.runtime.sampling import as_grey
 from sfm.targets.codes.boards import find_boards
 from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import bilinear
-from sfm.kernels.small_algebra import solve_symmetric
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import bilinear
+from sfm.runtime.small_algebra import solve_symmetric
 
 RAYS = 32
 # Spacing of the samples along a ray.

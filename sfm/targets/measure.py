@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import as_grey, bilinear
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import as_grey, bilinear
 from sfm.targets.codes.rings import UNCODED
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
 
 # The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is detected up to half
 # of it, for any size of the target.

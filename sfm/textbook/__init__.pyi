@@ -1,6 +1,6 @@
 """The public names of `sfm.textbook`, a row each."""
 
-from sfm.kernels.small_algebra import positive_roots as positive_roots
+from sfm.runtime.small_algebra import positive_roots as positive_roots
 from sfm.textbook.direct import DirectOrientation as DirectOrientation
 from sfm.textbook.direct import SeparateAdjustment as SeparateAdjustment
 from sfm.textbook.direct import adjust_separately as adjust_separately

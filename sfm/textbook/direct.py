@@ -26,11 +26,11 @@ from sfm.adjustment.engine.collinearity import State, sum_of_squares
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights, step, unknowns_of
-from sfm.arguments import check_indices, checked_arguments
-from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, rows_of
+from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector, skew
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.least_squares import resect_least_squares
 from sfm.orientation.resection.ransac import resect_robust

@@ -8,10 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, FloatArray
-from sfm.display import counted
-from sfm.errors import GeometryError
 from sfm.matching.correlation import (
     NOT_COMPARED,
     OUTPUTS,
@@ -23,6 +19,10 @@ from sfm.matching.correlation import (
     template_corners,
 )
 from sfm.matching.radiometry import FULL_SCALE_8, full_scale, grey_of, grey_of_8_bit, odd_window
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 
 FINE_REACH = 4  # px: a pixel of the level above is 2 px here; doubled to allow for its error
 

@@ -21,14 +21,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.kernels.sampling import resample
-from sfm.network import Network
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
+from sfm.runtime.sampling import resample
 
 BORDER_POINTS = 40  # points per side of a photograph that give the format of its normal image
 MAX_LARGER = 4.0  # largest area of a normal image over that of its photograph; beyond, the base is along rays

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import tangents_of
 
 SIMILARITY, AFFINE = "similarity", "affine"

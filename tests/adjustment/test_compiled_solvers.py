@@ -14,8 +14,8 @@ from sfm.adjustment.engine.cofactors import Cofactors, _complement, cofactors
 from sfm.adjustment.engine.solvers import dense, fronts, multifrontal, multifrontal_factor
 from sfm.adjustment.engine.solvers import fronts as pairs
 from sfm.adjustment.solve import adjust
-from sfm.conventions import AnyArray
-from sfm.warm_up import MANY_IMAGES, _scattered, _strip, made_up_network
+from sfm.cli.warm_up import MANY_IMAGES, _scattered, _strip, made_up_network
+from sfm.model.conventions import AnyArray
 
 FRONTS = (
     fronts.distances,

@@ -18,15 +18,15 @@ from sfm.adjustment.quality.correlations import (
 )
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import MOVED, Alternative
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.score import Reduced, gain_of, reduce_adjustment
-from sfm.network import Network, Source, rows_of
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, Source, rows_of
+from sfm.model.similarity import fit_similarity
 from sfm.report.phrases import describe_neighbours, significant
-from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.choices import solve_survey
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.sources import TEXTURE

@@ -14,10 +14,10 @@ from adapters.formats.sba_text import read_sba_text
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
-from sfm.conventions import angles_from_rotation, pixel_from_image, rotation_from_angles
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import angles_from_rotation, pixel_from_image, rotation_from_angles
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
 from tests.places import ROOT
 from tests.tables import rows_of
 

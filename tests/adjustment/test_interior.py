@@ -18,12 +18,12 @@ from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, project
 from sfm.comparison.solutions import reprojection
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, InteriorObservations, Network, ObjectPoints
+from sfm.model.camera import Camera, project
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, InteriorObservations, Network, ObjectPoints
 from sfm.textbook.direct import adjust_separately
 from tests.synthetic import make_network, perturb, seed_of
 

@@ -20,10 +20,10 @@ from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.fronts import pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.kernels.threads import own_threads
-from sfm.network import ImagePoints, Network
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.runtime.threads import own_threads
 from tests.adjustment.test_null_space import halves, in_fronts, together
 from tests.synthetic import make_network, seed_of
 from tests.synthetic_blocks import FREE, aerial, run

@@ -23,10 +23,10 @@ from sfm.adjustment.engine.solvers.multifrontal_factor import MultifrontalFactor
 from sfm.adjustment.engine.solvers.protocol import Solver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import null_motions
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, ScaleBars
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ScaleBars
 from tests.synthetic import observed_anew, seed_of
 from tests.synthetic_blocks import FREE, HEIGHT, aerial, in_sigmas, lens, run, spoiled, unordered
 

@@ -20,9 +20,9 @@ from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import rank_defect
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import project
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from tests.synthetic import make_network, seed_of
 from tests.synthetic_blocks import aerial, in_sigmas, lens, run
 

@@ -13,14 +13,14 @@ from sfm.adjustment.quality.correlations import _correlations, orientation_corre
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
-from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
-from sfm.result import SurveyResult
 from tests.findings import findings_of
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 

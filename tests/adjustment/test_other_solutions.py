@@ -12,8 +12,8 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality import other_solutions as searched
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
-from sfm.distortion.models import MODELS as CAMERA_MODELS
+from sfm.model.camera import camera_from_values
+from sfm.model.distortion.models import MODELS as CAMERA_MODELS
 from tests.synthetic import make_network, seed_of
 
 

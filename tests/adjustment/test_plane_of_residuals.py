@@ -14,11 +14,11 @@ from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
-from sfm.similarity import fit_similarity
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 
 SIZE_PX = (2000, 1500)

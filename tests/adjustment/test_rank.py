@@ -10,11 +10,11 @@ import pytest
 from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
-from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
-from sfm.observations.point_pairs import CoordinateDifferences
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.observations.point_pairs import CoordinateDifferences
 from tests.synthetic import C_MM, PIXEL_MM, SIZE_PX, make_network, seed_of
 
 FREE = Datum("free")

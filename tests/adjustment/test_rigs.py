@@ -21,9 +21,9 @@ from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from tests.rigs import make_rig
 from tests.synthetic import perturb, seed_of
 

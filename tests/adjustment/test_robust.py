@@ -24,12 +24,12 @@ from sfm.adjustment.quality.gross_errors.robust import (
 from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import fit_similarity
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 
 FREE = Datum("free")

@@ -13,8 +13,8 @@ from sfm.adjustment.quality.gross_errors.robust import _Rays, would_pass
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
 from sfm.adjustment.quality.statistics import standardised_residuals, tau_critical
 from sfm.adjustment.solve import adjust
-from sfm.errors import GeometryError
-from sfm.network import ImagePoints
+from sfm.model.errors import GeometryError
+from sfm.model.network import ImagePoints
 from tests.synthetic import make_network, seed_of
 
 NETWORKS = 50

@@ -13,13 +13,13 @@ from sfm.adjustment.engine.collinearity import collinearity, new_workspace, resi
 from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import angles_from_rotation, rotation_from_angles
-from sfm.distortion.models import GENERAL_MODELS, MODELS
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.observations.pose import angle_jacobian
-from sfm.similarity import fit_similarity
+from sfm.model.conventions import angles_from_rotation, rotation_from_angles
+from sfm.model.distortion.models import GENERAL_MODELS, MODELS
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.model.observations.pose import angle_jacobian
+from sfm.model.similarity import fit_similarity
 from tests.synthetic import make_network, perturb, seed_of
 
 FREE = Datum("free")

@@ -26,7 +26,7 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS
-from sfm.distributions import Levels, level_of_single
+from sfm.model.distributions import Levels, level_of_single
 from tests.synthetic import make_network, seed_of
 
 

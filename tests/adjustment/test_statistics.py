@@ -25,10 +25,10 @@ from sfm.adjustment.quality.statistics import (
 from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.network import ExteriorObservations, InteriorObservations, ObjectPoints, ScaleBars
+from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.network import ExteriorObservations, InteriorObservations, ObjectPoints, ScaleBars
 from tests.synthetic import make_network, seed_of
 
 FREE = Datum("free")

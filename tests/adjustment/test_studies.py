@@ -15,10 +15,10 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.errors import GeometryError
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import fit_similarity
+from sfm.model.conventions import FloatArray, angles_from_rotation
+from sfm.model.errors import GeometryError
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from tests.adjustment.test_robust import one_sided, point_error, rms, scatter_over_predicted
 from tests.synthetic import make_network, perturb, seed_of
 

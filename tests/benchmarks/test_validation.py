@@ -26,9 +26,9 @@ from benchmarks.validation import (
     write_table,
 )
 from sfm.comparison.solutions import reprojection
-from sfm.errors import BackendError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.errors import BackendError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from tests.tables import rows_of
 
 NETWORKS = 60

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm import warm_up
+from sfm.cli import warm_up
 from sfm.cli.commands.starting import compile_first
-from sfm.kernels import warmed
+from sfm.runtime import warmed
 from sfm.targets.detect import find_targets
 from tests.commands import kolinear
 from tests.places import ROOT
@@ -70,9 +70,9 @@ AFTERWARDS = """
 import sys
 from pathlib import Path
 from numba.core.dispatcher import Dispatcher
-from sfm import warm_up
+from sfm.cli import warm_up
 import sfm.report.output
-from sfm.batch.run import run_batch
+from sfm.products.batch.run import run_batch
 from tests.engines import ALONE, HERE, Notes
 
 def compiled():

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from sfm import cli
 from sfm.cli import app
 from sfm.cli.commands import starting
-from sfm.rendering.render import write_photographs
-from sfm.rendering.scene_file import read_scene
+from sfm.products.rendering.render import write_photographs
+from sfm.products.rendering.scene_file import read_scene
 from sfm.report.output import write_result
 from tests.commands import kolinear, refused
 from tests.engines import PLOTLESS
@@ -324,7 +324,7 @@ def test_compiling_is_reported_when_it_happens_and_only_then(tmp_path: Path) -> 
             text=True,
             check=True,
         )
-        assert run.stderr.count("python -m sfm.warm_up") == run.stderr.count("\n") == told
+        assert run.stderr.count("python -m sfm.cli.warm_up") == run.stderr.count("\n") == told
 
 
 def test_ctrl_c_is_no_traceback(

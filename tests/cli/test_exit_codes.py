@@ -12,10 +12,10 @@ from typing import Any, NoReturn
 import cv2
 import pytest
 
-from sfm.batch.run import run_batch
 from sfm.cli.app import app
 from sfm.cli.commands import starting
-from sfm.errors import KolinearError
+from sfm.model.errors import KolinearError
+from sfm.products.batch.run import run_batch
 from sfm.report.output import read_log
 from sfm.runtime.faults import error_in_words, is_fault, working_on
 from tests.commands import kolinear

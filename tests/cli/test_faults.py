@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.errors import FolderInUseError, OutputError
 from sfm.files.open_folders import locked, owner_of
 from sfm.files.whole_files import remove_leftovers
+from sfm.model.errors import FolderInUseError, OutputError
 from sfm.report.output import SurveyLog, read_log
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore, measured_key

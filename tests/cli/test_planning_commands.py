@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapters.formats.result_tables import write_tables
-from sfm.solution import Solution
+from sfm.model.solution import Solution
 from tests.commands import kolinear
 from tests.places import ROOT
 from tests.surveys import write_observed_survey

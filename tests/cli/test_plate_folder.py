@@ -16,9 +16,9 @@ from adapters.formats.registry import ENDINGS, FORMATS
 from sfm.cli.app import app
 from sfm.cli.commands import surveying as drafting
 from sfm.cli.commands.starting import stopped_once
-from sfm.conventions import METRES
-from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.survey.drafting.draft import Draft, draft_survey
+from sfm.model.conventions import METRES
+from sfm.model.errors import KolinearError, OutputError, SurveyFileError
+from sfm.products.drafting.draft import Draft, draft_survey
 from sfm.survey.inputs.settings import Head
 from sfm.survey.inputs.survey_file import read_survey_file
 from tests.commands import kolinear, refused

@@ -18,7 +18,7 @@ from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
 from sfm.cli.commands.inspecting import view
 from sfm.cli.commands.matching import match_command
-from sfm.errors import GeometryError, OutputError, PhotographError, SurveyFileError
+from sfm.model.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import LINE, MAX_PICTURES
 from sfm.report.output import write_result

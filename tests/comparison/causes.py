@@ -17,13 +17,13 @@ import numpy as np
 from sfm.adjustment.solve import adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import compare_results
-from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.epochs.differences import Epoch
-from sfm.epochs.series import analyse_epochs, verdict_of_epochs
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.remarks.remark import kinds_of
-from sfm.solution import Solution
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.solution import Solution
+from sfm.products.epochs.differences import Epoch
+from sfm.products.epochs.series import analyse_epochs, verdict_of_epochs
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 NOISE_PX, BAR_SIGMA = 0.1, 2e-5

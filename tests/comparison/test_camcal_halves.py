@@ -16,8 +16,8 @@ from adapters.formats.registry import format_named, read_comparable, write_any
 from sfm.comparison.camera_conversion import convert_cameras, undistort
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import compare_results
+from sfm.model.remarks.remark import kinds_of
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore

@@ -14,9 +14,9 @@ from sfm.comparison.causes import PointPairs, Row, find_cause, find_pattern, is_
 from sfm.comparison.findings import remarks_of_cause, verdict_of_comparison
 from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.significance import compare_results
-from sfm.conventions import UNITS, rotation_from_vector
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import Similarity
+from sfm.model.conventions import UNITS, rotation_from_vector
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import Similarity
 from tests.comparison.causes import EXPECTED, compared, epochs, expected, pair, transformed
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 

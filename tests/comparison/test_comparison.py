@@ -15,17 +15,17 @@ from benchmarks.random_networks import random_network
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
 from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
 from sfm.comparison.two_adjusters import adjusters
 from sfm.comparison.two_adjusters.adjusters import common_problem, compare_adjusters, grouped_free
-from sfm.conventions import rotation_from_vector
-from sfm.distortion.models import MODELS as CAMERA_MODELS
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
-from sfm.similarity import Similarity
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.distortion.models import MODELS as CAMERA_MODELS
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.similarity import Similarity
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
 from tests.tables import rows_of

@@ -20,15 +20,15 @@ from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.solutions import compare_baseline, reprojection
 from sfm.comparison.stable_points import tests_in_datum as single_tests_in_datum
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.distortion.models import Role
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.remarks.remark import Remark, kinds_of, remark
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.distortion.models import Role
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark, kinds_of, remark
+from sfm.model.similarity import Similarity
+from sfm.model.solution import Solution
 from sfm.report.differences import describe_scale
-from sfm.similarity import Similarity
-from sfm.solution import Solution
 from tests.synthetic import make_network, observed_anew, seed_of, stored_of
 
 DATUMS = ("free", "minimal", "control")

@@ -9,13 +9,13 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.comparison.camera_conversion import convert_camera, corresponding_free, start_values, undistort
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
-from sfm.distortion.models import GENERAL_MODELS, MODELS, Role
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.remarks.remark import of_kind
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
+from sfm.model.distortion.models import GENERAL_MODELS, MODELS, Role
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.remarks.remark import of_kind
 from tests.findings import findings_of
 from tests.other_adjuster import in_house_adjuster
 from tests.synthetic import make_network, seed_of

@@ -12,12 +12,12 @@ from adapters.formats.registry import format_named, read_comparable, write_any
 from sfm.comparison.camera_conversion import convert_cameras, undistort
 from sfm.comparison.pairing import pair_results
 from sfm.comparison.significance import compare_results
-from sfm.conventions import rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.similarity import Similarity
-from sfm.solution import Solution
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import Similarity
+from sfm.model.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 CODED = 12  # of the points bear codes, the others numbers of one run

@@ -15,12 +15,12 @@ from adapters.formats.content import KINDS, Content
 from adapters.formats.registry import read_content, write_content
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.solve import adjust
-from sfm.errors import SurveyFileError
 from sfm.files.covariance_file import NAME, read_covariance, write_covariance
 from sfm.files.result_tables import CONTROL_POINTS, IMAGE_POINTS, POINTS, ResultTable, write_rigs
 from sfm.files.user_cache import PREFIX, scratch_folder
+from sfm.model.errors import SurveyFileError
+from sfm.model.solution import Solution, points_kept_together
 from sfm.pipeline import run_survey
-from sfm.solution import Solution, points_kept_together
 from sfm.survey.inputs.survey import read_survey
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of

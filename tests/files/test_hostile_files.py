@@ -18,18 +18,18 @@ from adapters.colmap.database import read_database, write_database
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.registry import read_any, read_comparable
 from adapters.formats.result_tables import read_result, write_tables
-from sfm.batch.run import find_surveys
-from sfm.errors import KolinearError, SurveyFileError
 from sfm.files import globs
 from sfm.files.csv_tables import read_header, read_table
-from sfm.inspection.planned_survey import read_plan
+from sfm.model.errors import KolinearError, SurveyFileError
 from sfm.pipeline import run_survey
+from sfm.products.batch.run import find_surveys
+from sfm.products.inspection.planned_survey import read_plan
+from sfm.products.refining.refinement import refine_model
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.refining.refinement import refine_model
 from sfm.survey.sources.given import measure_given
 from tests.findings import findings_of
-from tests.inspection.benches import one_bench
+from tests.products.inspection.benches import one_bench
 from tests.synthetic import make_network, seed_of
 
 SECONDS = 8.0

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import BLOCK, as_cell, as_plain, csv_blocks, csv_text, from_cell, is_plain
-from sfm.rendering.scene_file import read_scene
+from sfm.model.errors import SurveyFileError
+from sfm.products.rendering.scene_file import read_scene
 from sfm.survey.inputs.survey import read_survey
 
 FORMULAS = ("=1+1", "+A1", "@SUM(A1)", "-A1", "-1+2", "\t=1", "\r=1", " =1", "a;=1", "\uff1d1", "\uff0dA1")

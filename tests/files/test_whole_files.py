@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from sfm.errors import BackendError, OutputError
 from sfm.files.whole_files import refuse_full, refuse_unwritable, whole_file, whole_files, whole_folder
+from sfm.model.errors import BackendError, OutputError
 
 NOBODY = 65534  # a user of no rights
 

@@ -21,12 +21,12 @@ from adapters.colmap.camera_models import read_model, write_model
 from adapters.formats.registry import read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text
-from sfm.camera import camera_from_values
-from sfm.errors import KolinearError
+from sfm.model.camera import camera_from_values
+from sfm.model.errors import KolinearError
+from sfm.model.solution import Solution
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
-from sfm.solution import Solution
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.given import (
     read_control,

@@ -22,7 +22,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from sfm.errors import KolinearError
+from sfm.model.errors import KolinearError
 
 LIMIT_SECONDS = 10.0
 HANG_SECONDS = 600.0  # of the clock, after which a case is ended; a busy computer compiles kernels for long

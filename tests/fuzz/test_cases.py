@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from sfm.errors import KolinearError, PhotographError
+from sfm.model.errors import KolinearError, PhotographError
 from sfm.photographs.exif import BOMB_PX_PER_BYTE, read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.survey.inputs.given import read_image_points

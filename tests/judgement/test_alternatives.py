@@ -14,7 +14,6 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray, IntArray
 from sfm.judgement.hypotheses import alternatives, families, hypotheses, refit, score
 from sfm.judgement.hypotheses.alternatives import (
     alternatives_of,
@@ -34,7 +33,8 @@ from sfm.judgement.hypotheses.score import (
     log_probability,
     reduce_adjustment,
 )
-from sfm.network import ImagePoints, InteriorObservations
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.network import ImagePoints, InteriorObservations
 from tests.synthetic import make_network, observed_anew, seed_of
 
 

@@ -19,8 +19,8 @@ from sfm.judgement.bundle_statistics import (
     statistics_of,
     summarise_redundancy,
 )
-from sfm.network import ExteriorObservations, InteriorObservations, ScaleBars
-from sfm.observation_residuals import CENTRE, ROTATION
+from sfm.model.network import ExteriorObservations, InteriorObservations, ScaleBars
+from sfm.model.observation_residuals import CENTRE, ROTATION
 from tests.synthetic import make_network, seed_of
 
 

@@ -11,9 +11,6 @@ from scipy.spatial import ConvexHull, Delaunay
 
 import sfm
 from sfm.adjustment.result import Adjustment
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.estimate import Estimate
 from sfm.judgement.calibrated_cameras import (
     CalibratedCamera,
     calibrated_cameras,
@@ -24,8 +21,11 @@ from sfm.judgement.calibrated_cameras import (
     rigs_of,
 )
 from sfm.judgement.checks import precision_of
-from sfm.remarks.remark import remark
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.estimate import Estimate
+from sfm.model.remarks.remark import remark
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 

@@ -13,8 +13,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement import cameras
-from sfm.remarks.remark import kinds_of
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.remarks.remark import kinds_of
 from tests.synthetic import make_network, seed_of
 
 

@@ -12,7 +12,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement import checks
 from sfm.judgement.checks import Sigma0
-from sfm.network import ExteriorObservations, InteriorObservations, ScaleBars
+from sfm.model.network import ExteriorObservations, InteriorObservations, ScaleBars
 from tests.synthetic import make_network, seed_of
 
 

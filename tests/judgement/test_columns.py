@@ -10,12 +10,12 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import pixel_from_tangents, project
 from sfm.comparison.solutions import reprojection
-from sfm.conventions import rotation_from_vector
-from sfm.distortion.models import Role
 from sfm.judgement.hypotheses import columns
 from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields, rigid_motions
+from sfm.model.camera import pixel_from_tangents, project
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.distortion.models import Role
 from tests.synthetic import make_network, seed_of
 
 

@@ -12,7 +12,6 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses import families, hypotheses
 from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields
 from sfm.judgement.hypotheses.families import Alternative
@@ -26,9 +25,10 @@ from sfm.judgement.hypotheses.hypotheses import (
 )
 from sfm.judgement.hypotheses.refit import Refit, log_likelihood_of, shifts_of
 from sfm.judgement.hypotheses.score import Gain
-from sfm.network import ObjectPoints, ScaleBars, without_given
-from sfm.remarks.remark import Remark
-from sfm.similarity import fit_similarity
+from sfm.model.conventions import FloatArray
+from sfm.model.network import ObjectPoints, ScaleBars, without_given
+from sfm.model.remarks.remark import Remark
+from sfm.model.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 
 

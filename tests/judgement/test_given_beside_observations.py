@@ -10,18 +10,18 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.estimate import Estimate, values_of
 from sfm.judgement.given import free_network
 from sfm.judgement.given import judge as given
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
 from sfm.judgement.given.tables import Contradiction, Table
-from sfm.network import ExteriorObservations, Network, ScaleBars
-from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT
-from sfm.observations.point_pairs import HeightDifferences
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import Similarity
+from sfm.model.estimate import Estimate, values_of
+from sfm.model.network import ExteriorObservations, Network, ScaleBars
+from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT
+from sfm.model.observations.point_pairs import HeightDifferences
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import Similarity
 from tests.rigs import make_rig
 from tests.synthetic import make_network, observed_anew, seed_of
 

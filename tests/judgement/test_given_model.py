@@ -10,15 +10,15 @@ import pytest
 from scipy import stats
 from scipy.sparse import csr_matrix
 
-from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.judgement.given import free_network
 from sfm.judgement.given import mistakes as given_names
 from sfm.judgement.given import points as given_points
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.scales import Scales, scales_of_lengths
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values
-from sfm.network import ScaleBars
-from sfm.similarity import Similarity, fit_similarity
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.network import ScaleBars
+from sfm.model.similarity import Similarity, fit_similarity
 from tests.given_figures import Figure, judge
 from tests.synthetic import seed_of
 

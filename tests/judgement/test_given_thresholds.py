@@ -12,7 +12,6 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.distributions import LEVEL
 from sfm.judgement.given import free_network
 from sfm.judgement.given import groups as given_groups
 from sfm.judgement.given import judge as given
@@ -20,9 +19,10 @@ from sfm.judgement.given import scales as given_scales
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.scales import Comparison, Scales, Source
 from sfm.judgement.given.values import GivenModel, Judgement
-from sfm.network import Network, ScaleBars
+from sfm.model.distributions import LEVEL
+from sfm.model.network import Network, ScaleBars
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark, kinds_of, of_kind
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.findings import findings_of

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.quality.statistics import non_centrality
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.distributions import LEVEL
 from sfm.judgement.given import points as given_points
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.points import PlacedPoints
 from sfm.judgement.given.scales import Scales, scale_of_points, scales_of_lengths
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values
-from sfm.network import ScaleBars
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.distributions import LEVEL
+from sfm.model.network import ScaleBars
+from sfm.model.similarity import Similarity
 from tests.given_figures import Figure, judge
 from tests.survey.mistyped import BOX, PYRAMID
 from tests.synthetic import seed_of
@@ -92,7 +92,7 @@ def test_the_margin_decides_whether_one_is_reported_from_the_others(monkeypatch:
 
 
 def test_the_level_and_the_noncentrality_are_those_of_baarda() -> None:
-    from sfm.distributions import normal_ppf
+    from sfm.model.distributions import normal_ppf
 
     assert LEVEL == 0.001 and pytest.approx(2 * np.log(1 / LEVEL)) == given_values.MARGIN
     delta = normal_ppf(1 - LEVEL / 2) + normal_ppf(0.8)

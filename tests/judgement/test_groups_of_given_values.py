@@ -13,16 +13,16 @@ from scipy import stats
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.datum import Datum
-from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.judgement.given import judge as given
 from sfm.judgement.given import values as given_values
 from sfm.judgement.given.groups import GivenSettings, Group, contradiction_of, remarks_on_unchecked
 from sfm.judgement.given.points import STRAINS, GivenPoints, Strain, judge_points
 from sfm.judgement.given.scales import Comparison, Scales, Source, common_scale
 from sfm.judgement.given.values import GivenModel, Judgement, judge_values, misfit_of
-from sfm.network import ObjectPoints, ScaleBars
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.network import ObjectPoints, ScaleBars
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import Similarity
 from tests.given_figures import Figure
 from tests.synthetic import seed_of
 

@@ -11,11 +11,7 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
 from sfm.comparison.solutions import reprojection
-from sfm.conventions import rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses import hypotheses, score
 from sfm.judgement.hypotheses import refit as refitting
 from sfm.judgement.hypotheses.alternatives import interiors
@@ -35,10 +31,14 @@ from sfm.judgement.hypotheses.hypotheses import (
 )
 from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.judgement.hypotheses.score import gain_of, log_probability, reduce_adjustment
-from sfm.network import InteriorObservations, Network, ObjectPoints
-from sfm.planning.stations import aim_camera
-from sfm.remarks.remark import WRONG_SIGMAS, Remark, kinds_of
-from sfm.similarity import fit_similarity
+from sfm.model.camera import project
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import InteriorObservations, Network, ObjectPoints
+from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, kinds_of
+from sfm.model.similarity import fit_similarity
+from sfm.products.planning.stations import aim_camera
 from tests.survey.faults import EVERY, FAULTS, planted
 from tests.synthetic import make_network, observed_anew, seed_of
 

@@ -16,14 +16,14 @@ from sfm.adjustment.quality.other_solutions import OtherSolution
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.distributions import normal_ppf
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import Given, statistics_of
 from sfm.judgement.checks import ControlCoordinate, LongestResidual, sigma0_of
-from sfm.network import ScaleBars
-from sfm.observation_residuals import CENTRE, ROTATION, GivenResiduals
-from sfm.remarks.remark import Remark, kinds_of, of_kind, remark
-from sfm.result import SurveyResult
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.distributions import normal_ppf
+from sfm.model.network import ScaleBars
+from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind, remark
 from tests.synthetic import make_network, seed_of
 
 LEVEL = 1e-3

@@ -8,10 +8,10 @@ from math import log
 import numpy as np
 import pytest
 
-from sfm.conventions import FloatArray, rotation_from_vector
 from sfm.judgement.given import mistakes
 from sfm.judgement.given.mistakes import assignments, cost_of_choice, explanations, find_renamed
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.similarity import Similarity
 from tests.synthetic import seed_of
 
 FRAME = Similarity(2.5, rotation_from_vector(np.array([0.3, -0.2, 1.1])), np.array([5.0, -2.0, 1.0]))

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from sfm.errors import GeometryError
 from sfm.judgement.model_choice import Choice, choose, solve_likeliest
+from sfm.model.errors import GeometryError
 
 
 def solve(model: float) -> float:

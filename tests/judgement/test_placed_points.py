@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.distributions import MARGIN
 from sfm.judgement.given import points as given_points
 from sfm.judgement.given.points import GivenPoints, PlacedPoints, Strain, judge_points, parameters_of
 from sfm.judgement.given.values import GivenModel, Judgement
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.distributions import MARGIN
+from sfm.model.similarity import Similarity
 from tests.given_figures import Figure, judge
 from tests.synthetic import seed_of
 

@@ -12,7 +12,6 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.errors import GeometryError
 from sfm.judgement.hypotheses import families
 from sfm.judgement.hypotheses import refit as refitting
 from sfm.judgement.hypotheses.columns import columns_of
@@ -26,7 +25,8 @@ from sfm.judgement.hypotheses.refit import (
     spread_of_photographs,
 )
 from sfm.judgement.hypotheses.score import Gain, reduce_adjustment
-from sfm.network import ObjectPoints
+from sfm.model.errors import GeometryError
+from sfm.model.network import ObjectPoints
 from tests.synthetic import make_network, observed_anew, seed_of
 
 

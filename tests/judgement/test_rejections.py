@@ -13,13 +13,13 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
-from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import chi2_isf
 from sfm.judgement.hypotheses import rejections
 from sfm.judgement.hypotheses.rejections import SecondPlace, explain_rejections
-from sfm.network import ImagePoints
-from sfm.remarks.remark import Remark, kinds_of
+from sfm.model.camera import project
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distributions import chi2_isf
+from sfm.model.network import ImagePoints
+from sfm.model.remarks.remark import Remark, kinds_of
 from tests.synthetic import make_network, seed_of
 
 

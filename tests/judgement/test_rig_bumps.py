@@ -11,10 +11,6 @@ import pytest
 
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
-from sfm.conventions import angles_from_rotation, rotation_from_angles
-from sfm.distributions import chi2_isf, chi2_sf, level_of_single
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.bumps import (
     Bump,
     _difference,
@@ -25,7 +21,11 @@ from sfm.judgement.hypotheses.bumps import (
     bump_remarks,
     find_bumps,
 )
-from sfm.network import Network
+from sfm.model.camera import project
+from sfm.model.conventions import angles_from_rotation, rotation_from_angles
+from sfm.model.distributions import chi2_isf, chi2_sf, level_of_single
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 

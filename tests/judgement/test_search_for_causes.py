@@ -14,7 +14,6 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses import families, hypotheses
 from sfm.judgement.hypotheses.alternatives import alternatives_of, is_significant
 from sfm.judgement.hypotheses.columns import Columns, columns_of
@@ -22,8 +21,9 @@ from sfm.judgement.hypotheses.families import Alternative
 from sfm.judgement.hypotheses.hypotheses import Cause, find_causes, free_network, judge_alternatives
 from sfm.judgement.hypotheses.refit import Refit
 from sfm.judgement.hypotheses.score import Gain, Reduced, log_likelihood_gain, reduce_adjustment
-from sfm.network import ImagePoints, Network, ScaleBars
-from sfm.remarks.remark import kinds_of
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ScaleBars
+from sfm.model.remarks.remark import kinds_of
 from tests.synthetic import make_network, observed_anew, seed_of
 
 

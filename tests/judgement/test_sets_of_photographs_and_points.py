@@ -14,11 +14,11 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses.alternatives import Part, runs_of
 from sfm.judgement.hypotheses.columns import columns_of, rigid_motions
 from sfm.judgement.hypotheses.score import NONE, Gain, reduce_adjustment
+from sfm.model.conventions import BoolArray, FloatArray
 from sfm.survey.inputs.sources import TEXTURE
 from tests.synthetic import make_network, seed_of
 

@@ -9,11 +9,11 @@ import pytest
 
 import sfm
 from sfm.adjustment.datum import Datum
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
-from sfm.similarity import fit_similarity
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.judgement.given import tables
 from sfm.judgement.given.tables import Contradiction, Table, _Judge, as_judged, judge_tables
 from sfm.judgement.given.values import GivenModel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from tests.synthetic import seed_of
 
 LEVEL = 1e-3

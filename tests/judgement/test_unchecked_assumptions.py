@@ -12,15 +12,15 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses import refit as unchecked
 from sfm.judgement.hypotheses.alternatives import count_alternatives, interiors, needed_gain
 from sfm.judgement.hypotheses.columns import columns_of, interior_columns
 from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
-from sfm.remarks.remark import of_kind
-from sfm.similarity import fit_similarity, without_motions
+from sfm.model.conventions import FloatArray
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity, without_motions
 from sfm.survey.inputs.sources import TEXTURE
 from tests.synthetic import make_network, observed_anew, seed_of
 

@@ -24,20 +24,20 @@ from sfm.adjustment.quality.statistics import (
     w_test,
 )
 from sfm.adjustment.result import Adjustment
-from sfm.distributions import FALSE_ALARM
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.judgement import verdict as verdicts
 from sfm.judgement.bundle_statistics import statistics_of
 from sfm.judgement.checks import standard_deviations
+from sfm.judgement.survey_result import FailedImage, SurveyResult
 from sfm.judgement.verdict import judge_adjustment, judge_survey
-from sfm.network import Network
+from sfm.model.distributions import FALSE_ALARM
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of, of_kind, remark
+from sfm.model.remarks.verdict import Verdict
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind, remark
-from sfm.remarks.verdict import Verdict
 from sfm.report.phrases import describe_test
 from sfm.report.survey_report import text_report
-from sfm.result import FailedImage, SurveyResult
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values, project, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, rotation_from_angles, rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.matching.conjugate import difference_of_blur, match_points
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.matching.tracks.correspondence import match_targets
-from sfm.network import ImagePoints
+from sfm.model.camera import camera_from_values, project, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles, rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints
 from tests.synthetic import seed_of
 from tests.textures import natural_texture, with_noise
 

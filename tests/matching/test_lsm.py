@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import GeometryError, PhotographError
 from sfm.matching.conjugate import match_points
 from sfm.matching.correlation import LsmFlag, match_ncc
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import GeometryError, PhotographError
 from tests.places import SHARED
 from tests.textures import MEAN, Pairs, affine_pairs, with_noise
 

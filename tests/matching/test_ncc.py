@@ -8,10 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError, PhotographError
-from sfm.kernels.sampling import resample
 from sfm.matching.conjugate import match_points
 from sfm.matching.correlation import NccFlag, ambiguous, independent_pixels, match_ncc
 from sfm.matching.epipolar import epipolar_paths
@@ -23,6 +19,10 @@ from sfm.matching.radiometry import (
     match_brightness,
     radiometry_of,
 )
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError, PhotographError
+from sfm.runtime.sampling import resample
 from sfm.textbook.matching import match_along_line, match_pyramid
 from tests.synthetic import make_network
 from tests.textures import random_texture, with_noise

@@ -18,18 +18,6 @@ from adapters.colmap.camera_models import read_model
 from adapters.colmap.mapper import map_photographs
 from datasets.textured import render
 from sfm.adjustment.result import Adjustment
-from sfm.batch.run import run_batch
-from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import (
-    AnyArray,
-    BoolArray,
-    FloatArray,
-    IntArray,
-    angles_from_rotation,
-    rotation_from_vector,
-)
-from sfm.errors import GeometryError, PhotographError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.coverage import (
     MAX_SHARED_FRACTION,
@@ -53,18 +41,30 @@ from sfm.matching.tracks.feature_tracks import (
 )
 from sfm.matching.tracks.features import Features, PairMatches, matched_features, sift_features
 from sfm.matching.tracks.interest import foerstner_points, natural_points, textured_squares
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, project, tangents_from_pixel
+from sfm.model.conventions import (
+    AnyArray,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    angles_from_rotation,
+    rotation_from_vector,
+)
+from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
+from sfm.products.batch.run import run_batch
+from sfm.products.drafting.draft import draft_survey
+from sfm.products.refining.refinement import RefineSettings, refine_model, refinement_text
 from sfm.report.output import read_log
-from sfm.similarity import fit_similarity
 from sfm.survey.assembly import OtherPrograms
-from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.covering_points import _epipolar_lines, _returning, find_covering_points
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
-from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
 from sfm.textbook.matching import match_along_line
 from tests.engines import ALONE, HERE, Notes
 from tests.tables import rows_of

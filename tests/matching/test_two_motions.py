@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sfm.conventions import FloatArray
 from sfm.matching.tracks.feature_tracks import Tracks, link_features
 from sfm.matching.tracks.features import Features
+from sfm.model.conventions import FloatArray
 from tests.synthetic import seed_of
 
 C_PX, NOISE_PX = 800.0, 0.3

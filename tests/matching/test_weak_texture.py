@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.errors import GeometryError
 from sfm.matching.tracks.features import sift_features
 from sfm.matching.tracks.interest import natural_points
+from sfm.model.errors import GeometryError
 from sfm.pipeline import run_survey
-from sfm.survey.drafting.draft import draft_survey
+from sfm.products.drafting.draft import draft_survey
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring import tie_points
 from tests.survey.texture_scenes import outcome_of, usual, write_scene

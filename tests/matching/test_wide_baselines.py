@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.wide_matching import count_matches, photograph, points_and_truth, wide_scene
 from datasets.textured import render
-from sfm.conventions import FloatArray
 from sfm.matching import conjugate
 from sfm.matching.conjugate import affinities_around, match_points
 from sfm.matching.conjugate_patches import ConjugatePoints
@@ -26,6 +25,7 @@ from sfm.matching.tracks.features import (
     overlapping_pairs,
     sift_features,
 )
+from sfm.model.conventions import FloatArray
 from tests.synthetic import seed_of
 from tests.textures import MEAN, affine_pairs, random_texture, with_noise
 

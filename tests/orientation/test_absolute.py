@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.similarity import Similarity, orient_absolute
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.similarity import Similarity, orient_absolute
 from tests.synthetic import seed_of
 
 

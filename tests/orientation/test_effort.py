@@ -12,9 +12,9 @@ import pytest
 from sfm.adjustment.datum import Datum, motions_of
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import unknowns_of
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, ObjectPoints
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ObjectPoints
 from sfm.orientation.image_rays import fit_homography
 from sfm.orientation.incremental import growth as growing
 from sfm.orientation.incremental import starting_pair

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.network import ImagePoints, empty_estimate
+from sfm.model.camera import project
+from sfm.model.network import ImagePoints, empty_estimate
+from sfm.model.similarity import fit_similarity, reverse_depth
 from sfm.orientation.incremental import poor_photographs
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.poor_photographs import _ResectionFit, bounded_costs
 from sfm.orientation.incremental.sequence import orient
-from sfm.similarity import fit_similarity, reverse_depth
 from sfm.survey.orientation import refine
 from tests.facades import SIZE_PX, facade_network
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import rotation_from_angles
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints
+from sfm.model.camera import Camera, project, tangents_from_pixel
+from sfm.model.conventions import rotation_from_angles
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints
 from sfm.orientation import intersection
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.intersection import intersect

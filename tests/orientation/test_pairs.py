@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, empty_estimate
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, empty_estimate
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.sequence import orient
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import fit_similarity
 from tests.synthetic import make_network, seed_of
 
 
@@ -90,7 +90,7 @@ def test_a_stereo_rig_with_a_small_base() -> None:
 
 def seen_from(network: Network, truth: Estimate) -> tuple[Network, Estimate]:
     """Return the network as its two photographs see all points, 0.02 px noise."""
-    from sfm.camera import project
+    from sfm.model.camera import project
 
     noise = 0.02 * seed_of("seen from").standard_normal((2 * len(truth.points), 2))
     xy = np.concatenate(

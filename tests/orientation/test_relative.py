@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_angles, rotation_from_vector
-from sfm.errors import GeometryError
+from sfm.model.conventions import rotation_from_angles, rotation_from_vector
+from sfm.model.errors import GeometryError
 from sfm.orientation.image_rays import decompose_homography, fit_homography
 from sfm.orientation.relative import (
     coplanarity_residuals,

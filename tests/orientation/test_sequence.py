@@ -7,14 +7,14 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values, pixel_from_tangents
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental import sequence
 from sfm.orientation.incremental.sequence import orient
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import fit_similarity
 from sfm.survey.orientation import refine as refine_network
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
@@ -96,7 +96,7 @@ def test_four_coplanar_points_in_each_photograph():
 
 
 def _seen_anew(network, truth):
-    from sfm.camera import project
+    from sfm.model.camera import project
 
     seen = network.image_points
     xy = np.concatenate(

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm.errors import PhotographError
+from sfm.model.errors import PhotographError
 from sfm.photographs.exif import (
     LocalSystem,
     SatellitePosition,

@@ -10,16 +10,16 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import rotation_from_vector
-from sfm.estimate import Estimate
 from sfm.judgement import cameras as camera_remarks
 from sfm.judgement.calibrated_cameras import camera_is_result
-from sfm.network import Network
+from sfm.judgement.survey_result import SeenPlate, SurveyResult
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of, of_kind, remark
+from sfm.model.remarks.verdict import Verdict
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind, remark
-from sfm.remarks.verdict import Verdict
 from sfm.report.phrases import describe_calibration
-from sfm.result import SeenPlate, SurveyResult
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of

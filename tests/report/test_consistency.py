@@ -13,11 +13,11 @@ from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
-from sfm.network import Network
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

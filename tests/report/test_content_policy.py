@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from sfm.batch.job import SurveyRow
-from sfm.batch.table import batch_page
 from sfm.comparison.significance import compare_results
+from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
+from sfm.products.batch.job import SurveyRow
+from sfm.products.batch.table import batch_page
 from sfm.report.output import write_result
 from sfm.report.pages import content_policy, html, write_page
-from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.places import ROOT

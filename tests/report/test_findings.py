@@ -23,18 +23,18 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.consistency import Consistency, Uneven, consistency_of
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import Given
 from sfm.judgement.cameras import edges_of, larger_than_the_others, sharpness_remarks
 from sfm.judgement.checks import longest_residual
+from sfm.judgement.survey_result import FailedImage, PhotographTargets, SurveyResult
 from sfm.judgement.verdict import given_remarks
-from sfm.network import Network, ScaleBars
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ScaleBars
+from sfm.model.remarks.remark import Remark, of_kind, remark
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark, of_kind, remark
 from sfm.report.findings import Findings
 from sfm.report.output import SurveyLog, write_result
-from sfm.result import FailedImage, PhotographTargets, SurveyResult
 from tests import compare_results
 from tests.findings import findings_of
 from tests.places import ROOT

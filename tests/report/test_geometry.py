@@ -13,14 +13,14 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement.bundle_statistics import Geometry, geometry_of, hull_area
-from sfm.network import ObjectPoints
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.network import ObjectPoints
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.result import SurveyResult
 from sfm.survey.inputs.given import read_exterior, read_points
 from tests.findings import findings_of
 from tests.places import SHARED

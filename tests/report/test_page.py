@@ -12,10 +12,10 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
-from sfm.conventions import FloatArray
 from sfm.files.result_tables import GIVEN
-from sfm.remarks.remark import remark
-from sfm.remarks.verdict import judge
+from sfm.model.conventions import FloatArray
+from sfm.model.remarks.remark import remark
+from sfm.model.remarks.verdict import judge
 from sfm.report.page import (
     MAX_ROWS,
     YES,

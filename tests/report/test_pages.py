@@ -22,12 +22,14 @@ from sfm.adjustment.solve import adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.display import bound
-from sfm.errors import GeometryError, OutputError
 from sfm.files.whole_files import remove_leftovers
-from sfm.network import Network
+from sfm.judgement.survey_result import BaselineComparison, SurveyResult
+from sfm.model.display import bound
+from sfm.model.errors import GeometryError, OutputError
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
 from sfm.report.differences import largest_difference
 from sfm.report.figures.overlays import INK, REASON_COLOURS, SHIFT, _crosses
 from sfm.report.output import write_result
@@ -35,8 +37,6 @@ from sfm.report.page import FoldedParts, Heading, Paragraph, Part, Statement, Ta
 from sfm.report.pages import html_of, page_of, write_page
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
 from sfm.report.survey_report import text_report
-from sfm.result import BaselineComparison, SurveyResult
-from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.outlines import Flag
 from tests.findings import findings_of

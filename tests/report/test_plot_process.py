@@ -19,11 +19,11 @@ from matplotlib.ft2font import FT2Font
 import sfm.report.figures.plot_process as drawing
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.judgement.survey_result import SurveyResult
 from sfm.report.figures import plots
 from sfm.report.figures.plot_data import PlotData
 from sfm.report.figures.plot_process import PlotProcess, draw_plots, plot_process
 from sfm.report.output import plot_data
-from sfm.result import SurveyResult
 from tests.findings import findings_of
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
@@ -188,7 +188,7 @@ def test_little_is_imported_to_draw() -> None:
     """Else the process takes the time of the survey that it is to save."""
     script = (
         "import sys, sfm.report.figures.plot_process, sfm.report.figures.plots\n"
-        "print(sorted({'numba', 'scipy', 'cv2', 'pydantic', 'sfm.network'} & set(sys.modules)))"
+        "print(sorted({'numba', 'scipy', 'cv2', 'pydantic', 'sfm.model.network'} & set(sys.modules)))"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     run = subprocess.run(

@@ -12,10 +12,10 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import orientation_correlations
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from sfm.pipeline import run_survey
 from sfm.report.findings import Findings
 from sfm.report.survey_report import text_report

@@ -20,14 +20,22 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.display import bound, counted
-from sfm.errors import OutputError
 from sfm.files.open_folders import refuse_foreign_folder
 from sfm.judgement.bundle_statistics import geometry_of
-from sfm.network import Network, ObjectPoints, ScaleBars, Source
-from sfm.remarks.remark import kinds_of, remark
-from sfm.remarks.verdict import lines_of
+from sfm.judgement.survey_result import (
+    ControlCheck,
+    FailedImage,
+    PhotographTargets,
+    StageTime,
+    SurveyResult,
+    sort_likeliest_first,
+)
+from sfm.model.conventions import FloatArray, angles_from_rotation
+from sfm.model.display import bound, counted
+from sfm.model.errors import OutputError
+from sfm.model.network import Network, ObjectPoints, ScaleBars, Source
+from sfm.model.remarks.remark import kinds_of, remark
+from sfm.model.remarks.verdict import lines_of
 from sfm.report import survey_report
 from sfm.report.figures import overlays
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
@@ -49,14 +57,6 @@ from sfm.report.phrases import (
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.result import (
-    ControlCheck,
-    FailedImage,
-    PhotographTargets,
-    StageTime,
-    SurveyResult,
-    sort_likeliest_first,
-)
 from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
 from sfm.targets.outlines import LIKELIEST_FIRST, Flag
 from tests.browser import Tab
@@ -448,7 +448,7 @@ def test_one_of_a_kind_is_no_plural() -> None:
     )
     words = re.compile(r"'s' (?:if|\*)|\"s\" (?:if|\*)|else ['\"]s['\"]")
     by_hand = [str(path) for path in (ROOT / "sfm").rglob("*.py") if words.search(path.read_text("utf-8"))]
-    assert not by_hand, "sfm.display.counted writes numbers of things"
+    assert not by_hand, "sfm.model.display.counted writes numbers of things"
 
 
 def test_reasons_are_reported_from_what_is_most_like_a_target(result: SurveyResult) -> None:

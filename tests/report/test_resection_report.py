@@ -7,7 +7,7 @@ import pytest
 
 from sfm.cli.commands.matching import read_tasks
 from sfm.cli.commands.measuring import resect as resect_command
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.report.single_photographs import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS
 from sfm.textbook.resection.by_method import resect, resect_by_all

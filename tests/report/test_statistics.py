@@ -24,10 +24,7 @@ from sfm.adjustment.quality.statistics import (
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
-from sfm.conventions import angles_from_rotation
-from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import given_of, statistics_of
 from sfm.judgement.calibrated_cameras import families, interior_parameters
 from sfm.judgement.checks import (
@@ -40,8 +37,12 @@ from sfm.judgement.checks import (
     sigma0_of,
 )
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
-from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.remarks.remark import of_kind
+from sfm.judgement.survey_result import ControlCheck, Eccentricity, SurveyResult
+from sfm.model.camera import Camera
+from sfm.model.conventions import angles_from_rotation
+from sfm.model.estimate import Estimate
+from sfm.model.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.model.remarks.remark import of_kind
 from sfm.report.figures.plots import all_plots, plan_axes
 from sfm.report.output import plot_data
 from sfm.report.pages import WIDTH, html_of
@@ -57,7 +58,6 @@ from sfm.report.phrases import (
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.result import ControlCheck, Eccentricity, SurveyResult
 from tests.findings import findings_of
 from tests.synthetic import make_network, seed_of
 from tests.tables import rows_of

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sfm.comparison.significance import compare_results
+from sfm.model.solution import Solution
 from sfm.report.pages import write_page
-from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import make_network, seed_of
 

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
+from sfm.model.solution import Solution
 from sfm.report.viewer.embedded import packed_scene, scene_of_stored, sources
 from sfm.report.viewer.pictures import Pictures, cut_pictures
-from sfm.solution import Solution
 from tests.places import ROOT
 from tests.synthetic import SIZE_PX, make_network, seed_of
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import IntArray
+from sfm.model.conventions import IntArray
+from sfm.model.solution import Solution
 from sfm.report.view_page import view_page, write_view
 from sfm.report.viewer.embedded import scene_of_stored
 from sfm.report.viewer.pictures import Bar, Marks, ViewerScene, cut_pictures, distance_sigmas
-from sfm.solution import Solution
 from tests.browser import Tab
 from tests.synthetic import SIZE_PX, make_network, seed_of
 

@@ -13,10 +13,10 @@ import pytest
 from rich.console import Console
 from threadpoolctl import threadpool_info
 
-from sfm.kernels.threads import at_once, own_threads
 from sfm.pipeline import run_survey
 from sfm.runtime.progress import Silent, StageClock, report_step, reported
 from sfm.runtime.progress_bar import drawn_progress
+from sfm.runtime.threads import at_once, own_threads
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from tests.other_adjuster import in_house_adjuster

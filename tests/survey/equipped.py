@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
-from sfm.observations.kind import Group, TableKind
+from sfm.model.conventions import FloatArray, angles_from_rotation
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.observations.kind import Group, TableKind
 from tests.rigs import make_rig
 from tests.survey.test_rigs import RIG, written
 from tests.survey.test_survey_observations import network_of, table_of

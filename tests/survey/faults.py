@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.camera import project
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from tests.synthetic import PIXEL_MM, SIZE_PX, make_network, seed_of
 
 NOISE_PX = 0.1

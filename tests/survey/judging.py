@@ -28,14 +28,14 @@ from scipy import stats
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
-from sfm.errors import KolinearError
-from sfm.network import Network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import KolinearError
+from sfm.model.network import Network
+from sfm.model.remarks.catalogue import given_values, hypotheses
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.catalogue import given_values, hypotheses
-from sfm.remarks.remark import of_kind
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.survey.equipped import EQUIPPED, equipped

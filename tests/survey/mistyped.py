@@ -15,14 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray
-from sfm.errors import KolinearError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import KolinearError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from tests.findings import findings_of

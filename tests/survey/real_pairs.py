@@ -18,10 +18,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm.errors import KolinearError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import KolinearError
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.calibration import Calibration
 from sfm.survey.inputs.survey import Survey, read_survey, with_calibration
 from sfm.survey.measuring.measured_store import MeasuredStore

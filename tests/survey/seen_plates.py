@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values, project
-from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
 from sfm.pipeline import run_survey
-from sfm.result import SurveyResult
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.target_network import build_network, min_rays, name_coded

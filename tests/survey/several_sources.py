@@ -20,14 +20,22 @@ import numpy as np
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
-from sfm.camera import project
-from sfm.conventions import FloatArray, IntArray
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.planning.stations import aim_camera
-from sfm.remarks.remark import kinds_of
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks, rectangles
-from sfm.similarity import fit_similarity
+from sfm.products.planning.stations import aim_camera
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import (
+    CircularTargets,
+    Faces,
+    Optics,
+    Scene,
+    coded_ring,
+    join_marks,
+    rectangles,
+)
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily

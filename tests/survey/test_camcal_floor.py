@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import sfm
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.settings import TiePointSettings
 from tests.places import DATASETS, SHARED
 

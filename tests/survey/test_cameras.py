@@ -13,12 +13,12 @@ import sfm
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import scale_estimate
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
-from sfm.errors import SurveyFileError
-from sfm.estimate import Estimate
+from sfm.model.camera import camera_from_values
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import reverse_depth
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
-from sfm.similarity import reverse_depth
 from sfm.survey.adjusting.settling import held_to_converge, nearer_start
 from sfm.survey.adjusting.solution_remarks import remarks_on_pixel_sides, remarks_on_principal_distances
 from sfm.survey.inputs.survey import CameraSetup

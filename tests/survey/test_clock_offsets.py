@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from sfm.conventions import AnyArray, rotation_from_vector
+from sfm.model.conventions import AnyArray, rotation_from_vector
+from sfm.model.remarks.remark import of_kind, remark
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind, remark
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import Optics
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import Optics
 from sfm.report.survey_report import text_report
 from sfm.survey.clock_offsets import rotation_spread
 from sfm.survey.inputs.survey import read_survey

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 import sfm.pipeline as pipeline
-from sfm.camera import camera_from_values
-from sfm.conventions import AnyArray, BoolArray
-from sfm.errors import SurveyFileError
-from sfm.remarks.remark import Remark
-from sfm.rendering.render import render_photograph, render_photographs
-from sfm.rendering.scene import (
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import AnyArray, BoolArray
+from sfm.model.errors import SurveyFileError
+from sfm.model.remarks.remark import Remark
+from sfm.model.similarity import fit_similarity
+from sfm.products.drafting.draft import draft_survey
+from sfm.products.rendering.render import render_photograph, render_photographs
+from sfm.products.rendering.scene import (
     CircularTargets,
     Faces,
     Optics,
@@ -25,9 +27,7 @@ from sfm.rendering.scene import (
     concentric_rings,
     join_marks,
 )
-from sfm.similarity import fit_similarity
 from sfm.survey.diagnosis.codes_found import sides_not_found, small_codes
-from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.concentric import concentric_family

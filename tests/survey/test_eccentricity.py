@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import sfm.pipeline as pipeline
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import FloatArray
-from sfm.errors import SurveyFileError
-from sfm.remarks.remark import of_kind
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import SurveyFileError
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.survey.inputs.given import read_diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import read_survey

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.survey import Survey, read_survey
 from tests.survey.test_rigs import written

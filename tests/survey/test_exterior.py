@@ -12,18 +12,18 @@ from scipy import stats
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, angles_from_rotation
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import given_of
-from sfm.network import ObjectPoints
-from sfm.observations.pose import MountObservations
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray, angles_from_rotation
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ObjectPoints
+from sfm.model.observations.pose import MountObservations
+from sfm.model.remarks.remark import Remark
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark
 from sfm.report.output import write_result
 from sfm.report.pages import html_of
 from sfm.report.survey_report import text_report
-from sfm.result import SurveyResult
 from sfm.survey import placing
 from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey

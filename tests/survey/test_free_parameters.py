@@ -10,10 +10,10 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
-from sfm.conventions import FloatArray
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
 from sfm.survey.free_parameters import FreeParameters, choose_free_parameters
 from sfm.survey.inputs.cameras import split_cameras
 from sfm.survey.inputs.settings import TargetSettings

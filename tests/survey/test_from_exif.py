@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.remarks.remark import kinds_of, of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind
-from sfm.result import SurveyResult
 from sfm.survey.inputs.from_exif import moments_from_exif, observed_positions, plausible_positions
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.settings import RigSettings

@@ -11,17 +11,17 @@ import pytest
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_tables as write_stored
 from datasets.camcal.reference import prepare
-from sfm.errors import SurveyFileError
-from sfm.estimate import Estimate
 from sfm.judgement.checks import longest_residual
-from sfm.network import Network
-from sfm.observations.control_and_bars import ObjectPoints, ScaleBars
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.observations.control_and_bars import ObjectPoints, ScaleBars
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import (
     KnownPoints,
     ScaleBar,

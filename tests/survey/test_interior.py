@@ -12,16 +12,16 @@ import sfm
 from adapters.colmap.adjuster import adjust_with_colmap
 from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.camera import project
-from sfm.conventions import angles_from_rotation
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import angles_from_rotation
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.report.survey_report import text_report
 from sfm.report.tables.summary import summary
-from sfm.result import SurveyResult
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
 from tests.commands import kolinear

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import image_from_pixel
-from sfm.errors import SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import image_from_pixel
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import kinds_of, of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind
 from sfm.report.output import write_result
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.adjusting.settling import datum_carriers
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.sources.given import MARGIN_PX, MAX_OUTSIDE, measure_given, outside_photograph

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.camera import camera_from_values, project
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, Source, empty_estimate
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, Source, empty_estimate
+from sfm.model.remarks.remark import remark
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.remarks.remark import remark
 from sfm.survey.diagnosis.lost_photographs import (
     MIN_PARALLAX,
     explain_lost_photographs,

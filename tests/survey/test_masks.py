@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray
-from sfm.errors import PhotographError, SurveyFileError
+from sfm.model.conventions import AnyArray
+from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_mask, read_photograph
 from sfm.pipeline import run_survey
-from sfm.survey.drafting.draft import draft_survey
+from sfm.products.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import read_survey_file

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sfm.model.remarks.remark import kinds_of
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints
 from tests.survey.mistyped import CASES, NEVER_FOUND, SIGMA, given_of, mistyped, right, scene, study

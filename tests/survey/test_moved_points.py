@@ -9,13 +9,13 @@ import pytest
 
 import sfm
 from sfm.adjustment.quality.consistency import consistency_of
-from sfm.camera import project
-from sfm.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
-from sfm.remarks.remark import of_kind
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of
 

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import AnyArray, FloatArray
-from sfm.distributions import chi2_ppf
-from sfm.errors import SurveyFileError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.distributions import chi2_ppf
+from sfm.model.errors import SurveyFileError
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import Optics, join_marks, rectangles
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import Optics, join_marks, rectangles
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import SIZE_PX, SURVEY, camera, code_centres, plates, stations
 from tests.synthetic import seed_of

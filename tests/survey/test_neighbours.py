@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import IntArray
 from sfm.matching.tracks.feature_tracks import TiePoints, find_tie_points
+from sfm.model.conventions import IntArray
+from sfm.model.remarks.remark import of_kind
 from sfm.photographs.exif import Metadata, SatellitePosition
-from sfm.remarks.remark import of_kind
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.settings import TiePointSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import angles_from_rotation
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import angles_from_rotation
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.remarks.remark import Remark, kinds_of, remark
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark, kinds_of, remark
-from sfm.result import SurveyResult
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.surveys import write_observed_survey, write_photograph_survey

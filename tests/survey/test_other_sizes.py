@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.solve import adjust
-from sfm.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
-from sfm.result import SurveyResult
-from sfm.survey.drafting.draft import draft_survey
+from sfm.products.drafting.draft import draft_survey
 from sfm.survey.inputs.checks.copies import (
     find_copies,
     without_copies,

@@ -11,18 +11,18 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, project, tangents_from_pixel
-from sfm.conventions import FloatArray
-from sfm.distortion.models import Role
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, project, tangents_from_pixel
+from sfm.model.conventions import FloatArray
+from sfm.model.distortion.models import Role
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
-from sfm.similarity import fit_similarity
+from sfm.products.drafting.draft import draft_survey
 from sfm.survey.diagnosis.photograph_cameras import SCALES, TOLERANCE
-from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.measurements import Measurements
 from sfm.survey.inputs.settings import AdjustSettings

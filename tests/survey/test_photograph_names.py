@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
+from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.photograph_names import NamedPhotographs, name_photographs

@@ -11,21 +11,21 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, camera_from_values, project
 from sfm.cli.console import print_result
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
-from sfm.rendering.render import corner_rays, render_photograph
-from sfm.rendering.scene import Optics
+from sfm.products.rendering.render import corner_rays, render_photograph
+from sfm.products.rendering.scene import Optics
 from sfm.report.findings import Findings
 from sfm.report.pages import html_of
 from sfm.report.phrases import describe_calibration, significant
 from sfm.report.survey_report import text_report
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.plates import PlateFamily
 from tests.findings import findings_of

@@ -12,12 +12,12 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
-from sfm.conventions import AnyArray, FloatArray
-from sfm.network import ObjectPoints, rows_of
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.network import ObjectPoints, rows_of
 from sfm.pipeline import run_survey
-from sfm.survey.drafting.draft import draft_survey
-from sfm.survey.drafting.target_trial import _side_by_side, try_targets
+from sfm.products.drafting.draft import draft_survey
+from sfm.products.drafting.target_trial import _side_by_side, try_targets
 from sfm.survey.inputs.calibration import plate_family
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.concentric import concentric_family

@@ -12,12 +12,12 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.verdict import ray_remarks
-from sfm.network import ObjectPoints
-from sfm.remarks.remark import Remark, kinds_of, of_kind
+from sfm.model.camera import camera_from_values
+from sfm.model.estimate import Estimate
+from sfm.model.network import ObjectPoints
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind
 from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control, remarks_on_uncalibrated
 from sfm.survey.diagnosis.codes_found import missing_plates
 from sfm.survey.inputs.calibration import plate_control

@@ -19,17 +19,17 @@ from adapters.colmap.refined_model import open_model
 from datasets.textured import render
 from sfm.adjustment.quality import correlations as error_correlation
 from sfm.adjustment.result import ErrorCorrelation
-from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.solvers import refine
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.matching.radiometry import GreyPhotographs
-from sfm.network import ImagePoints, Network
-from sfm.similarity import Similarity
-from sfm.survey.refining import windows as model_photographs
-from sfm.survey.refining.refinement import UNSUPPORTED, refine_model
-from sfm.survey.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
+from sfm.model.camera import camera_from_values, project, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import BackendError, GeometryError, OutputError, PhotographError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.similarity import Similarity
+from sfm.products.refining import windows as model_photographs
+from sfm.products.refining.refinement import UNSUPPORTED, refine_model
+from sfm.products.refining.windows import KeyPoints, Limits, Size, Windows, match_reduced
 from sfm.targets.codes.rings import ring_family
 from tests.tables import rows_of
 
@@ -306,7 +306,7 @@ def test_a_model_that_is_not_dependable_says_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _model(tmp_path)
-    monkeypatch.setattr("sfm.survey.refining.refinement.MAX_ITERATIONS", 1)
+    monkeypatch.setattr("sfm.products.refining.refinement.MAX_ITERATIONS", 1)
     with pytest.raises(SystemExit, match="1"):
         refine(tmp_path / "model", tmp_path)
     assert "error: The adjustment did not converge in " in capsys.readouterr().out

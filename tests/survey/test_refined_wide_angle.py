@@ -12,11 +12,11 @@ import pytest
 
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.reconstruction import colmap_parameters
-from sfm.camera import Camera, project, tangents_from_pixel
 from sfm.cli.commands.solvers import refine
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, project, tangents_from_pixel
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from tests.synthetic import seed_of
 from tests.tables import rows_of
 

@@ -13,19 +13,19 @@ import pytest
 
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.camera import project
-from sfm.conventions import FloatArray, angles_from_rotation, rotation_from_vector
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.estimate import Estimate, Mounts
 from sfm.judgement.calibrated_cameras import rigs_of
-from sfm.network import Network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_vector
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind
 from sfm.pipeline import run_survey
-from sfm.planning.prediction import simulate_network
-from sfm.remarks.remark import Remark, kinds_of, of_kind
+from sfm.products.planning.prediction import simulate_network
 from sfm.report.figures.plots import epipolar_figure
 from sfm.report.output import plot_data, write_result
 from sfm.report.survey_report import text_report
-from sfm.result import SurveyResult
 from sfm.survey import rigs
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from sfm.survey.rigs import mounts_of, place_by_rigs, planned_mounts

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values, project
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, empty_estimate
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import camera_from_values, project
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, empty_estimate
+from sfm.model.remarks.remark import kinds_of, of_kind
 from sfm.orientation.incremental.sequence import Orientation, orient
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
-from sfm.result import SurveyResult
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.lost_photographs import MOTION_POINTS, find_second_motion, find_second_objects
 from sfm.survey.inputs.given import KnownPoints

@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values, project
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.pipeline import run_survey
-from sfm.rendering.render import corner_rays, render_photograph
-from sfm.rendering.scene import Faces, Optics, Scene, join_marks
-from sfm.similarity import fit_similarity
+from sfm.products.drafting.draft import draft_survey
+from sfm.products.rendering.render import corner_rays, render_photograph
+from sfm.products.rendering.scene import Faces, Optics, Scene, join_marks
 from sfm.survey.assembly import settings_by_table
 from sfm.survey.board_turns import _is_certain, _Rig
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
-from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming, PhotographList
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import orient_survey

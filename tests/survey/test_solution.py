@@ -12,17 +12,17 @@ import pytest
 from adapters.colmap.mapper import MapperBaseline
 from sfm.adjustment.quality import variance_components
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.conventions import rotation_from_vector
-from sfm.errors import BackendError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.judgement.bundle_statistics import statistics_of
-from sfm.network import Network, ObjectPoints, ScaleBars
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import BackendError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ObjectPoints, ScaleBars
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import Similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.report.output import write_result
 from sfm.report.tables.csv_files import write_tables
-from sfm.result import SurveyResult
-from sfm.similarity import Similarity
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.placing import object_scale

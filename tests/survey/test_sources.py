@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.api import read_result, write_result
-from sfm.camera import project
-from sfm.conventions import AnyArray
-from sfm.network import ImagePoints, Source
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import project
+from sfm.model.conventions import AnyArray
+from sfm.model.network import ImagePoints, Source
+from sfm.model.similarity import fit_similarity
 from sfm.photographs import reading
 from sfm.pipeline import run_survey
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import Optics, join_marks, rectangles
-from sfm.result import SurveyResult
+from sfm.products.public_functions import read_result, write_result
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import Optics, join_marks, rectangles
 from sfm.runtime.progress import SILENT, StageClock
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs import sources
 from sfm.survey.inputs.measurements import Measurements, find_photographs
 from sfm.survey.inputs.sources import Declared, declared

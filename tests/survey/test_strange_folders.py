@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import sfm.cli
-import sfm.rendering.render
+import sfm.products.rendering.render
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.formats.registry import FORMATS
@@ -27,15 +27,15 @@ from adapters.formats.result_tables import write_tables
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.batch.run import run_batch
-from sfm.errors import OutputError
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
-from sfm.kernels.compiling import COMPILING, sources_of
 from sfm.matching.tracks.interest import natural_points
+from sfm.model.errors import OutputError
+from sfm.model.solution import Solution
 from sfm.photographs.exif import Metadata, read_metadata
+from sfm.products.batch.run import run_batch
 from sfm.report.output import SurveyLog, folder_name, read_log
-from sfm.solution import Solution
+from sfm.runtime.compiling import COMPILING, sources_of
 from sfm.survey.measuring.measured_store import TARGETS, TEXTURE, MeasuredStore
 from sfm.targets.detect import Targets, find_targets
 from tests import commands
@@ -72,7 +72,7 @@ def kolinear(*arguments: object) -> int:
     if arguments[0] == "render":
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("sys.argv", list(map(str, arguments)))
-            return sfm.rendering.render.main()
+            return sfm.products.rendering.render.main()
     return commands.kolinear(*arguments)
 
 
@@ -282,8 +282,8 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
     def metadata(path: Path, real: Any = read_metadata) -> Metadata:
         return replace(real(path), make=evil, model=evil, focal_mm=24.0)
 
-    monkeypatch.setattr("sfm.survey.drafting.draft.read_metadata", metadata)
-    monkeypatch.setattr("sfm.api.sensor_widths", lambda *_: lambda *_: 36.0)
+    monkeypatch.setattr("sfm.products.drafting.draft.read_metadata", metadata)
+    monkeypatch.setattr("sfm.products.public_functions.sensor_widths", lambda *_: lambda *_: 36.0)
     assert kolinear("init", given) == 0
     told = capsys.readouterr()
     assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err
@@ -643,7 +643,7 @@ def test_what_is_measured_is_known_by_what_measures() -> None:
     targets, texture = (sources_of(*kind.measuring).keys() for kind in (TARGETS, TEXTURE))
     assert {"sfm.photographs.reading", "sfm.targets.measure", "sfm.targets.codes.rings"} <= targets
     assert {"sfm.photographs.reading", "sfm.matching.tracks.features", "sfm.matching.radiometry"} <= texture
-    elsewhere = ("sfm.printing", "sfm.rendering", "sfm.survey", "sfm.adjustment")
+    elsewhere = ("sfm.products.printing", "sfm.products.rendering", "sfm.survey", "sfm.adjustment")
     assert not [name for name in targets | texture if name.startswith(elsewhere)]
 
 

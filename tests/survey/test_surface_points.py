@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import AnyArray
 from sfm.matching.lsm.coverage import CoveredPixels, Windows
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks import feature_tracks
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import project
+from sfm.model.conventions import AnyArray
+from sfm.model.network import ImagePoints, Network
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs import reading as reading_module
 from sfm.photographs.reading import read_photograph

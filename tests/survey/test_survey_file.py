@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.conventions import angles_from_rotation, image_from_pixel
-from sfm.errors import PhotographError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.conventions import angles_from_rotation, image_from_pixel
+from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from sfm.photographs.exif import Metadata
 from sfm.survey.adjusting.solution_remarks import datum_remarks, missing_control
 from sfm.survey.inputs.cameras import camera_of_image, start_cameras

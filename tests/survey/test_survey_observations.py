@@ -14,26 +14,26 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray, IntArray, rotation_from_vector
-from sfm.errors import SurveyFileError
-from sfm.estimate import Estimate, values_of
 from sfm.judgement.given import free_network
 from sfm.judgement.given.tables import Contradiction, Table, as_judged
-from sfm.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.observations import planes_and_lines
-from sfm.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind, inverse_of_determined
-from sfm.observations.planes_and_lines import Lines, PlumbLines
-from sfm.observations.point_pairs import HeightDifferences, HorizontalDirections, OffsetDistances
-from sfm.observations.pose import MountObservations
-from sfm.observations.rigid_frames import RigidFrames
-from sfm.observations.tables import TABLES
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate, values_of
+from sfm.model.network import ExteriorObservations, InteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.model.observations import planes_and_lines
+from sfm.model.observations.kind import PHOTOGRAPH, Group, RowKind, TableKind, inverse_of_determined
+from sfm.model.observations.planes_and_lines import Lines, PlumbLines
+from sfm.model.observations.point_pairs import HeightDifferences, HorizontalDirections, OffsetDistances
+from sfm.model.observations.pose import MountObservations
+from sfm.model.observations.rigid_frames import RigidFrames
+from sfm.model.observations.tables import TABLES
+from sfm.model.remarks.remark import of_kind
+from sfm.model.similarity import Similarity
 from sfm.pipeline import run_survey
-from sfm.planning.prediction import simulate_network
-from sfm.remarks.remark import of_kind
+from sfm.products.planning.prediction import simulate_network
 from sfm.report.output import write_result
 from sfm.report.survey_report import text_report
-from sfm.result import SurveyResult
-from sfm.similarity import Similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.observation_tables import read_observation_table
 from tests.findings import findings_of

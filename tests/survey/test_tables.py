@@ -13,13 +13,13 @@ import pytest
 
 from adapters.formats.photomodeler import read_photomodeler, write_photomodeler
 from adapters.formats.result_tables import write_tables
-from sfm.errors import SurveyFileError
 from sfm.files import csv_tables
-from sfm.network import ImagePoints, Network
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import of_kind
+from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.report.tables.csv_files import write_tables as write_result_tables
-from sfm.solution import Solution
 from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey

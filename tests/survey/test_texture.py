@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import JudgedAssumptions
-from sfm.network import Network
-from sfm.remarks.remark import of_kind, remark
-from sfm.similarity import fit_similarity
+from sfm.model.camera import project
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import of_kind, remark
+from sfm.model.similarity import fit_similarity
 from sfm.survey.adjusting import solution
 from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
 from sfm.survey.adjusting.solution import SolvedSurvey

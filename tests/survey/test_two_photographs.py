@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.remarks.remark import kinds_of, of_kind
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.starting_pair import TWOFOLD
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, of_kind
+from sfm.products.drafting.draft import draft_survey
 from sfm.report.findings import Findings
 from sfm.report.tables.csv_files import write_tables
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
 from sfm.survey.circles import circle_misfit
-from sfm.survey.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import Measurements, find_photographs
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.orientation import orient_survey

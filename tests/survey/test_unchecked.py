@@ -9,17 +9,17 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import pixel_from_tangents
-from sfm.distributions import LEVEL
-from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings, remarks_on_unchecked
 from sfm.judgement.given.judge import judge_given
 from sfm.judgement.given.values import GivenModel
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import pixel_from_tangents
+from sfm.model.distributions import LEVEL
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.remarks.remark import kinds_of, remark
+from sfm.model.similarity import Similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of, remark
-from sfm.similarity import Similarity
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar

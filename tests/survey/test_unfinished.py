@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.batch.job import SurveyRow
-from sfm.batch.run import run_batch
-from sfm.batch.table import outcome_of
-from sfm.errors import GeometryError
+from sfm.model.errors import GeometryError
+from sfm.products.batch.job import SurveyRow
+from sfm.products.batch.run import run_batch
+from sfm.products.batch.table import outcome_of
 from sfm.report.output import read_log
 from tests.commands import kolinear, refused
 from tests.engines import ALONE, HERE, Notes

@@ -10,9 +10,9 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import other_solutions
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project
+from sfm.model.camera import camera_from_values, project
+from sfm.model.remarks.remark import remark
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import remark
 from sfm.survey.adjusting.solution_remarks import remarks_on_held_c
 from sfm.survey.inputs.survey import CameraSetup
 from tests.findings import findings_of

@@ -12,8 +12,8 @@ import pytest
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.judgement.checks import Sigma0
+from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import of_kind
 from sfm.report.phrases import describe_sigma0, describe_weights
 from sfm.report.survey_report import text_report
 from sfm.survey.inputs.given import KnownPoints

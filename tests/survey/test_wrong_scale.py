@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import Remark
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.given import KnownPoints, ScaleBar
 from sfm.survey.observation_tables import ObservationTable
 from tests.findings import findings_of

@@ -21,14 +21,14 @@ import cv2
 import numpy as np
 
 from benchmarks.textured import covariance_on_centres
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import KolinearError
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import KolinearError
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.planning.stations import aim_camera
-from sfm.remarks.remark import kinds_of
-from sfm.result import SurveyResult
-from sfm.similarity import fit_similarity
-from sfm.survey.drafting.draft import draft_survey
+from sfm.products.drafting.draft import draft_survey
+from sfm.products.planning.stations import aim_camera
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.synthetic import seed_of

@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import FloatArray, rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import FloatArray, rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import kinds_of
+from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.remarks.remark import kinds_of
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.findings import findings_of
 from tests.surveys import survey_of

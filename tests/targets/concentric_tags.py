@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.codes.concentric import ConcentricFamily, concentric_family
 from sfm.targets.detect import find_targets
 from tests.synthetic import seed_of

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
 from sfm.targets.detect import find_targets
 from sfm.targets.outlines import Flag
 from tests.synthetic import seed_of

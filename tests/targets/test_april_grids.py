@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.codes.boards import MIN_MODULE_PX, _outlines, _unique, name_corners, read_april_tags
 from sfm.targets.codes.plate_search import search_april_grids
 from sfm.targets.codes.plates import PlateFamily

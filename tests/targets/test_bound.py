@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.detect import find_targets
 from tests.places import ROOT
 from tests.synthetic import seed_of

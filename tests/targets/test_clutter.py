@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values
-from sfm.conventions import AnyArray, FloatArray, rotation_from_angles
-from sfm.rendering.render import render_photograph
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, discs, join_marks
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import AnyArray, FloatArray, rotation_from_angles
+from sfm.products.rendering.render import render_photograph
+from sfm.products.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, discs, join_marks
 from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.ring_cells import ROWS
 from sfm.targets.codes.rings import CodeFamily

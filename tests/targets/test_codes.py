@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import SurveyFileError
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import SurveyFileError
 from sfm.targets.codes import rings
 from sfm.targets.codes.plates import FAMILIES, code_family
 from sfm.targets.codes.rings import (

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import GeometryError
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import GeometryError
 from sfm.targets.codes.concentric import WIDTHS, ConcentricFamily, concentric_family
 from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets

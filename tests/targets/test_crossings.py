@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.camera import project
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.codes.boards import find_crossings, name_cut_board
 from sfm.targets.codes.plates import PlateFamily
 from sfm.targets.detect import find_targets

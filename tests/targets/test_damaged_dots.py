@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.detect import find_targets
 from tests.synthetic import seed_of
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes import ring_cells
 from sfm.targets.codes import rings as ring_reading
 from sfm.targets.codes.plates import code_family

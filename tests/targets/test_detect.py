@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import KolinearError, PhotographError
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import KolinearError, PhotographError
 from sfm.photographs.reading import read_photograph
 from sfm.targets.codes.plates import code_family
 from sfm.targets.detect import find_targets

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import Camera, camera_from_values, pixel_curvature, pixel_jacobian, project
-from sfm.conventions import FloatArray, rotation_from_angles, rotation_from_vector
+from sfm.model.camera import Camera, camera_from_values, pixel_curvature, pixel_jacobian, project
+from sfm.model.conventions import FloatArray, rotation_from_angles, rotation_from_vector
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
 from tests.outlines import moments_of_area
 from tests.synthetic import seed_of

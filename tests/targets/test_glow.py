@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.report.figures.overlays import REASON_COLOURS, REMARK_COLOURS
 from sfm.targets.detect import Targets, find_targets
 from sfm.targets.outlines import Flag

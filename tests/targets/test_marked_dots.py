@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sfm.camera import camera_from_values
-from sfm.conventions import AnyArray, FloatArray, rotation_from_angles
-from sfm.rendering.render import render_photograph
-from sfm.rendering.scene import CircularTargets, Faces, Optics, Scene, discs, join_marks
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import AnyArray, FloatArray, rotation_from_angles
+from sfm.products.rendering.render import render_photograph
+from sfm.products.rendering.scene import CircularTargets, Faces, Optics, Scene, discs, join_marks
 from sfm.targets.detect import Targets, find_targets
 
 DOT, PAPER, GLARE = 0.8, 0.1, 1.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvalsh
 
-from sfm.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.measure import (
     EllipseFit,
     axes_covariance,

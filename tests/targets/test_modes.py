@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.errors import KolinearError
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.errors import KolinearError
 from sfm.targets.detect import CENTRES, find_targets
 from sfm.targets.fits.centroid import measure_centroids, measure_edge_ellipses
 from sfm.targets.measure import axes_from_shape, fit_ellipse_model, shape_from_axes

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from datasets.bridge import render
-from sfm.conventions import AnyArray, BoolArray, FloatArray
-from sfm.rendering.render import render_photographs
-from sfm.rendering.scene import Optics
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
+from sfm.products.rendering.render import render_photographs
+from sfm.products.rendering.scene import Optics
 from sfm.targets.detect import find_targets
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness, undamaged

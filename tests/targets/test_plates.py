@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import SurveyFileError
-from sfm.rendering.render import render_photograph
-from sfm.rendering.scene import Optics
+from sfm.model.camera import project
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import SurveyFileError
+from sfm.products.rendering.render import render_photograph
+from sfm.products.rendering.scene import Optics
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes import dot_plates
 from sfm.targets.codes.boards import FLAGS, REDUCED_PX, reduce_photograph

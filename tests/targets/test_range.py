@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray
+from sfm.model.conventions import AnyArray
 from sfm.survey.inputs.settings import TargetSettings
 from sfm.survey.measuring.targets import measure_photograph
 from sfm.targets.detect import find_targets

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.tags import DICTIONARIES, _widening, find_tags, tag_family, tag_modules
 from sfm.targets.detect import find_targets
 from sfm.targets.fits.whole_tag import fit_whole_tags

@@ -8,14 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.camera import Camera, camera_from_values, project
-from sfm.conventions import AnyArray, BoolArray, FloatArray
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.camera import Camera, camera_from_values, project
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.model.similarity import fit_similarity
 from sfm.photographs.reading import linearise_srgb
 from sfm.pipeline import run_survey
-from sfm.printing.sheet import lay_out_sheet
-from sfm.rendering.render import render_photograph, render_photographs
-from sfm.rendering.scene import (
+from sfm.products.printing.sheet import lay_out_sheet
+from sfm.products.rendering.render import render_photograph, render_photographs
+from sfm.products.rendering.scene import (
     CircularTargets,
     Faces,
     Marks,
@@ -26,7 +27,6 @@ from sfm.rendering.scene import (
     rectangles,
     square_tag,
 )
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.codes.tags import DICTIONARIES, corner_name, find_tags, tag_family, tag_modules
 from sfm.targets.detect import find_targets

@@ -9,9 +9,9 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import tangents_from_pixel
-from sfm.errors import GeometryError
-from sfm.network import ObjectPoints, ScaleBars
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.errors import GeometryError
+from sfm.model.network import ObjectPoints, ScaleBars
 from sfm.textbook.direct import adjust_separately, orient_direct
 from tests.synthetic import make_network, perturb, seed_of
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm.camera import project
-from sfm.conventions import rotation_from_vector
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.camera import project
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from sfm.textbook.pair import make_normal_images
 from tests.synthetic import make_network, seed_of
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_angles
-from sfm.errors import GeometryError
+from sfm.model.conventions import rotation_from_angles
+from sfm.model.errors import GeometryError
 from sfm.textbook.photo_coordinates import (
     PhotoCorrections,
     RadialTable,

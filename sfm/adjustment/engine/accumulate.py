@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.adjustment.engine.collinearity import Observations, State, Workspace, collinearity
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled, inlined, kernel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled, inlined, kernel
 
 SINGULAR_PIVOT = 1e-13  # ratio of a pivot of a point to its diagonal term below which its rays are parallel
 STIFFENING = 1e10  # factor on the pivot that holds such a direction of a point

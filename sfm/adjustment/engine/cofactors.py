@@ -21,9 +21,9 @@ from sfm.adjustment.engine.normals import solve_lower, solve_transposed, times_p
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance
-from sfm.conventions import FloatArray, IntArray
-from sfm.kernels.compiling import kernel
-from sfm.observations.pose import exterior_jacobian
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.observations.pose import exterior_jacobian
+from sfm.runtime.compiling import kernel
 
 # Ratio of a variance to its limiting value below which the datum fixes the coordinate. Survey observations
 # of a point may be that much better than its rays; there, it is the ratio to the variance in any datum.

@@ -15,9 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MAX_PARAMETERS, observe
-from sfm.kernels.compiling import compiled, inlined, kernel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import MAX_PARAMETERS, observe
+from sfm.runtime.compiling import compiled, inlined, kernel
 
 CAMERA_UNKNOWNS = MAX_PARAMETERS + 6  # interior parameters and the mount of a camera
 

@@ -38,10 +38,10 @@ from sfm.adjustment.engine.normals import solve_lower
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.result import Covariance, ErrorCorrelation
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import kernel
-from sfm.network import rows_of
-from sfm.observations.pose import exterior_jacobian
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.network import rows_of
+from sfm.model.observations.pose import exterior_jacobian
+from sfm.runtime.compiling import kernel
 
 POINTS_AT_ONCE = 2000
 BYTES_AT_ONCE = 16_000_000  # bytes of the correlations held at a time

@@ -30,8 +30,8 @@ from sfm.adjustment.engine.solvers.choice import choose_solver
 from sfm.adjustment.engine.solvers.dense import DenseSolver
 from sfm.adjustment.engine.solvers.protocol import Factor, Solver
 from sfm.adjustment.engine.unknowns import Unknowns, step
-from sfm.conventions import FloatArray
-from sfm.errors import DivergedError, GeometryError
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import DivergedError, GeometryError
 from sfm.runtime.progress import keep_freed_memory
 
 TOLERANCE = 1e-6

@@ -31,9 +31,9 @@ from sfm.adjustment.engine.collinearity import Observations, State, new_workspac
 from sfm.adjustment.engine.observed import ObservedKind, Terms, terms_of
 from sfm.adjustment.engine.ordering import by_photograph
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import BoolArray, FloatArray
-from sfm.kernels.compiling import kernel
-from sfm.kernels.threads import at_once
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.runtime.compiling import kernel
+from sfm.runtime.threads import at_once
 
 # Number of image points from which two halves of the photographs are summed separately. A second thread takes
 # 0.1 ms to start and saves 0.07 microseconds per image point.

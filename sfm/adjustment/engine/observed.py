@@ -3,7 +3,7 @@
 The method is unified least squares. An observation has derivatives J by the unknowns of its blocks, a weight
 P and a difference l, computed minus observed. It adds J'P J to N and J'P l to g. Observations of object
 points alone are added before the points are eliminated; all others are added to the reduced normal equations.
-The kinds are those of `sfm.observations`, and this module does not depend on any particular one.
+The kinds are those of `sfm.model.observations`, and this module does not depend on any particular one.
 
 Source: Mikhail, Bethel and McGlone, Modern Photogrammetry (2001), sec. 4.4 and 5.6 (unified least
 squares).
@@ -18,10 +18,10 @@ import numpy as np
 
 from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import Network
-from sfm.observations.control_and_bars import ObjectPoints
-from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse_of_observed
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.network import Network
+from sfm.model.observations.control_and_bars import ObjectPoints
+from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse_of_observed
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
-from sfm.kernels.compiling import compiled
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.runtime.compiling import compiled
 
 
 def by_point(image: IntArray, point: IntArray, pose_of: IntArray, n: int) -> tuple[IntArray, IntArray]:

@@ -18,17 +18,17 @@ from scipy.linalg import block_diag
 from sfm.adjustment.engine.collinearity import CAMERA_UNKNOWNS, Observations, State, behind_camera
 from sfm.adjustment.engine.ordering import by_point, whitening_of
 from sfm.adjustment.result import scaled_covariance
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray, skew
-from sfm.display import counted
-from sfm.distortion.models import MAX_PARAMETERS
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate, Mounts
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import turn
-from sfm.network import Network
-from sfm.observations.kind import POINT
-from sfm.observations.pose import exterior_jacobian
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.display import counted
+from sfm.model.distortion.models import MAX_PARAMETERS
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate, Mounts
+from sfm.model.network import Network
+from sfm.model.observations.kind import POINT
+from sfm.model.observations.pose import exterior_jacobian
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import turn
 
 NO_START = ": no start value"  # behind the names of photographs and points that take no part
 MIN_RAYS = 2  # fewest rays of an object point that nothing else determines

@@ -25,12 +25,12 @@ import numpy as np
 
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment, computed_once
-from sfm.camera import pixel_jacobian, project
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
-from sfm.estimate import Estimate
-from sfm.network import rows_of
-from sfm.remarks.remark import EXPECTED_SIGMAS
+from sfm.model.camera import pixel_jacobian, project
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
+from sfm.model.estimate import Estimate
+from sfm.model.network import rows_of
+from sfm.model.remarks.remark import EXPECTED_SIGMAS
 
 # Ratio r of the largest component of a photograph to the median below which a difference does not matter:
 # equal weights of two groups cost at most (1 + r^2) / 2r of the best precision, here 8 %.

@@ -44,13 +44,13 @@ from sfm.adjustment.engine.correlated import Linearised, linearise
 from sfm.adjustment.engine.unknowns import interior_names
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.kernels.threads import own_threads
-from sfm.network import rows_of
-from sfm.observations.pose import exterior_jacobian
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.network import rows_of
+from sfm.model.observations.pose import exterior_jacobian
+from sfm.runtime.threads import own_threads
 
 CELLS = 24  # grid cells along the longer side of the photograph
 HALVINGS = 7  # halvings of the longer side down to the smallest cells and shortest correlation

@@ -25,13 +25,13 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.iterate import TOLERANCE
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import f_isf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.similarity import fit_similarity, reverse_depth
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distributions import f_isf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import fit_similarity, reverse_depth
 
 STEP = 1.3  # ratio of successive principal distances that are tried
 STEPS = 6  # steps in each direction, from a fifth of c to five times c

@@ -15,10 +15,10 @@ from sfm.adjustment.datum import free_motions, leading
 from sfm.adjustment.engine.iterate import Optimum
 from sfm.adjustment.engine.normals import times_schur
 from sfm.adjustment.engine.unknowns import MIN_RAYS, Unknowns, interior_names
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 
 MAPPED_TO_ZERO = 1e-6  # largest |N h| of a null vector, |h| = 1, unit diagonal of N; rounding leaves 1e-13
 AXIS = 1e-3  # largest deviation from 1 of a component for a direction to be called that of an axis

@@ -26,11 +26,11 @@ from sfm.adjustment.engine.observed import ObservedKind, Reduced, reduced_rows
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, VarianceComponents
 from sfm.adjustment.result import Adjustment, ObservedResiduals
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
-from sfm.distortion.models import MODELS
-from sfm.distributions import (
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera
+from sfm.model.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import MODELS
+from sfm.model.distributions import (
     FALSE_ALARM,
     LEVEL,
     POWER,
@@ -42,7 +42,7 @@ from sfm.distributions import (
     t_ppf,
     t_sf,
 )
-from sfm.errors import GeometryError
+from sfm.model.errors import GeometryError
 
 MIN_EXCESS_RATIO = 2.0  # coordinates beyond the critical value, relative to the number expected by chance
 MIN_REPORTED_CORRELATION = 0.9  # absolute correlation from which two parameters are reported

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.adjustment.result import MIN_SIGMA_PX, Adjustment
-from sfm.camera import camera_families
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.camera import camera_families
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 
 LAST_CHANGE = 1e-3  # relative change of a variance component at which the estimation ends
 LAST_CHANGE_OF_PARTS = 0.01  # the same for a covariance of two parts, and for the share of one part

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from sfm.cli.commands.starting import FAILED, compile_first, loading
 from sfm.cli.commands.surveying import AllowOutside, PicturesMb, Verbose
-from sfm.errors import KolinearError, MissingLibraryError, one_line
+from sfm.model.errors import KolinearError, MissingLibraryError, one_line
 from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 from sfm.runtime.faults import FAULT
 
@@ -77,10 +77,10 @@ def batch(
     with loading():
         from rich.console import Console
 
-        from sfm.api import colmap_writer
-        from sfm.batch.job import Comparers
-        from sfm.batch.run import calls_of, find_surveys, run_batch
-        from sfm.batch.table import BatchTable, print_batch, stopping_at_terminate
+        from sfm.products.batch.job import Comparers
+        from sfm.products.batch.run import calls_of, find_surveys, run_batch
+        from sfm.products.batch.table import BatchTable, print_batch, stopping_at_terminate
+        from sfm.products.public_functions import colmap_writer
 
     files = find_surveys(surveys)
     compile_first()
@@ -110,7 +110,7 @@ def batch(
 
 def _programs_of_worker(survey: Survey) -> OtherPrograms:
     """Return the programs to compare a survey with, on one thread each, as every core has a worker."""
-    from sfm.api import programs_of
+    from sfm.products.public_functions import programs_of
 
     return programs_of(survey.compare.backend, survey.compare.baseline, threads=1)
 

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
-from sfm.display import counted
-from sfm.errors import OutputError
+from sfm.model.display import counted
+from sfm.model.errors import OutputError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.conventions import BoolArray, FloatArray
-    from sfm.solution import Solution
+    from sfm.model.conventions import BoolArray, FloatArray
+    from sfm.model.solution import Solution
 
 PICTURES = "pictures"  # folder of photographs in a result folder
 MAX_PRINTED = 40  # distances, angles and heights on the terminal; quantities.csv lists all
 if TYPE_CHECKING:
-    from sfm.inspection.measure import Measurement
+    from sfm.products.inspection.measure import Measurement
 
 
 def measure(
@@ -52,8 +52,8 @@ def measure(
         from adapters.formats.registry import read_comparable
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.inspection.features_file import read_features_file
-        from sfm.inspection.measure import measure_result
+        from sfm.products.inspection.features_file import read_features_file
+        from sfm.products.inspection.measure import measure_result
         from sfm.report.measurement import describe_measured, parameter_rows, quantity_table
         from sfm.report.pages import write_page
         from sfm.report.phrases import with_sigma
@@ -126,7 +126,7 @@ def accept(
         from adapters.formats.result_tables import read_result, read_scale_sources
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.inspection.acceptance import accept_result, read_lengths
+        from sfm.products.inspection.acceptance import accept_result, read_lengths
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -220,11 +220,11 @@ def view(
         from adapters.formats.registry import format_of, read_comparable
         from adapters.formats.result_tables import read_targets
         from sfm.files.globs import why_no_folder
-        from sfm.kernels.threads import cores
         from sfm.report.figures.overlays import overlay_names
         from sfm.report.view_page import photographs_in, refuse_foreign_page, write_view
         from sfm.report.viewer.embedded import scene_of_stored
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.runtime.threads import cores
 
     place = Path(os.path.abspath(source))  # links are not followed, as when pages are written
     page = place.with_name(f"{place.name}.html") if out is None else out

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from sfm.camera import camera_from_values, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray, pixel_from_image
-from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.matching.conjugate import match_points
 from sfm.matching.correlation import MIN_CORRELATION
+from sfm.model.camera import camera_from_values, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray, pixel_from_image
+from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.overlays import draw_patches
 from sfm.report.single_photographs import (

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import loading
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 from sfm.textbook.resection import METHODS
 
 if TYPE_CHECKING:
-    from sfm.conventions import IntArray
+    from sfm.model.conventions import IntArray
 NONE_MATCHED = 1  # exit code
 MAX_TARGETS = 10_000  # per sheet; no family has more codes
 
@@ -241,7 +241,7 @@ def targets(
     The sheet is drawn to scale and has a ruler to check the print.
     """
     with loading():
-        from sfm.printing.sheet import lay_out_sheet, write_sheet
+        from sfm.products.printing.sheet import lay_out_sheet, write_sheet
 
     radii = None if ring_radii is None else _parse_two_numbers(ring_radii)
     sheet = lay_out_sheet(

@@ -19,13 +19,13 @@ from sfm.cli.commands.planning_inputs import (
     survey_plan,
 )
 from sfm.cli.commands.starting import loading
-from sfm.errors import GeometryError, SurveyFileError
-from sfm.planning import MIN_PIXELS
+from sfm.model.errors import GeometryError, SurveyFileError
+from sfm.products.planning import MIN_PIXELS
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.camera import Camera
-    from sfm.planning.visibility import DepthOfField
+    from sfm.model.camera import Camera
+    from sfm.products.planning.visibility import DepthOfField
 
 MAX_WEAK = 5  # weak points listed on the terminal
 plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
@@ -74,9 +74,9 @@ def target_size_command(
     diameter = pixels x sensor width x distance / (c x photograph width x cosine of the tilt)
     """
     with loading():
-        from sfm.conventions import METRES
         from sfm.files.whole_files import refuse_existing, whole_file
-        from sfm.planning.visibility import compute_target_size
+        from sfm.model.conventions import METRES
+        from sfm.products.planning.visibility import compute_target_size
         from sfm.targets.codes.plates import code_family
         from sfm.targets.codes.rings import CodeFamily
 
@@ -265,12 +265,12 @@ def network_command(
         import numpy as np
 
         from sfm.cli.console import exit_by, print_verdict
-        from sfm.conventions import METRES
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.planning.designer import StationLimits, design_network
-        from sfm.planning.plan import describe_plan, plan_of, verdict_of_plan
-        from sfm.planning.prediction import WantedPrecision
-        from sfm.planning.visibility import Seeing, TargetImage
+        from sfm.model.conventions import METRES
+        from sfm.products.planning.designer import StationLimits, design_network
+        from sfm.products.planning.plan import describe_plan, plan_of, verdict_of_plan
+        from sfm.products.planning.prediction import WantedPrecision
+        from sfm.products.planning.visibility import Seeing, TargetImage
         from sfm.report.pages import write_page
         from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
@@ -362,7 +362,7 @@ def _depth_of_field(
     camera: Camera, f_number: float | None, focus: float | None, confusion_um: float | None, to_mm: float
 ) -> DepthOfField | None:
     """Return the depth of field in the object unit, or None if no f-number is given."""
-    from sfm.planning.visibility import DepthOfField, Lens, depth_of_field
+    from sfm.products.planning.visibility import DepthOfField, Lens, depth_of_field
 
     if (f_number is None) != (focus is None):
         raise SurveyFileError("plan: the depth of field needs both --f-number and --focus")
@@ -392,10 +392,10 @@ def simulate_command(
     deviations are compared with the achieved ones and with the true errors.
     """
     with loading():
-        from sfm.api import run_survey
         from sfm.files.open_folders import locked, refuse_foreign_folder
         from sfm.files.whole_files import remove_leftovers, whole_folder
-        from sfm.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
+        from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
+        from sfm.products.public_functions import run_survey
 
     refuse_foreign_folder(out)
     with working_on(str(folder)):
@@ -452,7 +452,7 @@ def more_command(
         from adapters.formats.result_tables import read_result
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.planning.plan import further_photographs
+        from sfm.products.planning.plan import further_photographs
         from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress

@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sfm.display import counted, listed
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.display import counted, listed
+from sfm.model.errors import GeometryError, SurveyFileError
 
 if TYPE_CHECKING:
-    from sfm.camera import Camera
-    from sfm.estimate import Mounts
-    from sfm.network import Network
-    from sfm.planning.planned_object import PlannedObject
-    from sfm.planning.prediction import ScaleBarPlan
-    from sfm.planning.stations import Stations
+    from sfm.model.camera import Camera
+    from sfm.model.estimate import Mounts
+    from sfm.model.network import Network
+    from sfm.products.planning.planned_object import PlannedObject
+    from sfm.products.planning.prediction import ScaleBarPlan
+    from sfm.products.planning.stations import Stations
     from sfm.survey.inputs.settings import CameraSettings
     from sfm.survey.inputs.survey import Survey
     from sfm.survey.observation_tables import ObservationTable
@@ -52,8 +52,8 @@ def object_of(text: str, count: int, *, open_mesh: bool) -> PlannedObject:
         KolinearError: the message states what was found and what was expected.
     """
     from adapters.formats.mesh import read_mesh
-    from sfm.geometry.tolerance import Mesh
-    from sfm.planning.planned_object import SHAPES, object_of_mesh, object_of_points, shape_object
+    from sfm.products.geometry.tolerance import Mesh
+    from sfm.products.planning.planned_object import SHAPES, object_of_mesh, object_of_points, shape_object
 
     kind, colon, sizes = text.partition(":")
     if colon and kind in SHAPES:
@@ -131,9 +131,9 @@ def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
     """
     import numpy as np
 
-    from sfm.conventions import rotation_from_angles
     from sfm.files.csv_tables import read_table
-    from sfm.planning.stations import Stations, arrangement
+    from sfm.model.conventions import rotation_from_angles
+    from sfm.products.planning.stations import Stations, arrangement
 
     path = Path(text)
     if path.suffix.lower() != ".csv":
@@ -146,7 +146,7 @@ def stations_of(text: str, planned: PlannedObject, camera: Camera) -> Stations:
 
 def bars_of(texts: list[str] | None) -> tuple[ScaleBarPlan, ...]:
     """Return the scale bars of texts FROM,TO,SIGMA."""
-    from sfm.planning.prediction import ScaleBarPlan
+    from sfm.products.planning.prediction import ScaleBarPlan
 
     bars = []
     for text in texts or ():
@@ -203,7 +203,7 @@ def _camera_of_survey(path: Path, name: str | None, c_mm: float | None) -> Camer
 
 
 def _camera_of_settings(path: Path, settings: CameraSettings, c_mm: float | None = None) -> Camera:
-    from sfm.camera import camera_from_values
+    from sfm.model.camera import camera_from_values
 
     c = c_mm if c_mm is not None else settings.c_mm
     if c is None:
@@ -269,7 +269,7 @@ class PlannedSetup:
             raise SurveyFileError("plan: a rig or observations of photographs need --stations")
 
     def _tables_of_photographs(self) -> list[ObservationTable]:
-        from sfm.observations.kind import PHOTOGRAPH
+        from sfm.model.observations.kind import PHOTOGRAPH
 
         tables = () if self.survey is None else self.survey.tables
         return [table for table in tables if table.of.texts_of == PHOTOGRAPH]
@@ -290,7 +290,7 @@ def survey_plan(path: Path, planned: PlannedObject, unit: str, *, free_mounts: b
     """
     import numpy as np
 
-    from sfm.planning.prediction import ScaleBarPlan
+    from sfm.products.planning.prediction import ScaleBarPlan
     from sfm.survey.inputs.start import with_given_mounts
     from sfm.survey.inputs.survey import read_survey
     from sfm.survey.observation_tables import with_tables
@@ -332,7 +332,7 @@ def listed_camera(name: str, c_mm: float | None) -> Camera:
     Raises:
         GeometryError: the name is not listed, or there is no principal distance.
     """
-    from sfm.camera import camera_from_values
+    from sfm.model.camera import camera_from_values
 
     if name not in SENSORS:
         raise GeometryError(

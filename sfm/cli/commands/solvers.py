@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import FAILED, compile_first, loading
-from sfm.display import counted
-from sfm.errors import SurveyFileError
+from sfm.model.display import counted
+from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.epochs.differences import Epoch
+    from sfm.products.epochs.differences import Epoch
 
 
 def compare(
@@ -213,9 +213,9 @@ def epochs(
     """
     with loading():
         from sfm.cli.console import exit_by, print_verdict
-        from sfm.distributions import FALSE_ALARM
-        from sfm.epochs.series import analyse_epochs, verdict_of_epochs
         from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.model.distributions import FALSE_ALARM
+        from sfm.products.epochs.series import analyse_epochs, verdict_of_epochs
         from sfm.report.epochs import describe_block, describe_stable
         from sfm.report.pages import write_page
 
@@ -259,7 +259,7 @@ def _read_epoch(path: Path) -> Epoch:
     from adapters.formats.control_tables import read_given
     from adapters.formats.result_tables import read_result
     from sfm.cli.commands.surveying import run_file
-    from sfm.epochs.differences import Epoch
+    from sfm.products.epochs.differences import Epoch
 
     folder = run_file(path) if path.is_file() else path
     with working_on(str(folder)):
@@ -346,13 +346,13 @@ def refine(
             update_model,
         )
         from sfm.files.whole_files import refuse_unwritable, whole_folder
+        from sfm.products.refining.oriented_windows import measure_model_targets
+        from sfm.products.refining.refinement import RefineSettings, refine_model, refinement_text
         from sfm.report.pages import page_of, texts_of
         from sfm.report.refinement import Numbers, describe_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.settings import AdjustSettings
         from sfm.survey.inputs.survey import read_survey
-        from sfm.survey.refining.oriented_windows import measure_model_targets
-        from sfm.survey.refining.refinement import RefineSettings, refine_model, refinement_text
 
     out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
     refuse_unwritable(out)

@@ -20,12 +20,12 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
-from sfm.display import counted
-from sfm.errors import KolinearError, MissingLibraryError
+from sfm.model.display import counted
+from sfm.model.errors import KolinearError, MissingLibraryError
 
 if TYPE_CHECKING:
     from sfm.adjustment.result import Adjustment
-    from sfm.estimate import Estimate
+    from sfm.model.estimate import Estimate
 
 READER_GONE = 141  # exit code 128 + SIGPIPE, as a shell reports it for other programs
 LIBRARIES = (
@@ -107,7 +107,7 @@ def _end(number: int, frame: FrameType | None, *, text: str = INTERRUPTED_TEXT) 
 def _announce_compiling() -> None:
     """Report compiling of kernels on stderr while the command runs, if numba is loaded."""
     if "numba" in sys.modules and not _listening:
-        from sfm.kernels.compiling import COMPILING, when_compiling
+        from sfm.runtime.compiling import COMPILING, when_compiling
 
         _listening.append(True)
         _running.enter_context(
@@ -117,11 +117,11 @@ def _announce_compiling() -> None:
 
 def compile_first() -> None:
     """Compile the kernels of a survey unless they are compiled for these sources, and report it on stderr."""
-    from sfm.kernels.warmed import is_warm
+    from sfm.runtime.warmed import is_warm
 
     if is_warm():
         return
-    from sfm import warm_up
+    from sfm.cli import warm_up
     from sfm.runtime.progress_bar import drawn_progress
 
     print("kolinear: compiling the kernels, once, a minute or two", file=sys.stderr, flush=True)
@@ -139,9 +139,9 @@ def doctor() -> None:
         from rich.table import Table
 
         from sfm.files.user_cache import user_folder
-        from sfm.kernels.compiling import KEPT
-        from sfm.kernels.threads import cores
-        from sfm.kernels.warmed import is_warm
+        from sfm.runtime.compiling import KEPT
+        from sfm.runtime.threads import cores
+        from sfm.runtime.warmed import is_warm
 
     console = Console(highlight=False)
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
@@ -182,8 +182,8 @@ def _check_targets() -> str:
     """Measure four drawn dots of known positions."""
     import numpy as np
 
+    from sfm.cli.warm_up import DOTS, drawn_photograph
     from sfm.targets.detect import find_targets
-    from sfm.warm_up import DOTS, drawn_photograph
 
     dots = find_targets(drawn_photograph(False), polarity="dark", codes="ring14")
     if len(dots) != len(DOTS):
@@ -200,7 +200,7 @@ def _tested_network() -> tuple[Adjustment, Estimate]:
     """Return the adjustment of a synthetic network, and its true values."""
     from sfm.adjustment.datum import Datum
     from sfm.adjustment.solve import adjust
-    from sfm.warm_up import made_up_network
+    from sfm.cli.warm_up import made_up_network
 
     network, truth = made_up_network()
     return adjust(network, truth, datum=Datum("free")), truth
@@ -210,7 +210,7 @@ def _check_adjustment() -> str:
     """Compare the adjustment of a synthetic network with the true values."""
     import numpy as np
 
-    from sfm.remarks.remark import WRONG_SIGMAS
+    from sfm.model.remarks.remark import WRONG_SIGMAS
 
     adjusted, truth = _tested_network()
     if not adjusted.converged:
@@ -225,8 +225,8 @@ def _check_adjustment() -> str:
 
 def _check_colmap() -> str:
     """Adjust the same network with COLMAP and compare."""
-    from sfm.api import programs_of
     from sfm.comparison.two_adjusters.adjusters import compare_adjusters
+    from sfm.products.public_functions import programs_of
 
     adjuster = programs_of("colmap", "none").adjuster
     assert adjuster is not None

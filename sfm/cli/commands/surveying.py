@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.commands.starting import FAILED, compile_first, loading
-from sfm.errors import KolinearError, OutputError
+from sfm.model.errors import KolinearError, OutputError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    from sfm.remarks.remark import Remark
-    from sfm.survey.drafting.draft import Draft
+    from sfm.model.remarks.remark import Remark
+    from sfm.products.drafting.draft import Draft
     from sfm.survey.inputs.survey import Survey
 
 PHOTOGRAPHS = "# Photographs: "  # comment with their folder, relative to the survey file, as a JSON string
@@ -222,12 +222,11 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
     """Run a survey, write and print its result, and return the result folder."""
     begun = time.perf_counter()
     with loading():
-        from sfm.api import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
-        from sfm.kernels.threads import cores
         from sfm.photographs.reading import SUFFIXES
         from sfm.pipeline import run_survey
+        from sfm.products.public_functions import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings import findings_of
         from sfm.report.output import (
@@ -238,6 +237,7 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
             write_unfinished,
         )
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.runtime.threads import cores
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
         from sfm.survey.inputs.photograph_names import name_photographs
@@ -455,9 +455,9 @@ def refuse_pitch(pitch: float | None, file: Path) -> None:
 
 def _draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
     with loading():
-        from sfm.api import one_blas_thread, sensor_widths
+        from sfm.products.drafting.draft import draft_survey
+        from sfm.products.public_functions import one_blas_thread, sensor_widths
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.survey.drafting.draft import draft_survey
         from sfm.survey.measuring.measured_store import MeasuredStore
 
     compile_first()
@@ -477,7 +477,7 @@ def _write_draft(draft: Draft, photographs: Path, file: Path) -> None:
     """Write a drafted survey file with the folder of its photographs, and report findings on stderr."""
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
-    from sfm.remarks.verdict import lines_of
+    from sfm.model.remarks.verdict import lines_of
     from sfm.report.output import path_from
 
     picture = file.with_name(f"{file.stem}{RINGS_PICTURE}")

@@ -28,18 +28,18 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
 from sfm.comparison.camera_conversion import Conversion, convert_camera, corresponding_free
 from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
-from sfm.conventions import BoolArray, FloatArray
-from sfm.display import counted, program_name
-from sfm.distortion.models import Role
-from sfm.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
-from sfm.network import ImagePoints, Network
-from sfm.reduced_network import reduce_network, select_supported
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.display import counted, program_name
+from sfm.model.distortion.models import Role
+from sfm.model.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.reduced_network import reduce_network, select_supported
 from sfm.runtime.progress import report_step
 
 MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that determine a photograph

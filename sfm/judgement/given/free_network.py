@@ -21,13 +21,13 @@ from scipy.sparse import csr_matrix
 
 from sfm.adjustment.covariance import Marginal, marginal_of
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.estimate import AdjustedValues, Estimate, values_of
 from sfm.judgement.given.values import RANK, GivenModel
-from sfm.network import Network
-from sfm.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
-from sfm.similarity import Similarity, similarity_motions
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import AdjustedValues, Estimate, values_of
+from sfm.model.network import Network
+from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind
+from sfm.model.similarity import Similarity, similarity_motions
 
 MAX_PLACES = 1000  # given points with a joint covariance, 72 MB; if there are more, only so many are judged
 

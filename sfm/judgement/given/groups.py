@@ -9,8 +9,6 @@ from typing import TypeVar
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.conventions import FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM, Levels
 from sfm.judgement.given.free_network import FreeNetwork, Reference
 from sfm.judgement.given.points import (
     GivenPoints,
@@ -21,11 +19,13 @@ from sfm.judgement.given.values import (
     GivenModel,
     Judgement,
 )
-from sfm.network import Network
-from sfm.observations.kind import CoordinateKind, Kind
-from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
-from sfm.result import GivenTest
-from sfm.similarity import extended_axes
+from sfm.judgement.survey_result import GivenTest
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.distributions import FALSE_ALARM, Levels
+from sfm.model.network import Network
+from sfm.model.observations.kind import CoordinateKind, Kind
+from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.similarity import extended_axes
 
 K = TypeVar("K", bound=Kind)
 C = TypeVar("C", bound=CoordinateKind)

@@ -17,7 +17,6 @@ import numpy as np
 from sfm.adjustment.covariance import determines_cameras
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.statistics import non_centrality
-from sfm.conventions import BoolArray, FloatArray
 from sfm.judgement.given.free_network import FreeNetwork, confirmed, thinned
 from sfm.judgement.given.groups import (
     GivenSettings,
@@ -33,13 +32,14 @@ from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
 from sfm.judgement.given.tables import Table, as_judged, judge_tables
 from sfm.judgement.given.values import GivenModel
-from sfm.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
-from sfm.observations.kind import CoordinateKind
-from sfm.observations.point_pairs import Distances
-from sfm.observations.pose import MountObservations
-from sfm.remarks.remark import Remark, remark
-from sfm.result import GivenTest
-from sfm.similarity import Similarity
+from sfm.judgement.survey_result import GivenTest
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.network import ExteriorObservations, Network, ObjectPoints, ScaleBars
+from sfm.model.observations.kind import CoordinateKind
+from sfm.model.observations.point_pairs import Distances
+from sfm.model.observations.pose import MountObservations
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import Similarity
 
 
 @dataclass(frozen=True)

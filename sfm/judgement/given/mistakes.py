@@ -13,9 +13,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
-from sfm.observations.kind import Kind
-from sfm.similarity import Similarity, fit_similarities
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.observations.kind import Kind
+from sfm.model.similarity import Similarity, fit_similarities
 
 MIN_POINTS = 4  # three points have a similar triangle by chance too easily: two degrees of freedom
 MAX_POINTS = 40  # 59,280 ordered triangles; with more points, only the agreed similarity is used

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from sfm.conventions import FloatArray, rotation_from_angles
 from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
 from sfm.judgement.given.mistakes import explanations
 from sfm.judgement.given.scales import (
@@ -23,10 +22,11 @@ from sfm.judgement.given.scales import (
     scales_of,
 )
 from sfm.judgement.given.values import GivenModel
-from sfm.network import Network
-from sfm.observations.pose import MountObservations
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import Similarity
+from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.network import Network
+from sfm.model.observations.pose import MountObservations
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import Similarity
 
 TINY = float(np.finfo(float).tiny)
 

@@ -16,9 +16,6 @@ from math import comb, log
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
-from sfm.distributions import MARGIN
-from sfm.errors import GeometryError
 from sfm.judgement.given.free_network import Reference, centre_and_size
 from sfm.judgement.given.mistakes import assignments, cost_of_choice, explanations, find_renamed
 from sfm.judgement.given.values import (
@@ -29,8 +26,11 @@ from sfm.judgement.given.values import (
     judge_values,
     misfit_of,
 )
-from sfm.observations.kind import CoordinateKind
-from sfm.similarity import Similarity, extended_axes, fit_similarities, fit_similarity
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
+from sfm.model.distributions import MARGIN
+from sfm.model.errors import GeometryError
+from sfm.model.observations.kind import CoordinateKind
+from sfm.model.similarity import Similarity, extended_axes, fit_similarities, fit_similarity
 
 MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct
 MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten

@@ -15,8 +15,6 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags, vstack
 from scipy.spatial.transform import Rotation
 
-from sfm.conventions import FloatArray, IntArray, find_unit
-from sfm.distributions import chi2_isf
 from sfm.judgement.given.free_network import Reference, thinned
 from sfm.judgement.given.groups import Group, Task, plate_name, remarks_on_unchecked
 from sfm.judgement.given.points import UNCHANGED, PlacedPoints, parameters_of
@@ -28,11 +26,13 @@ from sfm.judgement.given.values import (
     cost_of_parameter,
     judge_values,
 )
-from sfm.network import ScaleBars
-from sfm.observations.kind import Kind
-from sfm.remarks.remark import Remark, remark, significant
-from sfm.result import GivenTest
-from sfm.similarity import Similarity
+from sfm.judgement.survey_result import GivenTest
+from sfm.model.conventions import FloatArray, IntArray, find_unit
+from sfm.model.distributions import chi2_isf
+from sfm.model.network import ScaleBars
+from sfm.model.observations.kind import Kind
+from sfm.model.remarks.remark import Remark, remark, significant
+from sfm.model.similarity import Similarity
 
 TABLE = "the table of distances"
 MAX_PERCENT = 2.0  # a larger ratio of lengths is reported as a factor, a smaller one in per cent

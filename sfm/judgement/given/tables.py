@@ -14,14 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import IntArray
 from sfm.judgement.given.free_network import Reference, confirmed, thinned
 from sfm.judgement.given.mistakes import explanations
 from sfm.judgement.given.values import GivenModel, judge_values
-from sfm.network import Network
-from sfm.observations.kind import Group, Kind, TableKind
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import Similarity
+from sfm.model.conventions import IntArray
+from sfm.model.network import Network
+from sfm.model.observations.kind import Group, Kind, TableKind
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import Similarity
 
 
 class Table(NamedTuple):

@@ -23,8 +23,8 @@ from math import comb, log
 import numpy as np
 
 from sfm.adjustment.quality.statistics import non_centrality
-from sfm.conventions import SWELLING, BoolArray, FloatArray, IntArray
-from sfm.distributions import LEVEL, MARGIN, MIN_LEAD, f_sf
+from sfm.model.conventions import SWELLING, BoolArray, FloatArray, IntArray
+from sfm.model.distributions import LEVEL, MARGIN, MIN_LEAD, f_sf
 
 # An order of magnitude: mm stated for cm, or the precision of the instrument alone. Differences that it does
 # not explain are errors of the values. The best-fitting factor may be larger by chance.

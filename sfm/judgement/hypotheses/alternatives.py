@@ -20,9 +20,6 @@ import numpy as np
 from scipy.special import gammaln
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf
 from sfm.judgement.hypotheses.columns import Columns, interior_columns, rigid_motions
 from sfm.judgement.hypotheses.families import (
     BODY,
@@ -50,8 +47,11 @@ from sfm.judgement.hypotheses.score import (
     log_probability,
     points_by_cameras,
 )
-from sfm.likelihood import price_of
-from sfm.network import sum_rows
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import Role
+from sfm.model.distributions import chi2_isf
+from sfm.model.likelihood import price_of
+from sfm.model.network import sum_rows
 
 MIN_GROUP = 2  # photographs on each side of a split
 MAX_RUNS = 60  # photographs, or runs of photographs, with separate freedoms

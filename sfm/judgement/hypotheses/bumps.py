@@ -27,11 +27,11 @@ from sfm.adjustment.covariance import JointOnDemand, marginal_of
 from sfm.adjustment.engine.collinearity import residuals
 from sfm.adjustment.engine.correlated import linearise
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray, angles_from_rotation, rotation_from_angles
-from sfm.distributions import chi2_sf, level_of_single
 from sfm.judgement.hypotheses.score import gain_of
-from sfm.kernels.threads import own_threads
-from sfm.remarks.remark import Remark, remark
+from sfm.model.conventions import FloatArray, IntArray, angles_from_rotation, rotation_from_angles
+from sfm.model.distributions import chi2_sf, level_of_single
+from sfm.model.remarks.remark import Remark, remark
+from sfm.runtime.threads import own_threads
 
 MIN_REDUNDANCY = 1e-9  # redundancy of a separate pose below which nothing checks it
 STEP = 1e-6  # of a numerical derivative, as a share of the distance of two photographs, and in rad

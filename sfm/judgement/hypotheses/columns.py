@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.camera import Camera, pixel_from_tangents, pixel_jacobian
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.network import rows_of
-from sfm.similarity import mean_distance
+from sfm.model.camera import Camera, pixel_from_tangents, pixel_jacobian
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import Role
+from sfm.model.network import rows_of
+from sfm.model.similarity import mean_distance
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 CAMERA_ROLES = (

@@ -13,7 +13,6 @@ from typing import ClassVar
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, FloatArray, IntArray
 from sfm.judgement.hypotheses.columns import (
     BENDING_PLACES,
     CAMERA,
@@ -36,9 +35,10 @@ from sfm.judgement.hypotheses.score import (
     log_probability,
     squares_gained,
 )
-from sfm.likelihood import price_of
-from sfm.remarks.remark import Quantity
-from sfm.similarity import without_motions
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.likelihood import price_of
+from sfm.model.remarks.remark import Quantity
+from sfm.model.similarity import without_motions
 
 SEEN_PX = 1e-3  # change of an image coordinate below which no measurement shows it
 CELLS = 5  # cells of the format in each direction

@@ -21,10 +21,6 @@ from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import MIN_LEAD
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     alternatives_of,
@@ -50,12 +46,16 @@ from sfm.judgement.hypotheses.score import (
     reduce_adjustment,
     squares_gained,
 )
-from sfm.likelihood import price_of
-from sfm.network import Network, rows_of, without_given
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distributions import MIN_LEAD
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.likelihood import price_of
+from sfm.model.network import Network, rows_of, without_given
+from sfm.model.reduced_network import reduce_network
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import fit_similarity
 from sfm.runtime.progress import reported
-from sfm.similarity import fit_similarity
 
 MAX_CAUSES = 4  # number of causes, each sought beside the others
 MAX_TRIED = 2  # alternatives of each kind that are adjusted, those with most evidence in the score test

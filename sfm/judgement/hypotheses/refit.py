@@ -24,9 +24,6 @@ from scipy.special import chndtrinc
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import FloatArray
-from sfm.distributions import POWER
-from sfm.errors import GeometryError
 from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     cameras_of_photographs,
@@ -53,10 +50,13 @@ from sfm.judgement.hypotheses.score import (
     least_share,
     reduce_adjustment,
 )
-from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Network
-from sfm.remarks.remark import WRONG_SIGMAS, Remark, remark
-from sfm.similarity import fit_similarity, without_motions
+from sfm.model.conventions import FloatArray
+from sfm.model.distributions import POWER
+from sfm.model.errors import GeometryError
+from sfm.model.likelihood import areas_of_photographs, log_likelihood
+from sfm.model.network import Network
+from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.similarity import fit_similarity, without_motions
 
 ROUNDS = 6
 HALVINGS = 4  # most halvings of a step, because a linear step may go too far for a large error

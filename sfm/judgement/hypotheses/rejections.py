@@ -13,11 +13,11 @@ import numpy as np
 
 from sfm.adjustment.quality.consistency import intersect_rays
 from sfm.adjustment.result import Adjustment
-from sfm.camera import project
-from sfm.conventions import IntArray
-from sfm.distributions import chi2_isf, chi2_sf
-from sfm.network import rows_of
-from sfm.remarks.remark import Remark, remark
+from sfm.model.camera import project
+from sfm.model.conventions import IntArray
+from sfm.model.distributions import chi2_isf, chi2_sf
+from sfm.model.network import rows_of
+from sfm.model.remarks.remark import Remark, remark
 
 MIN_EXCHANGED = 2  # photographs with two names exchanged from which this is systematic, not accidental
 MIN_RAYS = 3  # rays that meet at a second position; two nearly meet anywhere along an epipolar line

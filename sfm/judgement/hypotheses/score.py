@@ -25,10 +25,10 @@ from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.conventions import BoolArray, FloatArray, IntArray, skew
-from sfm.distributions import f_sf
 from sfm.judgement.hypotheses.columns import Columns, interior_columns
-from sfm.network import rows_of, sum_rows
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.distributions import f_sf
+from sfm.model.network import rows_of, sum_rows
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5

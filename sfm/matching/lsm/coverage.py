@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm.camera import Camera, pixel_from_tangents, ray_directions, tangents_from_pixel
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.estimate import Estimate
-from sfm.kernels.compiling import compiled
-from sfm.network import ImagePoints, rows_of
+from sfm.model.camera import Camera, pixel_from_tangents, ray_directions, tangents_from_pixel
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, rows_of
+from sfm.runtime.compiling import compiled
 
 # Ratio of precisions for the same pixels up to which the preferred windows are used.
 MAX_COST_RATIO = 1.1

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sfm.camera import ray_directions, tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.estimate import Estimate
 from sfm.matching.correlation import START_CORRELATION, match_ncc_warped
 from sfm.matching.lsm.coverage import plane_warps, project_points
+from sfm.model.camera import ray_directions, tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
 
 REACH_PX = 2  # distance from the line and along it that a correlation covers
 VERTICES = 65  # of the line of which the length gives the number of depths

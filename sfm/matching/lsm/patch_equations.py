@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.compiling import compiled, compiled_fast
-from sfm.kernels.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, sample
-from sfm.kernels.small_algebra import factorise
 from sfm.matching.correlation import FLAT_TEXTURE, MATCHED, OUTSIDE
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.runtime.compiling import compiled, compiled_fast
+from sfm.runtime.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, sample
+from sfm.runtime.small_algebra import factorise
 
 MAX_STRETCH = 3.0  # ratio of lengths of a patch in both photographs above which it is not a match
 # Geometric parameters. A tilt of the surface moves what a window shows along the epipolar line, in proportion

@@ -12,12 +12,12 @@ from dataclasses import fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
-from sfm.estimate import Estimate
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
-from sfm.network import ImagePoints, rows_of
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, rows_of
 
 SIDE_RATIO = 0.75  # of the next window to the one before
 MIN_WINDOW_PX = 9  # smaller windows hardly determine the parameters of an affine warp

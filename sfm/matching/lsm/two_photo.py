@@ -20,13 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled, compiled_fast
-from sfm.kernels.sampling import BILINEAR, TAPS, interpolation_index, kernel_weights
-from sfm.kernels.small_algebra import factorise, solve_factorised
 from sfm.matching.correlation import (
     DIVERGED,
     FLAT_TEXTURE,
@@ -52,6 +45,13 @@ from sfm.matching.lsm.patch_equations import (
     resample_patch,
 )
 from sfm.matching.radiometry import Grey, grey_of, odd_window
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.runtime.compiling import compiled, compiled_fast
+from sfm.runtime.sampling import BILINEAR, TAPS, interpolation_index, kernel_weights
+from sfm.runtime.small_algebra import factorise, solve_factorised
 
 # Texture is flat in a direction in which the gradients of the window have no more energy than noise has by
 # chance: its mean plus this many standard deviations.

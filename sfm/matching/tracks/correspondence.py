@@ -15,12 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.arguments import check_indices, checked_arguments
-from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.matching.epipolar import essential_matrices
 from sfm.matching.tracks.evidence import (
     SEARCH,
@@ -33,6 +27,12 @@ from sfm.matching.tracks.evidence import (
     prune,
     same_target,
 )
+from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
 
 # Two points that never share a photograph and lie closer than this many tolerances are one target.
 SAME_TOLERANCES = 2.5

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import solve_three
 from sfm.matching.epipolar import epipolar_distance
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import solve_three
 
 # If the orientation is wrong by the tolerance, a point from two rays is this many tolerances off in a third
 # photograph. The search narrows to one tolerance as more rays join.

@@ -16,12 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.threads import in_threads
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.two_photo import match_lsm
 from sfm.matching.radiometry import GreyPhotographs
@@ -38,8 +32,14 @@ from sfm.matching.tracks.features import (
     overlapping_pairs,
 )
 from sfm.matching.tracks.interest import NaturalPoints
-from sfm.network import rows_of
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.model.network import rows_of
+from sfm.runtime.compiling import compiled
 from sfm.runtime.progress import reported
+from sfm.runtime.threads import in_threads
 
 WINDOW_PX = 15  # larger windows are less noisy, but over them an affine warp cannot follow a curved surface
 SNAP_PX = 6.0  # an interest point this close to a feature replaces its position

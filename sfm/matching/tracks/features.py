@@ -19,9 +19,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
 
 FEATURES = 250  # of each photograph, the coarsest ones
 PARTNERS = 10  # of each photograph, by common features

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
 from sfm.matching.radiometry import grey_of, odd_window
 from sfm.matching.tracks.features import Features, is_shown, shown_part, sift_features
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.runtime.compiling import compiled
 
 DETECTORS = ("foerstner", "sift")
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75, and w >= 0.5 to 1.5 times its mean over the photograph.

@@ -14,18 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from sfm.camera import Camera, project
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, empty_estimate, rows_of
+from sfm.model.camera import Camera, project
+from sfm.model.conventions import MAD_TO_SIGMA, BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import Role
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, empty_estimate, rows_of
+from sfm.model.reduced_network import reduce_network
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
 from sfm.orientation.intersection import intersect
 from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import report_step
 
 RELATIVE_UNKNOWNS = 5  # unknowns of a relative orientation

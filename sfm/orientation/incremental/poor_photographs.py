@@ -24,12 +24,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.network import rows_of
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.network import rows_of
+from sfm.model.remarks.remark import remark
+from sfm.model.similarity import reverse_depth
 from sfm.orientation.incremental.growth import Growth, Refine
-from sfm.remarks.remark import remark
-from sfm.similarity import reverse_depth
 
 DOUBTFUL = 30.0  # multiple of the median residual of a solution below which its reversal casts doubt on it
 SMALLER_TOLERANCES = (1 / 3, 1 / 10)  # shares of the first start tolerance, for a solution in doubt

@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted, listed
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, empty_estimate
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted, listed
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, empty_estimate
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.growth import (
     FIRST_ADJUSTMENT,
     MIN_SHARE,
@@ -44,8 +46,6 @@ from sfm.orientation.incremental.poor_photographs import (
 )
 from sfm.orientation.incremental.starting_pair import Start
 from sfm.orientation.intersection import intersect
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import fit_similarity
 
 PARALLEL_SIGMAS = 4.0  # smallest ray angle, in its standard deviations, for rays that are not parallel
 MAX_COMPLETIONS = 50  # rounds of resection and intersection without given values

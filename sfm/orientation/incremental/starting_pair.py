@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
-from sfm.display import counted, listed
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, rows_of
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.display import counted, listed
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.image_rays import PLANAR_POINTS, image_tangents
 from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.runtime.progress import report_step
-from sfm.similarity import fit_similarity
 
 MAX_TIED = 1_000_000  # largest number of pairs with equal counts of common points to select from
 MAX_PAIRS = 60  # pairs with solutions that are tried on the other photographs

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled_fused
-from sfm.kernels.small_algebra import MAX_ROOTS, find_positive_roots
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import (
     ResectionSolution,
     checked_points,
     solution_of,
     sort_solutions,
 )
+from sfm.runtime.compiling import compiled_fused
+from sfm.runtime.small_algebra import MAX_ROOTS, find_positive_roots
 
 MAX_SOLUTIONS = 4
 WORK = MAX_ROOTS  # size of the scratch space

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import solve_scaled, turn
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import solve_scaled, turn
 
 COINCIDENT = 1e-9  # largest distance of coincident points, relative to their extent
 COLLINEAR = 1e-7  # largest ratio of the second singular value to the first for collinear points

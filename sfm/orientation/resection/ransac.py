@@ -10,11 +10,10 @@ from math import comb
 import numpy as np
 from scipy.special import bdtrc
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import MAX_SOLUTIONS, WORK, rays_from_tangents, solve_triple
 from sfm.orientation.resection.least_squares import (
     DONE,
@@ -24,6 +23,7 @@ from sfm.orientation.resection.least_squares import (
     cofactors_in_angles,
     pose_normals,
 )
+from sfm.runtime.compiling import compiled
 
 SAMPLE = 3  # points in a trial
 MARGIN_SD = 3  # standard deviations of the number of trials, added to its expectation

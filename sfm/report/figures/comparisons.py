@@ -10,13 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray
-from sfm.epochs.displacements import Displacements
-from sfm.epochs.series import EpochSeries
-from sfm.geometry.tolerance import IN, OUT, Deviations
-from sfm.inspection.acceptance import Acceptance
-from sfm.planning import MIN_PIXELS
-from sfm.planning.visibility import compute_target_size
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
+from sfm.products.epochs.displacements import Displacements
+from sfm.products.epochs.series import EpochSeries
+from sfm.products.geometry.tolerance import IN, OUT, Deviations
+from sfm.products.inspection.acceptance import Acceptance
+from sfm.products.planning import MIN_PIXELS
+from sfm.products.planning.visibility import compute_target_size
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import (
     ALONE_IN,

@@ -12,14 +12,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import PhotographError
-from sfm.kernels.sampling import resample
+from sfm.judgement.survey_result import PhotographTargets, in_words
 from sfm.matching.conjugate_patches import ConjugatePoints
-from sfm.network import Network
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.errors import PhotographError
+from sfm.model.network import Network
 from sfm.photographs.reading import read_photograph
-from sfm.result import PhotographTargets, in_words
 from sfm.runtime.progress import SILENT, Progress
+from sfm.runtime.sampling import resample
 from sfm.targets.outlines import Flag
 
 PANEL = 168  # minimum side of a patch in the picture, px

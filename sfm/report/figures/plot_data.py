@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from sfm.conventions import FloatArray, IntArray
+from sfm.model.conventions import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

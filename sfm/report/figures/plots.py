@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sfm.conventions import SUPERSCRIPTS, AnyArray, FloatArray, IntArray
+from sfm.model.conventions import SUPERSCRIPTS, AnyArray, FloatArray, IntArray
 from sfm.report.figures.plot_data import Plot, PlotCamera, PlotData
 
 BLUE, RED, GREY, GREEN, ORANGE = "#1f5fa8", "#c8372d", "#8a8f98", "#2b7a4b", "#d98a1f"

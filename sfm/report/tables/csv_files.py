@@ -10,9 +10,16 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import MIN_CHECKED_REDUNDANCY
 from sfm.adjustment.result import Adjustment
-from sfm.camera import base_name
-from sfm.conventions import FloatArray
-from sfm.distortion.brown import (
+from sfm.files import result_tables as tables
+from sfm.files.covariance_file import write_covariances
+from sfm.files.csv_tables import write_ply
+from sfm.files.plain_text import BLOCK
+from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
+from sfm.judgement.bundle_statistics import Statistics
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import base_name
+from sfm.model.conventions import FloatArray
+from sfm.model.distortion.brown import (
     BALANCED,
     BALANCED_MODEL,
     BALANCED_UNITS,
@@ -20,18 +27,11 @@ from sfm.distortion.brown import (
     from_balanced,
     to_balanced,
 )
-from sfm.errors import GeometryError
-from sfm.files import result_tables as tables
-from sfm.files.covariance_file import write_covariances
-from sfm.files.csv_tables import write_ply
-from sfm.files.plain_text import BLOCK
-from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
-from sfm.judgement.bundle_statistics import Statistics
-from sfm.network import Network
-from sfm.observation_residuals import given_rows
+from sfm.model.errors import GeometryError
+from sfm.model.network import Network
+from sfm.model.observation_residuals import given_rows
+from sfm.model.solution import MEASURED
 from sfm.report.findings import Findings
-from sfm.result import SurveyResult
-from sfm.solution import MEASURED
 
 CODED_COLOUR, UNCODED_COLOUR = (20, 140, 60), (120, 120, 120)  # in points.ply
 USUAL_R0 = 2 / 3  # usual R0 over the largest image radius

@@ -24,15 +24,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from sfm.camera import project
 from sfm.comparison.stable_points import point_blocks
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.estimate import Estimate
 from sfm.files.plain_text import or_none
-from sfm.geometry.tolerance import Deviations
 from sfm.judgement.checks import rms_of_groups
-from sfm.network import ImagePoints, Network, ScaleBars
+from sfm.judgement.survey_result import sort_likeliest_first
+from sfm.model.camera import project
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ScaleBars
+from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
 from sfm.orientation.image_rays import ray_angles
+from sfm.products.geometry.tolerance import Deviations
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
 from sfm.report.phrases import finer_unit
@@ -47,15 +49,13 @@ from sfm.report.viewer.pictures import (
     cut_pictures,
     distance_sigmas,
 )
-from sfm.result import sort_likeliest_first
-from sfm.solution import MAX_POINTS, SeenTargets, Solution
 
 if TYPE_CHECKING:
-    from sfm.epochs.displacements import Displacements
-    from sfm.epochs.series import EpochSeries
-    from sfm.geometry.shapes.fit import ShapeFit
-    from sfm.inspection.measure import Measurement
-    from sfm.planning.plan import Plan
+    from sfm.products.epochs.displacements import Displacements
+    from sfm.products.epochs.series import EpochSeries
+    from sfm.products.geometry.shapes.fit import ShapeFit
+    from sfm.products.inspection.measure import Measurement
+    from sfm.products.planning.plan import Plan
 
 MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 UNUSED = "measured, not part of the result"

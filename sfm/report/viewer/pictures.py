@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import PhotographError
+from sfm.model.camera import Camera
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import PhotographError
 from sfm.photographs.reading import read_photograph
 from sfm.report.figures.overlays import fitted_picture, jpeg_of, overlay_names
 from sfm.runtime.progress import SILENT, Progress

@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.quality.statistics import more_than_chance
-from sfm.camera import base_name
-from sfm.conventions import IntArray
-from sfm.estimate import Mounts
 from sfm.judgement.model_choice import Choice, choose
 from sfm.judgement.verdict import judge_adjustment
-from sfm.remarks.remark import Quantity, of_kind, remark
+from sfm.model.camera import base_name
+from sfm.model.conventions import IntArray
+from sfm.model.estimate import Mounts
+from sfm.model.remarks.remark import Quantity, of_kind, remark
 from sfm.runtime.progress import report_step
 from sfm.survey.adjusting.solution import (
     SolvedSurvey,

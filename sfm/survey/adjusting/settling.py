@@ -24,20 +24,20 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.display import counted
-from sfm.distortion.models import Role
-from sfm.distributions import chi2_isf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.model_choice import Choice, choose
-from sfm.network import Network
-from sfm.observations.kind import is_observed
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.distortion.models import Role
+from sfm.model.distributions import chi2_isf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.observations.kind import is_observed
+from sfm.model.reduced_network import merge_estimate, reduce_network, select_determined
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import reverse_depth
 from sfm.orientation.image_rays import ray_angles
-from sfm.reduced_network import merge_estimate, reduce_network, select_determined
-from sfm.remarks.remark import Remark, remark
-from sfm.similarity import reverse_depth
 from sfm.survey.diagnosis.photograph_cameras import PhotographCameras, find_photograph_cameras
 from sfm.survey.inputs.cameras import without_idle_cameras
 from sfm.survey.inputs.settings import DatumSettings

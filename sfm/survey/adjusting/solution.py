@@ -18,11 +18,6 @@ from sfm.adjustment.quality.correlations import estimate_error_correlation, with
 from sfm.adjustment.quality.other_solutions import OtherSolution, other_solutions
 from sfm.adjustment.quality.variance_components import least_factor
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import BoolArray, IntArray
-from sfm.distortion.models import MODELS, Role
-from sfm.distributions import normal_ppf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import JudgedGiven, judge_given
@@ -30,16 +25,21 @@ from sfm.judgement.hypotheses.bumps import bump_remarks
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.hypotheses.rejections import explain_rejections
 from sfm.judgement.model_choice import Choice, choose
-from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import ExteriorObservations, Network, ScaleBars
-from sfm.observations.pose import MountObservations
+from sfm.judgement.survey_result import ControlCheck, GivenTest, LeftOutPoint
+from sfm.model.conventions import BoolArray, IntArray
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.distributions import normal_ppf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.likelihood import areas_of_photographs, log_likelihood
+from sfm.model.network import ExteriorObservations, Network, ScaleBars
+from sfm.model.observations.pose import MountObservations
+from sfm.model.reduced_network import merge_estimate, reduce_network
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.similarity import Similarity, fit_similarity
+from sfm.model.solution import NO_SCALE
 from sfm.orientation.incremental.starting_pair import pair_solutions
-from sfm.reduced_network import merge_estimate, reduce_network
-from sfm.remarks.remark import Remark, remark
-from sfm.result import ControlCheck, GivenTest, LeftOutPoint
 from sfm.runtime.progress import report_step
-from sfm.similarity import Similarity, fit_similarity
-from sfm.solution import NO_SCALE
 from sfm.survey.adjusting.settling import (
     StableAdjustment,
     Task,

@@ -12,15 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.camera import Camera, base_name
-from sfm.conventions import BoolArray, IntArray
-from sfm.distortion.models import MODELS
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.observations.kind import Group
-from sfm.observations.pose import MountObservations
-from sfm.remarks.remark import Remark, remark
-from sfm.result import LeftOutPoint
+from sfm.judgement.survey_result import LeftOutPoint
+from sfm.model.camera import Camera, base_name
+from sfm.model.conventions import BoolArray, IntArray
+from sfm.model.distortion.models import MODELS
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.observations.kind import Group
+from sfm.model.observations.pose import MountObservations
+from sfm.model.remarks.remark import Remark, remark
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.display import agreeing, counted, listed
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.display import agreeing, counted, listed
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import PLANAR_POINTS
 from sfm.orientation.incremental.sequence import MIN_POINTS
 from sfm.photographs.reading import read_photograph
-from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import Survey
 from sfm.targets.codes.dot_plates import MIN_DOTS

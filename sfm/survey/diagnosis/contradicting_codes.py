@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.remarks.remark import Remark, remark
+from sfm.model.remarks.remark import Remark, remark
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.target_network import UNNAMED
 from sfm.targets.codes.plates import PlateFamily, TargetFamily, plates_of

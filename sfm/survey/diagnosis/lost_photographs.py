@@ -36,22 +36,22 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera
 from sfm.comparison.significance import compare_results
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FALSE_ALARM
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.model_choice import Choice, choose
-from sfm.likelihood import areas_of_photographs, log_likelihood
-from sfm.network import Network, empty_estimate, rows_of
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import FALSE_ALARM
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.likelihood import areas_of_photographs, log_likelihood
+from sfm.model.network import Network, empty_estimate, rows_of
+from sfm.model.reduced_network import reduce_network, select_supported
+from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.model.similarity import mean_distance, nearest_rotation
+from sfm.model.solution import Solution
 from sfm.orientation.image_rays import image_tangents, rays_of
 from sfm.orientation.incremental.growth import MIN_SHARE, TOLERANCE_FACTOR, residual_lengths
 from sfm.orientation.incremental.sequence import MIN_POINTS, Orientation
-from sfm.reduced_network import reduce_network, select_supported
-from sfm.remarks.remark import Remark, remark, unless_note
-from sfm.similarity import mean_distance, nearest_rotation
-from sfm.solution import Solution
 from sfm.survey.diagnosis.photograph_cameras import MAJORITY_FRACTION
 
 MIN_RAYS = 2

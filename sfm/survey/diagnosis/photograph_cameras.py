@@ -27,21 +27,21 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.statistics import more_than_chance
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import Camera, tangents_from_pixel
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distortion.models import Role
-from sfm.distributions import FALSE_ALARM, FAMILY, Levels
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
 from sfm.judgement.hypotheses.hypotheses import adjust_image_points, best_explanation
 from sfm.judgement.hypotheses.refit import log_likelihood_of
 from sfm.judgement.model_choice import Choice, choose
-from sfm.likelihood import log_likelihood, price_of
-from sfm.network import ImagePoints, Network, ObjectPoints
+from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import Role
+from sfm.model.distributions import FALSE_ALARM, FAMILY, Levels
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.likelihood import log_likelihood, price_of
+from sfm.model.network import ImagePoints, Network, ObjectPoints
+from sfm.model.reduced_network import reduce_network
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.resection.ransac import resect_robust
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark
 
 MAJORITY_FRACTION = 0.5  # of image points or photographs; the minority then does not fit
 SCALES = np.geomspace(0.5, 2.0, 29)  # factors of c that are tried, 5 % apart

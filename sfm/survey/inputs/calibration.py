@@ -25,11 +25,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from sfm.camera import Camera
-from sfm.distortion.models import MODELS
-from sfm.errors import GeometryError, SurveyFileError
 from sfm.files.csv_tables import read_table
 from sfm.files.plain_text import Content, Name, Pixel, Side, read_json
+from sfm.model.camera import Camera
+from sfm.model.distortion.models import MODELS
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.given import KnownPoints
 from sfm.survey.inputs.settings import CameraSettings, PlateSettings, TargetSettings
 from sfm.targets.codes.plates import (

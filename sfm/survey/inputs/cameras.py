@@ -17,15 +17,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import Camera, base_name, camera_from_values
-from sfm.conventions import FloatArray, IntArray
-from sfm.display import counted
-from sfm.distortion.brown import from_balanced
-from sfm.distortion.models import MODELS
-from sfm.errors import PhotographError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import InteriorObservations, Network
-from sfm.observations.pose import MountObservations
+from sfm.model.camera import Camera, base_name, camera_from_values
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.distortion.brown import from_balanced
+from sfm.model.distortion.models import MODELS
+from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import InteriorObservations, Network
+from sfm.model.observations.pose import MountObservations
 from sfm.photographs.exif import Metadata
 from sfm.survey.inputs.given import StartCameras
 from sfm.survey.inputs.settings import CameraSettings

@@ -24,12 +24,12 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from sfm.conventions import METRES, FloatArray
-from sfm.display import listed
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_table
 from sfm.files.plain_text import read_toml
-from sfm.result import PlacedEquipment
+from sfm.judgement.survey_result import PlacedEquipment
+from sfm.model.conventions import METRES, FloatArray
+from sfm.model.display import listed
+from sfm.model.errors import SurveyFileError
 from sfm.survey.inputs.given import ScaleBar
 from sfm.survey.inputs.settings import (
     EquipmentSettings,

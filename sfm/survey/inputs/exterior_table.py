@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sfm.conventions import FloatArray
-from sfm.display import listed
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import CsvTable, array_table, read_header, read_table
-from sfm.observations.pose import MountObservations
+from sfm.model.conventions import FloatArray
+from sfm.model.display import listed
+from sfm.model.errors import SurveyFileError
+from sfm.model.observations.pose import MountObservations
 from sfm.survey.inputs.given import (
     ANGLES,
     AXES,

@@ -9,12 +9,12 @@ from datetime import datetime, timedelta
 
 import numpy as np
 
-from sfm.conventions import METRES
-from sfm.display import counted
-from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.csv_tables import array_table
+from sfm.model.conventions import METRES
+from sfm.model.display import counted
+from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinates, read_metadata
-from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import AXES
 from sfm.survey.inputs.measurements import PhotographList

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from sfm.conventions import BoolArray, FloatArray, rotation_from_angles
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import MAX_NUMBER, CsvTable, array_table, read_header, read_table
-from sfm.reduced_network import CORRELATION_LIMIT, possible_covariances
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles
+from sfm.model.errors import SurveyFileError
+from sfm.model.reduced_network import CORRELATION_LIMIT, possible_covariances
 
 MIN_SIGMA = 1e-9  # less than an atom in any unit used here
 MAX_EXTENT_PER_SIGMA = 1e6  # no length or position is known to better than a millionth of its extent

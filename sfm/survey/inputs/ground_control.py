@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.conventions import METRES
-from sfm.display import counted
-from sfm.errors import SurveyFileError
 from sfm.files.csv_tables import array_table
 from sfm.files.plain_text import Content, read_json
+from sfm.model.conventions import METRES
+from sfm.model.display import counted
+from sfm.model.errors import SurveyFileError
 from sfm.photographs.exif import SatellitePosition, local_coordinates
 from sfm.photographs.reading import SUFFIXES
 from sfm.survey.inputs.given import AXES, KnownPoints, Observations, known_points, read_control

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import IntArray
-from sfm.display import counted
-from sfm.errors import PhotographError, SurveyFileError
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.plain_text import as_plain, is_plain
-from sfm.network import Network
+from sfm.judgement.survey_result import FailedImage, LeftOutPoint, PhotographTargets
+from sfm.model.camera import Camera
+from sfm.model.conventions import IntArray
+from sfm.model.display import counted
+from sfm.model.errors import PhotographError, SurveyFileError
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
-from sfm.remarks.remark import Remark, remark
-from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey_file import SurveyFile, is_home_file, path_inside

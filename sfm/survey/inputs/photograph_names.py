@@ -20,10 +20,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from sfm.display import listed
-from sfm.errors import SurveyFileError
+from sfm.model.display import listed
+from sfm.model.errors import SurveyFileError
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import read_metadata
-from sfm.remarks.remark import Remark, remark
 from sfm.survey.inputs.cameras import cameras_of_image
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import Observations, StartOrientations

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from sfm.display import counted, listed
-from sfm.distortion.models import MODELS
-from sfm.distributions import FALSE_ALARM, Levels
 from sfm.files.plain_text import MAX_NAME, as_plain, is_plain
-from sfm.observations.tables import TABLES
+from sfm.model.display import counted, listed
+from sfm.model.distortion.models import MODELS
+from sfm.model.distributions import FALSE_ALARM, Levels
+from sfm.model.observations.tables import TABLES
 
 MAX_SHOWN = 60  # characters of a key
 MAX_LISTED = 10  # keys listed in one message

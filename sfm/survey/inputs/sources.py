@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from sfm.display import counted
-from sfm.network import Source
+from sfm.model.display import counted
+from sfm.model.network import Source
 
 # Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15

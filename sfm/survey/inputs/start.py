@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import IntArray
-from sfm.errors import SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.observations.pose import MountObservations
+from sfm.model.camera import Camera
+from sfm.model.conventions import IntArray
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ExteriorObservations, ImagePoints, Network, ObjectPoints, ScaleBars
+from sfm.model.observations.pose import MountObservations
 from sfm.survey.inputs.cameras import refuse_unknown_cameras
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given import KnownPoints, ScaleBar

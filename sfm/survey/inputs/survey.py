@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from sfm.adjustment.datum import Datum
-from sfm.arguments import checked_arguments
-from sfm.display import counted
-from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain
 from sfm.files.result_tables import read_moments
-from sfm.observations.pose import MountObservations
-from sfm.result import PlacedEquipment
+from sfm.judgement.survey_result import PlacedEquipment
+from sfm.model.arguments import checked_arguments
+from sfm.model.display import counted
+from sfm.model.errors import SurveyFileError
+from sfm.model.observations.pose import MountObservations
 from sfm.survey.inputs.calibration import (
     Calibration,
     apply_calibration,

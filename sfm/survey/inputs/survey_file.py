@@ -10,8 +10,8 @@ from typing import Annotated, get_origin
 
 from pydantic import Field, PrivateAttr, ValidationError
 
-from sfm.errors import SurveyFileError
 from sfm.files.plain_text import as_plain, is_plain, read_toml
+from sfm.model.errors import SurveyFileError
 from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.equipment import read_equipment

@@ -16,9 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.estimate import Estimate
-from sfm.kernels.threads import in_threads
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
@@ -26,9 +23,12 @@ from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
 from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
 from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
-from sfm.network import ImagePoints, rows_of
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.runtime.progress import give_back_memory, reported
+from sfm.runtime.threads import in_threads
 
 FIRST_PHOTOGRAPHS = 4  # of the most similar direction; their rays correct the position of a point
 FIRST_SHIFT_PX = 6.0  # largest distance of a match from the position that the plane gives

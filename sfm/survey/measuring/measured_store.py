@@ -21,11 +21,11 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
-from sfm.errors import OutputError, PhotographError
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
-from sfm.kernels.compiling import sources_of
 from sfm.matching.tracks.interest import NaturalPoints
+from sfm.model.errors import OutputError, PhotographError
+from sfm.runtime.compiling import sources_of
 from sfm.targets.detect import Targets
 
 Measured = Targets | NaturalPoints

@@ -16,10 +16,7 @@ import numpy as np
 from sfm.adjustment.quality.variance_components import estimate_common_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import project, tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
+from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.lsm.coverage import (
     CoveredPixels,
     Windows,
@@ -28,16 +25,19 @@ from sfm.matching.lsm.coverage import (
     project_points,
 )
 from sfm.matching.lsm.surface_planes import on_surface
-from sfm.network import ImagePoints, Network, without_given
-from sfm.observations.kind import no_index
+from sfm.model.camera import project, tangents_from_pixel
+from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, without_given
+from sfm.model.observations.kind import no_index
+from sfm.model.reduced_network import reduce_network
+from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles
-from sfm.reduced_network import reduce_network
-from sfm.remarks.remark import Remark, remark, unless_note
-from sfm.result import PhotographTargets
-from sfm.similarity import fit_similarity
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
 from sfm.survey.inputs.settings import AdjustSettings, TiePointSettings
 from sfm.survey.inputs.start import network_of

@@ -18,14 +18,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.display import counted, listed
-from sfm.errors import GeometryError, PhotographError
+from sfm.judgement.survey_result import FailedImage
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.display import counted, listed
+from sfm.model.errors import GeometryError, PhotographError
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import linearise_srgb, read_photograph
-from sfm.remarks.remark import Remark, remark
-from sfm.result import FailedImage
 from sfm.runtime.faults import working_on
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.cameras import start_cameras

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.distributions import Levels, normal_ppf
-from sfm.estimate import Estimate
 from sfm.matching.correlation import MAX_R, ambiguous, independent_pixels
 from sfm.matching.lsm.coverage import CoveredPixels, Windows
 from sfm.matching.lsm.depth_search import search_depths
 from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, planes_at
 from sfm.matching.radiometry import GreyPhotographs, grey_of
-from sfm.network import ImagePoints, Network
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.distributions import Levels, normal_ppf
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.survey.measuring.covering_points import (
     BORDER_PX,

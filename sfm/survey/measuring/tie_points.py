@@ -15,18 +15,18 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
+from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.radiometry import full_scale, grey_of
 from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
 from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
-from sfm.network import ImagePoints, Network, rows_of
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.network import ImagePoints, Network, rows_of
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, local_coordinates, read_metadata
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import PhotographFiles, read_photograph
-from sfm.remarks.remark import Remark, remark
-from sfm.result import PhotographTargets
 from sfm.runtime.progress import SILENT, Progress, reported
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.checks.copies import MIN_COMMON

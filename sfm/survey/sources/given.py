@@ -13,14 +13,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.camera import Camera
-from sfm.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
-from sfm.display import listed
-from sfm.errors import SurveyFileError
-from sfm.network import ImagePoints, Network, Source, rows_of
+from sfm.judgement.survey_result import FailedImage, LeftOutPoint, PhotographTargets
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
+from sfm.model.display import listed
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import ImagePoints, Network, Source, rows_of
+from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.masks import Masks
-from sfm.remarks.remark import Remark, remark
-from sfm.result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.given import Observations

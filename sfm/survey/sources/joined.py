@@ -18,16 +18,16 @@ from sfm.adjustment.quality.correlations import design_effect_of_neighbours
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import ImagePoints, Network, ScaleBars, without_given
+from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network, ScaleBars, without_given
+from sfm.model.reduced_network import reduce_network, select_determined
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import decoding_once
-from sfm.reduced_network import reduce_network, select_determined
-from sfm.remarks.remark import Remark, remark
-from sfm.result import LeftOutPoint, PhotographTargets
 from sfm.runtime.progress import Progress, StageClock
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings

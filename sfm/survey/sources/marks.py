@@ -24,22 +24,22 @@ from typing import cast
 
 import numpy as np
 
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import AnyArray, FloatArray
-from sfm.distributions import Levels, chi2_isf
-from sfm.errors import SurveyFileError
+from sfm.judgement.survey_result import LeftOutPoint
 from sfm.matching.conjugate import match_points
 from sfm.matching.lsm.coverage import Windows, project_points
 from sfm.matching.lsm.surface_planes import squares_over_covariance
 from sfm.matching.radiometry import GreyPhotographs, grey_of
-from sfm.network import ImagePoints, Network
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.distributions import Levels, chi2_isf
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import ImagePoints, Network
+from sfm.model.remarks.remark import remark
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
-from sfm.remarks.remark import remark
-from sfm.result import LeftOutPoint
 from sfm.survey.inputs.given import Observations
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, Measurements, PhotographList
 from sfm.survey.inputs.settings import PointSettings

@@ -13,11 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray
-from sfm.distributions import LEVEL, chi2_isf, chi2_ppf
 from sfm.judgement.given.values import MAX_FACTOR
-from sfm.network import ImagePoints, Source, rows_of
-from sfm.remarks.remark import Quantity, Remark, remark
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.distributions import LEVEL, chi2_isf, chi2_ppf
+from sfm.model.network import ImagePoints, Source, rows_of
+from sfm.model.remarks.remark import Quantity, Remark, remark
 
 FEWEST_COMMON = 4  # image points of two sources that show an offset between them
 

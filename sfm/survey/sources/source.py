@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from sfm.conventions import IntArray
-from sfm.estimate import Estimate
-from sfm.network import Network
+from sfm.judgement.survey_result import Eccentricity, LeftOutPoint, PhotographTargets
+from sfm.model.conventions import IntArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.remarks.remark import Remark
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.remarks.remark import Remark
-from sfm.result import Eccentricity, LeftOutPoint, PhotographTargets
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import Section

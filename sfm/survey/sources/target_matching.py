@@ -12,15 +12,15 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.camera import tangents_from_pixel
-from sfm.conventions import MAD_TO_SIGMA, BoolArray
-from sfm.estimate import Estimate
-from sfm.network import Network, rows_of, without_given
+from sfm.model.camera import tangents_from_pixel
+from sfm.model.conventions import MAD_TO_SIGMA, BoolArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of, without_given
+from sfm.model.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
+from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.orientation.intersection import intersect
-from sfm.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
-from sfm.remarks.remark import Remark, remark
 from sfm.runtime.progress import reported
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (

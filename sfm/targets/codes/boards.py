@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.codes.dot_plates import Lattice, find_lattice
 from sfm.targets.codes.plates import APRIL_BORDERS, MAX_OFF_PLACE, PlateFamily, quarter_turn
 from sfm.targets.codes.tags import CORRECTED, WRONG_IN_BORDER, opencv_dictionary

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.kernels.sampling import as_grey, resample
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.runtime.sampling import as_grey, resample
 from sfm.targets.fits.concentric import (
     CONTRAST,
     GEOMETRY,

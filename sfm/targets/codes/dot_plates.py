@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.targets.codes.plates import UNCODED, PlateFamily, quarter_turn
 from sfm.targets.fits.outline_noise import BIWEIGHT, MAD, ROUNDS
 

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
 from sfm.targets.codes.boards import (
     MIN_CROSSINGS,
     board_ends,

@@ -26,8 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.targets.codes.concentric import WIDTHS, ConcentricFamily, concentric_family
 from sfm.targets.codes.rings import RING_NAMES, CodeFamily, read_code_table, ring_family
 from sfm.targets.codes.tags import DICTIONARIES, TagFamily, tag_family

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import bilinear
-from sfm.kernels.small_algebra import invert_symmetric
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import bilinear
+from sfm.runtime.small_algebra import invert_symmetric
 
 # Samples per cell, and trial positions of the first cell.
 SAMPLES, PHASES = 12, 12

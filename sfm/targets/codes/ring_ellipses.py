@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import bilinear
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import bilinear
 from sfm.targets.edge_rays import reshape
 
 # Rays, and the steps along them, in radii of the dot. A ring farther away than this is not searched.

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import SurveyFileError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import as_grey, bilinear
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import SurveyFileError
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import as_grey, bilinear
 from sfm.targets.codes.ring_cells import fit_cells, place_cells
 from sfm.targets.codes.ring_ellipses import may_have_rings, measure_rings, trace_crossings
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.kernels.sampling import as_grey
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.runtime.sampling import as_grey
 from sfm.targets.fits.corner import BACKGROUND, BLUR, CONTRAST, CornerFits, fit_corners
 from sfm.targets.fits.whole_tag import fit_whole_tags
 from sfm.targets.outlines import Flag, as_bytes, estimate_noise

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from sfm.conventions import FloatArray
-from sfm.kernels.compiling import compiled_fast, inlined_fast
+from sfm.model.conventions import FloatArray
+from sfm.runtime.compiling import compiled_fast, inlined_fast
 
 # Unknowns of the fit in their order: x0, y0, p, q, r, B, A, s, gx, gy.
 UNKNOWNS = 10

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.errors import KolinearError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import as_grey
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.errors import KolinearError
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import as_grey
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 
 WEIGHTS = ("binary", "intensity", "squared")

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.targets.fits.corner import MASK_PX, SHARPENING_SIGMA
 from sfm.targets.measure import QUANTISATION
 from sfm.targets.outlines import Flag

@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import invert_symmetric, solve_symmetric
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import invert_symmetric, solve_symmetric
 from sfm.targets.fits.blurred_ellipse import edge_profile
 from sfm.targets.outlines import Flag
 

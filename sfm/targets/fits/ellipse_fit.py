@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import invert_symmetric, solve_symmetric
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import invert_symmetric, solve_symmetric
 from sfm.targets.edge_rays import RAYS, STEP_PX, improve_outline, trace_rays
 from sfm.targets.fits import blurred_ellipse as model
 from sfm.targets.fits import goodness

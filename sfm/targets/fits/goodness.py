@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from sfm.conventions import AnyArray, FloatArray
-from sfm.kernels.compiling import compiled
-from sfm.kernels.sampling import bilinear
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import bilinear
 from sfm.targets.edge_rays import HARMONICS, RAYS, STEP_PX
 from sfm.targets.fits import blurred_ellipse as model
 

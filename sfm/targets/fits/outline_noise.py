@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import digamma, fdtri, ndtri, polygamma
 
-from sfm.conventions import BoolArray, FloatArray, IntArray
-from sfm.distributions import FAMILY
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import FAMILY
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.goodness import SHAPES
 

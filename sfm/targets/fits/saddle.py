@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled
 
 # Largest half side of the window, in distances to the nearest crossing. On 14 photographs of a printed board
 # residuals are 0.128, 0.125, 0.128 and 0.134 px RMS with 0.25, 0.35, 0.43 and 0.5: distortion bends edges,

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from scipy.special import ndtri
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.distributions import FAMILY
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.distributions import FAMILY
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits import goodness
 from sfm.targets.fits.blurred_ellipse import BLUR, CONTRAST, UNKNOWNS, P, R

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from sfm.conventions import AnyArray, BoolArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
 from sfm.targets.fits.corner import (
     BACKGROUND,
     BLUR,

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray, rotation_from_angles
-from sfm.distributions import MARGIN
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.distributions import MARGIN
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
 from sfm.orientation.resection.least_squares import (
     LineFit,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents
 from sfm.orientation.resection.least_squares import ResectionSolution, checked_points, solution_of
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 
 PARAMETERS = 11
 DISTORTION = ("K1", "K2", "K3", "P1", "P2")

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray, skew
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray, skew
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import (
     ResectionSolution,
     checked_points,

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import gammaln
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import GeometryError
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import UNKNOWNS, Resection, pose_normals, resect_least_squares
 from sfm.orientation.resection.ransac import SAMPLE, RobustResection, resect_robust
 

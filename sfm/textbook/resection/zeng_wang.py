@@ -11,11 +11,9 @@ from itertools import combinations, islice
 
 import numpy as np
 
-from sfm.arguments import checked_arguments
-from sfm.conventions import FloatArray, IntArray
-from sfm.errors import GeometryError
-from sfm.kernels.compiling import compiled
-from sfm.kernels.small_algebra import MAX_ROOTS, find_positive_roots
+from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import (
     MAX_DOUBLE_ROOT_MISFIT,
     MAX_SOLUTIONS,
@@ -33,6 +31,8 @@ from sfm.orientation.resection.least_squares import (
     solution_of,
     sort_solutions,
 )
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import MAX_ROOTS, find_positive_roots
 
 MAX_STEPS = 100
 MAX_LAST_STEP = 1e-14  # rad

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from adapters.colmap.reconstruction import as_opencv, camera_of, colmap_camera
-from sfm.camera import Camera, pixel_from_tangents, tangents_from_pixel
-from sfm.conventions import FloatArray
-from sfm.distortion.models import COLMAP, MAX_PARAMETERS, MODELS, Role, observe
-from sfm.errors import BackendError
+from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.model.conventions import FloatArray
+from sfm.model.distortion.models import COLMAP, MAX_PARAMETERS, MODELS, Role, observe
+from sfm.model.errors import BackendError
 from tests.synthetic import DISTORTION, seed_of
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -16,11 +16,11 @@ from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.mapper import map_photographs
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
 from sfm.comparison.solutions import reprojection
-from sfm.errors import BackendError, OutputError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network, ObjectPoints
+from sfm.model.camera import camera_from_values
+from sfm.model.errors import BackendError, OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ObjectPoints
 from sfm.pipeline import run_survey
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey

@@ -15,7 +15,7 @@ from adapters.formats.registry import read_content, write_content
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_cameras
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
 

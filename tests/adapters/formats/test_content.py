@@ -14,16 +14,16 @@ from adapters.formats.registry import FORMATS, format_named, read_content, write
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.solvers import convert
-from sfm.errors import SurveyFileError
-from sfm.network import (
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import (
     ExteriorObservations,
     ImagePoints,
     InteriorObservations,
     ObjectPoints,
     ScaleBars,
 )
+from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
-from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.synthetic import make_network, seed_of
 
@@ -248,7 +248,7 @@ def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.Cap
 
 
 def _parameters(model: str):  # type: ignore[no-untyped-def]
-    from sfm.distortion.models import MODELS
+    from sfm.model.distortion.models import MODELS
 
     return MODELS[model].parameters
 

@@ -12,9 +12,9 @@ from adapters.formats.content import Content
 from adapters.formats.control_tables import read_given
 from adapters.formats.photomodeler import write_photomodeler
 from adapters.formats.registry import read_any, read_content, write_any, write_content
-from sfm.errors import SurveyFileError
 from sfm.files.result_tables import GIVEN
-from sfm.network import ImagePoints, Network
+from sfm.model.errors import SurveyFileError
+from sfm.model.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given import KnownPoints

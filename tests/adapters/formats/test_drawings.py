@@ -10,7 +10,7 @@ import pytest
 
 from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
 from adapters.formats.mesh import read_mesh
-from sfm.errors import SurveyFileError
+from sfm.model.errors import SurveyFileError
 
 CORNERS = np.array([[0.0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0.5]])
 AREA = 3.0  # of the first triangle

@@ -18,12 +18,12 @@ from adapters.colmap.model_files import check_model_files
 from adapters.formats.content import Content
 from adapters.formats.registry import FORMATS, write_content
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values
-from sfm.conventions import AnyArray
-from sfm.errors import OutputError
-from sfm.network import ObjectPoints
-from sfm.observations.control_and_bars import InteriorObservations
-from sfm.observations.pose import ExteriorObservations
+from sfm.model.camera import camera_from_values
+from sfm.model.conventions import AnyArray
+from sfm.model.errors import OutputError
+from sfm.model.network import ObjectPoints
+from sfm.model.observations.control_and_bars import InteriorObservations
+from sfm.model.observations.pose import ExteriorObservations
 from tests.synthetic import make_network
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -31,15 +31,15 @@ from adapters.formats.registry import (
     write_any,
 )
 from adapters.formats.sba_text import read_sba_text, write_sba_text
-from sfm.camera import Camera, camera_from_values, pixel_jacobian
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_camera, convert_cameras, undistort
 from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection
-from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.estimate import Estimate
 from sfm.files.csv_tables import write_ply
-from sfm.network import Network, ObjectPoints
+from sfm.model.camera import Camera, camera_from_values, pixel_jacobian
+from sfm.model.errors import KolinearError, OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ObjectPoints
 from tests.places import SHARED
 from tests.synthetic import DISTORTION, make_network, seed_of
 from tests.tables import rows_of

@@ -14,14 +14,14 @@ from adapters.formats.photomodeler import read_export, read_photomodeler, write_
 from adapters.formats.registry import format_named, write_any
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.camera import camera_from_values, project, tangents_from_pixel
 from sfm.cli.commands.solvers import convert
-from sfm.conventions import angles_from_rotation
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network, ObjectPoints
+from sfm.model.camera import camera_from_values, project, tangents_from_pixel
+from sfm.model.conventions import angles_from_rotation
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, ObjectPoints
+from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
-from sfm.solution import Solution
 from sfm.survey.inputs.survey import read_survey
 from tests.places import SHARED
 from tests.synthetic import make_network, observed_anew, seed_of

@@ -19,14 +19,14 @@ from scipy.spatial.transform import Rotation
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
 from adapters.formats.rig_files import rectify
-from sfm.camera import project
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_cameras
-from sfm.conventions import rotation_from_vector
-from sfm.errors import OutputError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.solution import Solution
+from sfm.model.camera import project
+from sfm.model.conventions import rotation_from_vector
+from sfm.model.errors import OutputError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.solution import Solution
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 

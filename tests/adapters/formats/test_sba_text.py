@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from adapters.formats.registry import read_any, read_comparable, write_any
 from adapters.formats.sba_text import read_sba_text, sba_files
 from sfm.adjustment.solve import adjust
-from sfm.camera import project
 from sfm.cli.commands.solvers import convert
 from sfm.comparison.camera_conversion import convert_camera
 from sfm.comparison.significance import compare_results
-from sfm.errors import KolinearError, OutputError, SurveyFileError
-from sfm.solution import Solution
+from sfm.model.camera import project
+from sfm.model.errors import KolinearError, OutputError, SurveyFileError
+from sfm.model.solution import Solution
 from tests.synthetic import make_network, seed_of
 
 CAMERAS = "1 0 0 0 0 0 4\n0.8 0 0.6 0 1 0 4 # turned\n"

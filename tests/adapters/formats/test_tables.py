@@ -22,10 +22,10 @@ from adapters.reading import text_lines as lines
 from adapters.reading.text_lines import Lines
 from adapters.reading.xml_lines import read_xml
 from sfm.comparison.camera_conversion import convert_cameras
-from sfm.errors import OutputError, SurveyFileError
-from sfm.estimate import Estimate
-from sfm.network import Network
-from sfm.solution import Solution
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.solution import Solution
 from tests.rigs import make_rig
 from tests.synthetic import make_network, seed_of
 

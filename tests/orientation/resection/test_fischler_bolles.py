@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm.conventions import rotation_from_vector
-from sfm.kernels.small_algebra import positive_roots
+from sfm.model.conventions import rotation_from_vector
 from sfm.orientation.resection import fischler_bolles
 from sfm.orientation.resection.fischler_bolles import leg_quartic, rays_from_tangents, resect_triples
+from sfm.runtime.small_algebra import positive_roots
 from tests.places import ROOT
 from tests.synthetic import seed_of
 

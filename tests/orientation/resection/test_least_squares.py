@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import angles_from_rotation, rotation_from_angles, rotation_from_vector
-from sfm.errors import GeometryError
+from sfm.model.conventions import angles_from_rotation, rotation_from_angles, rotation_from_vector
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import pose_normals, resect_least_squares
 from tests.places import ROOT, SHARED
 from tests.synthetic import seed_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_vector
+from sfm.model.conventions import rotation_from_vector
 from sfm.orientation.resection.ransac import expected_trials, resect_robust
 from tests.synthetic import seed_of
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm.conventions import rotation_from_angles
-from sfm.errors import GeometryError
+from sfm.model.conventions import rotation_from_angles
+from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
 from sfm.orientation.resection.least_squares import checked_points, choose_by_line, solution_of
 from sfm.textbook.resection.by_method import cylinder_distance, cylinder_warning

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm import cli
-from sfm.conventions import FloatArray, rotation_from_angles
+from sfm.model.conventions import FloatArray, rotation_from_angles
 from sfm.orientation.resection.ransac import RobustResection
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise
 from tests.places import ROOT

@@ -20,10 +20,10 @@ from sfm.adjustment.engine.solvers.fronts import BYTES, fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.solvers.protocol import Solver, available_bytes, refuse_what_does_not_fit
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import AnyArray, IntArray
-from sfm.display import counted
-from sfm.kernels.compiling import compiled
-from sfm.network import Network
+from sfm.model.conventions import AnyArray, IntArray
+from sfm.model.display import counted
+from sfm.model.network import Network
+from sfm.runtime.compiling import compiled
 
 # Operations per second, one thread, AVX-512 (OpenBLAS 0.3.30); only their ratios matter
 PRODUCT_RATE = 80e9  # symmetric product of full rows, mostly in single precision

@@ -32,10 +32,10 @@ from sfm.adjustment.engine.solvers import protocol
 from sfm.adjustment.engine.solvers.fronts import BYTES, Pairs, subtract_squares, times_inverse
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import FloatArray
-from sfm.display import counted
-from sfm.kernels.compiling import compiled, kernel
-from sfm.kernels.threads import at_once
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted
+from sfm.runtime.compiling import compiled, kernel
+from sfm.runtime.threads import at_once
 
 CHUNK = 1_000_000  # smallest number of elements of Y' multiplied at a time
 LEAST = 500  # smallest number of rows of Y' multiplied at a time; fewer would slow down a product

@@ -34,10 +34,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from sfm.adjustment.engine.collinearity import Observations
-from sfm.conventions import AnyArray, BoolArray, FloatArray, IntArray
-from sfm.kernels.compiling import compiled, kernel
-from sfm.kernels.small_algebra import add_product, subtract_pair
-from sfm.kernels.threads import at_once
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.runtime.compiling import compiled, kernel
+from sfm.runtime.small_algebra import add_product, subtract_pair
+from sfm.runtime.threads import at_once
 
 TILE = 48  # photographs; 6 x 6 numbers for each pair in a tile fill most of a 1 MB cache
 LEAF = 32  # number of photographs that are not split further

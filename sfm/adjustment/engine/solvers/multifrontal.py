@@ -41,10 +41,10 @@ from sfm.adjustment.engine.solvers.fronts import BYTES, Front, Fronts, subtract_
 from sfm.adjustment.engine.solvers.multifrontal_factor import EliminatedFront, MultifrontalFactor
 from sfm.adjustment.engine.solvers.protocol import Factor
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.compiling import kernel
-from sfm.kernels.small_algebra import subtract_pair
-from sfm.kernels.threads import at_once
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.runtime.compiling import kernel
+from sfm.runtime.small_algebra import subtract_pair
+from sfm.runtime.threads import at_once
 
 SHIFT = 1e-10  # share of the diagonal added to find null vectors; far above rounding, far below weak ones
 STEPS = 12  # steps of the iteration; each amplifies null vectors by eigenvalue / SHIFT

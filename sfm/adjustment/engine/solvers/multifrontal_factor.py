@@ -26,9 +26,9 @@ from sfm.adjustment.engine.collinearity import Observations
 from sfm.adjustment.engine.solvers.fronts import Front, Fronts
 from sfm.adjustment.engine.solvers.protocol import Inverse
 from sfm.adjustment.engine.unknowns import Unknowns
-from sfm.conventions import AnyArray, FloatArray, IntArray
-from sfm.kernels.compiling import kernel
-from sfm.kernels.small_algebra import add_product
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.runtime.compiling import kernel
+from sfm.runtime.small_algebra import add_product
 
 
 class EliminatedFront(NamedTuple):

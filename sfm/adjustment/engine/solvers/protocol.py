@@ -14,8 +14,8 @@ from typing import Protocol
 from sfm.adjustment.datum import Motions
 from sfm.adjustment.engine.accumulate import Blocks
 from sfm.adjustment.engine.normals import Equations
-from sfm.conventions import FloatArray
-from sfm.errors import GeometryError
+from sfm.model.conventions import FloatArray
+from sfm.model.errors import GeometryError
 
 try:
     import resource

@@ -31,9 +31,9 @@ from sfm.adjustment.quality.gross_errors.robust import (
     would_pass,
 )
 from sfm.adjustment.quality.statistics import tau_critical
-from sfm.conventions import BoolArray, FloatArray
-from sfm.errors import GeometryError
-from sfm.remarks.remark import Remark, remark
+from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.errors import GeometryError
+from sfm.model.remarks.remark import Remark, remark
 
 MAX_ROUNDS = 200  # most rounds of data snooping
 MAX_VAGUE = 5  # rounds without convergence; only residuals at an optimum show gross errors

@@ -32,7 +32,7 @@ import numpy as np
 from sfm.adjustment.engine.collinearity import Observations, State, residuals
 from sfm.adjustment.quality.statistics import standardised_residuals, tau_critical, whitening_matrix
 from sfm.adjustment.result import MIN_SIGMA_PX, ROUNDING
-from sfm.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
+from sfm.model.conventions import MAD_TO_SIGMA, BoolArray, FloatArray
 
 MIN_RAYS = 3  # fewest rays of a point whose residuals can show the wrong ray
 # Divided by the number of image points of a photograph: the share by which the photograph may change a

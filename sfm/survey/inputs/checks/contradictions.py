@@ -9,10 +9,10 @@ from itertools import combinations
 from pathlib import Path
 from typing import Protocol
 
-from sfm.display import counted, listed
-from sfm.distortion.brown import BALANCED, BALANCED_MODEL, from_balanced
-from sfm.distortion.models import MODELS
-from sfm.errors import GeometryError, SurveyFileError
+from sfm.model.display import counted, listed
+from sfm.model.distortion.brown import BALANCED, BALANCED_MODEL, from_balanced
+from sfm.model.distortion.models import MODELS
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.calibration import (
     plate_control,
     refuse_contradicting_plates,

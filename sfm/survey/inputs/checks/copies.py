@@ -24,12 +24,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.adjustment.result import Adjustment
-from sfm.conventions import FloatArray, IntArray
-from sfm.display import agreeing, counted, listed
-from sfm.distributions import f_sf
-from sfm.errors import GeometryError
-from sfm.estimate import Estimate
-from sfm.network import Network, rows_of
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.display import agreeing, counted, listed
+from sfm.model.distributions import f_sf
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
 
 # Correlation from which half of the variance of the errors is common. Real photographs saved again as JPEG of
 # quality 40 reach 0.99.

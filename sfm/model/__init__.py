@@ -1,0 +1,1 @@
+"""The types of the field: frames, cameras, measurements, values, observations, results and remarks."""

@@ -1,0 +1,127 @@
+"""The verdict on a result: a level and a headline that summarise its remarks.
+
+`judge` serves every kind of result. The most serious remark decides: an error makes the result bad, a warning
+makes it fair, and with notes alone it is good.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from sfm.model.display import MAX_LISTED, counted
+from sfm.model.remarks.remark import SEVERITIES, Remark, Severity
+
+Level = Literal["good", "fair", "bad"]
+EFFECT: Mapping[Severity, Level] = {"note": "good", "warning": "fair", "error": "bad"}
+
+
+@dataclass(frozen=True)
+class Line:
+    """A remark as it is printed."""
+
+    severity: Severity
+    text: str
+    remedy: str = ""  # only with the first remark of a kind
+    lost: bool = False  # whether the remedy recovers a lost photograph or point
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The summary of all remarks, which the user reads first."""
+
+    level: Level
+    headline: str
+    remarks: tuple[Remark, ...]  # the most serious first
+    tests: tuple[Remark, ...] = ()  # what was tested, and what could not be
+
+    @property
+    def lines(self) -> tuple[Line, ...]:
+        """The remarks as they are printed: the first ones of each kind, and the number of the others."""
+        return lines_of(self.remarks)
+
+    @property
+    def text(self) -> str:
+        """Headline and remarks, a line each; errors and warnings begin with an exclamation mark."""
+        signs = {"note": " "}
+        return "\n".join(
+            [self.headline, *(f"{signs.get(one.severity, '!')} {one.text}" for one in self.lines)]
+        )
+
+    @property
+    def summary(self) -> str:
+        """Headline and numbers of remarks."""
+        counts = Counter(one.severity for one in self.remarks)
+        listed = ", ".join(counted(counts[one], one) for one in SEVERITIES if counts[one])
+        return f"{self.headline} {listed}".rstrip()
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """The entry `verdict` of summary.json."""
+        stated = self.as_dict()
+        return {"level": stated.pop("verdict"), **stated}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict for JSON."""
+        remarks = [one.as_dict() for one in self.remarks]
+        tests = [one.as_dict() for one in self.tests]
+        return {"headline": self.headline, "verdict": self.level, "remarks": remarks, "tests": tests}
+
+
+NOT_JUDGED = Verdict("bad", "The result was not judged.", ())
+"""the verdict on a result before `judge`"""
+
+
+def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
+    """Return the verdict on a result, without the remarks that other remarks explain.
+
+    A warning that explains an error takes over its severity: the result is just as bad, and the reason is
+    stated instead.
+
+    Args:
+        remarks: all remarks on the result, in reading order within a severity, and all tests.
+        headlines: headline of each level for this kind of result.
+    """
+    found = tuple(remarks)
+    tests = tuple(one for one in found if one.test is not None)
+    every = tuple(one for one in found if one.test is None)
+    every = tuple(
+        replace(one, at_least=_worst_explained(one, every))
+        for one in every
+        if not any(_explains(cause, one) for cause in every)
+    )
+    order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
+    level: Level = EFFECT[order[0].severity] if order else "good"
+    return Verdict(level, headlines[level], order, tests)
+
+
+def _explains(cause: Remark, one: Remark) -> bool:
+    """Return whether `cause` explains a remark; a note with a grade explains only other notes."""
+    graded = not isinstance(cause.row.severity, str)
+    serious = cause.severity != "note" or one.severity == "note"
+    return one.kind in cause.row.explains and (serious or not graded)
+
+
+def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
+    """Return the worst severity of the remarks that a remark with a grade explains."""
+    graded = not isinstance(cause.row.severity, str)
+    explained = [one.severity for one in every if graded and _explains(cause, one)]
+    return min((cause.at_least, *explained), key=SEVERITIES.index)
+
+
+def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
+    """Return the printed lines: the first remarks of each kind and severity, and the number of the others."""
+    groups: dict[tuple[Severity, str], list[Remark]] = {}
+    for one in remarks:
+        groups.setdefault((one.severity, one.kind), []).append(one)
+    lines = []
+    for (severity, _), same in groups.items():
+        lines += [
+            Line(severity, one.text, "" if k else one.remedy, bool(one.row.explains))
+            for k, one in enumerate(same[:MAX_LISTED])
+        ]
+        if len(same) > MAX_LISTED:
+            lines.append(Line(severity, f"{len(same) - MAX_LISTED} more like these."))
+    return tuple(lines)

@@ -1,0 +1,1 @@
+"""What is made of surveys: drafts, refined models, epochs, inspection, plans, sheets and batches."""

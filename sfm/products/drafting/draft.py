@@ -1,0 +1,490 @@
+"""Draft of a survey file from a folder of photographs; comments state the source of every value.
+
+The cameras come from EXIF data, and the targets from a trial on a few photographs.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from textwrap import fill
+from typing import NoReturn
+
+import numpy as np
+
+from sfm.files.globs import find_files, why_no_folder
+from sfm.files.plain_text import as_plain, is_plain
+from sfm.model.display import agreeing, counted
+from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
+from sfm.photographs.masks import MASKS, Masks, find_masks
+from sfm.photographs.reading import SUFFIXES
+from sfm.products.drafting.camera_groups import (
+    BY_TIMES,
+    CameraGroup,
+    Grouping,
+    ProposedRig,
+    SensorWidth,
+    group_photographs,
+)
+from sfm.products.drafting.camera_names import IN_ORDER
+from sfm.products.drafting.camera_times import USUAL_S
+from sfm.products.drafting.lens_models import with_lens_models
+from sfm.products.drafting.ringed_dots import picture_of_rings
+from sfm.products.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
+from sfm.runtime.progress import SILENT, Progress
+from sfm.survey.inputs.sources import TARGETS
+from sfm.survey.inputs.survey_file import is_home_file
+from sfm.survey.measuring.measured_store import MeasuredStore
+from sfm.survey.orientation import FISHEYE
+from sfm.targets.codes.plates import BOARDS, FAMILIES, GRIDS, PLATES, PlateFamily
+
+DEPTHS = ("*", "*/*")  # where photographs are searched; the first that has some is used
+COMMENT_WIDTH = 100  # characters
+MOMENT_IN_NAMES = "in brackets: what photographs of one moment have in common"
+MOMENTS = {
+    IN_ORDER: "the first photographs of all cameras are of one moment, and so on",
+    BY_TIMES: "by the times in EXIF data, whatever the clocks differ by",
+}
+FREE_OF_TEXTURE = ("c", "x0", "y0", "K1", "K2")
+FREE_BY_TARGETS = ("c", "x0", "y0", "K1", "K2", "K3", "P1", "P2", "b1", "b2")
+FREE_OF_FISHEYES = ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
+FREE_BY_PLATES = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1")
+SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings and natural points
+OUTSIDE = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
+PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
+UNIT = "mm"
+MAX_SHOWN = 8  # names listed on a line
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A drafted survey."""
+
+    name: str
+    text: str  # text of the survey file
+    found: tuple[tuple[str, str], ...]  # (subject, finding), for the terminal
+    remarks: tuple[Remark, ...]  # points for a person to check
+    left_out: tuple[tuple[str, str], ...]  # (photograph, reason)
+    rings: bytes = (
+        b""  # PNG picture of dots with rings that no family of codes reads, empty without such dots
+    )
+
+
+def draft_survey(
+    folder: Path,
+    *,
+    sensor_width: SensorWidth = lambda make, model: None,
+    pitch: float | None = None,
+    store: MeasuredStore | None = None,
+    progress: Progress = SILENT,
+) -> Draft:
+    """Draft a survey file for the photographs in a folder.
+
+    Args:
+        folder: contains the photographs. Its subfolders are searched if it contains none itself, and are used
+            if they contain the photographs of the cameras of a rig.
+        sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
+        pitch: distance of neighbouring dots or crossings if there is a plate, mm; assumed if not given.
+        store: stores the targets that the trial measures.
+        progress: receives the steps of the trial.
+
+    Raises:
+        SurveyFileError: the folder does not exist or has no photographs.
+        GeometryError: fewer than two readable photographs.
+    """
+    metadata, unreadable = _metadata(folder)
+    masks, masked = find_masks(folder, tuple(metadata))
+    unused = "" if masked == MASKS else OUTSIDE
+    try:
+        masks.refuse_wrong({name: folder / name for name in metadata})
+    except SurveyFileError as error:  # a folder of this name may have another purpose
+        masks, unused = Masks(), f"not used: {error}"
+    grouping = group_photographs(metadata, sensor_width)
+    if grouping.rig is None and any("/" in name for name in metadata):
+        _refuse_folder(folder)
+    used = [name for camera in grouping.cameras for name in camera.photographs]
+    if len(used) < 2:
+        raise GeometryError(
+            f"{folder}: {counted(len(used), 'photograph')} of one camera, at least 2 are needed"
+            + "".join(f"; {name}: {why}" for name, why in (*unreadable, *grouping.left_out)[:MAX_SHOWN])
+        )
+    paths = [folder / name for name in used]
+    trial = try_targets(paths, folder=folder, masks=masks, store=store, progress=progress)
+    name = as_plain(folder.resolve().name) or "survey"
+    positions = sum(metadata[one].position is not None for one in used)
+    left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
+    if trial.plate is not None:
+        silent = _text(name, grouping, trial, pitch, left_out, positions, masked, unused, models=False)
+        cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
+        grouping = replace(grouping, cameras=cameras)
+    return Draft(
+        name,
+        _text(name, grouping, trial, pitch, left_out, positions, masked, unused),
+        _findings(grouping, trial, positions, masked, unused),
+        _remarks(grouping, trial, pitch),
+        left_out,
+        picture_of_rings(trial.ringed),
+    )
+
+
+def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
+    """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
+    if not folder.is_dir():
+        raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
+    files = next((files for depth in DEPTHS if (files := _files(folder, depth))), [])
+    files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
+    if all(conversion_of(path) for path in files):
+        _refuse_folder(folder, files)
+    metadata, unreadable = {}, []
+    for path in files:
+        name = path.relative_to(folder).as_posix()
+        if not is_plain(name):
+            unreadable.append((as_plain(name), "its name has control or invisible characters"))
+            continue
+        if not (path.resolve().is_relative_to(folder.resolve()) or is_home_file(path)):
+            unreadable.append((name, "a link out of the folder, and not to a file in your home folder"))
+            continue
+        try:
+            metadata[name] = read_metadata(path)
+        except PhotographError as error:
+            unreadable.append((name, str(error).removeprefix(f"{path.name}: ")))
+    return metadata, tuple(unreadable)
+
+
+def _files(folder: Path, pattern: str) -> list[Path]:
+    """Return the photographs and raw files of a folder, and of its subfolders as the pattern asks."""
+    return [
+        path
+        for path in find_files(folder, pattern, hidden=pattern == DEPTHS[0])
+        if path.suffix.lower() in SUFFIXES or conversion_of(path)
+    ]
+
+
+def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
+    """Refuse a folder without photographs of its own, whose subfolders are not those of a rig."""
+    every = sorted(folder.iterdir())
+    content = (
+        f"it contains {', '.join(as_plain(path.name) for path in every[:MAX_SHOWN])}"
+        if every
+        else "it is empty"
+    )
+    content += f": {conversion_of(raw[0])}" if raw else ""
+    content += "".join(
+        f"; try {as_plain(str(path))}" for path in every if path.name != MASKS and _has_photographs(path)
+    )
+    raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
+
+
+def _has_photographs(folder: Path) -> bool:
+    """Return whether a folder itself contains photographs."""
+    try:
+        return folder.is_dir() and any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _text(
+    name: str,
+    grouping: Grouping,
+    trial: TargetTrial,
+    pitch: float | None,
+    left_out: Sequence[tuple[str, str]],
+    positions: int,
+    masked: str,
+    unused: str,
+    *,
+    models: bool = True,
+) -> str:
+    lines = [
+        "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
+        "[survey]",
+        f"name = {_quoted(name)}",
+        f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
+    ]
+    if masked:
+        commented = "# " if unused else ""
+        lines.append(f"{commented}masks = {_quoted(masked)}  # what is black there is ignored")
+    for camera in grouping.cameras:
+        lines += ["", *_camera_lines(camera, _free_parameters(trial), models=models)]
+    if grouping.rig is not None:
+        lines += ["", *_rig_lines(grouping.rig)]
+    if left_out:
+        lines += ["", "# Left out:"]
+        lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
+    lines += ["", *_target_lines(trial, pitch)]
+    if trial.plate is None:
+        lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
+        lines += ["", *_example_lines(trial)]
+        lines += _position_lines(positions) if positions else []
+    else:
+        lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
+        for plate in trial.plates[1:]:
+            lines += ["", "# fixed to the first plate; its points are measured", "[[plate]]"]
+            lines += _plate_keys(plate, pitch)
+        lines += [f"# Left out: {_described(plate)} ({why})" for plate, why in trial.left_out]
+    sigma = CORNER_SIGMA_PX if trial.codes in ("none", *BOARDS) else SIGMA_PX
+    lines += [
+        "",
+        "[adjust]",
+        f"sigma_px = {sigma:g}  # of an image coordinate before adjusting; the report states what fits",
+        "",
+        "[compare]",
+        'backend = "colmap"  # adjust with COLMAP too and compare; "none" saves the time',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _free_parameters(trial: TargetTrial) -> tuple[str, ...]:
+    """Return the free parameters of the cameras; empty for texture, where the adjustment chooses them."""
+    if trial.plate is not None:
+        return FREE_BY_PLATES
+    return FREE_BY_TARGETS if trial.codes != "none" else ()
+
+
+def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> list[str]:
+    globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
+    lines = [
+        f"# {counted(len(camera.photographs), 'photograph')} of {camera.size_px[0]} x {camera.size_px[1]} px",
+        "[[camera]]",
+        f"name = {_quoted(camera.name)}",
+        f"images = {json.dumps(globs, ensure_ascii=False)}",
+        f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
+        f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
+        *(["c_assumed = true  # remove this once c_mm and pixel_mm are known"] if camera.assumed else []),
+        *(_model_lines(camera, free) if models else ()),
+    ]
+    return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
+
+
+def _rig_lines(rig: ProposedRig) -> list[str]:
+    return [
+        f"# {_what_pairs(rig).capitalize()} pair up: {counted(rig.moments, 'moment')}, "
+        f"as {as_plain(' and '.join(rig.example))}.",
+        "# Check that the cameras are fixed to one another and triggered together; else remove this section.",
+        "[[rig]]",
+        'name = "rig"',
+        f"cameras = {json.dumps(list(rig.cameras))}  # the first is the reference",
+        f"moment = {_quoted(rig.moment)}  # {MOMENTS.get(rig.moment, MOMENT_IN_NAMES)}",
+        *(
+            []
+            if rig.tolerance_s == USUAL_S
+            else [f"tolerance_s = {rig.tolerance_s:g}  # of times of one moment"]
+        ),
+    ]
+
+
+def _what_pairs(rig: ProposedRig) -> str:
+    return "times" if rig.moment == BY_TIMES else "names"
+
+
+def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
+    """Return the lines of model and free parameters; as comments for texture, where they are chosen."""
+    lines = (
+        ['model = "brown"'] if free else ['# model = "brown"  # without it: what the photographs determine']
+    )
+    if camera.fisheye:
+        lines, free = (
+            [f'model = "{FISHEYE}"  # {as_plain(camera.fisheye)}'],
+            (),  # with k3 and k4 free, four photographs of a board left 200 px, with those determined 1.3 px
+        )
+    usual = list(FREE_OF_FISHEYES if camera.fisheye else FREE_OF_TEXTURE)
+    without = "  # without it: what the photographs determine"
+    return [*lines, f"free = {json.dumps(list(free))}" if free else f"# free = {json.dumps(usual)}{without}"]
+
+
+def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
+    kinds = _kinds_of_codes().splitlines()
+    if trial.plate is not None:
+        return [*kinds, *_plate_lines(trial.plate, pitch)]
+    common = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
+    tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {common}"
+    lines = [tried, *kinds]
+    if trial.codes == "none":
+        lines += ["# No coded targets: points of natural texture take their place.", "[tie_points]"]
+        return lines + (_lattice_lines(trial.lattice, pitch) if trial.lattice and not trial.ringed else [])
+    lines += ["[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
+    if trial.fewest < TARGETS.fewest:
+        shows = counted(trial.fewest, "code")
+        lines += [
+            f"# A photograph that was tried shows {shows}, and {TARGETS.fewest} orient it: texture helps.",
+            "[tie_points]",
+        ]
+    return lines
+
+
+def _lattice_lines(lattice: tuple[int, int], pitch: float | None) -> list[str]:
+    """Return commented lines for circles in rows and columns that may be a plate."""
+    rows, columns = lattice
+    return [
+        f"# Circles are in up to {rows} rows and {columns} columns. If they are a plate, correct these lines",
+        "# and put them in place of [tie_points]:",
+        "# [targets]",
+        f"# codes = {_quoted(next(iter(GRIDS)))}  # or {', '.join(list(GRIDS)[1:])}",
+        f"# rows = {rows}",
+        f"# columns = {columns}",
+        f"# pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots in a row",
+    ]
+
+
+def _kinds_of_codes() -> str:
+    """Return a comment that lists the kinds of codes and plates; an ellipsis stands for more of one kind."""
+    kinds: dict[str, list[str]] = {}
+    for name in FAMILIES:
+        kinds.setdefault(re.split(r"[\d_]", name)[0], []).append(name)
+    codes = ", ".join(names[0] if len(names) == 1 else f"{kind}…" for kind, names in kinds.items())
+    text = f"# Codes: {codes}; plates: {', '.join(PLATES)}"
+    return fill(text, COMMENT_WIDTH, subsequent_indent="# ", break_on_hyphens=False)
+
+
+def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
+    lines = ["[targets]", *_plate_keys(plate, pitch)]
+    if not pitch:
+        lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
+    return lines
+
+
+def _plate_keys(plate: PlateFamily, pitch: float | None) -> list[str]:
+    lines = [
+        f"codes = {_quoted(plate.name)}",
+        f"rows = {plate.rows}  # of dots, of crossings inside the board, or of corners of tags",
+        f"columns = {plate.columns}",
+        f"pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots, crossings or tags",
+    ]
+    if plate.marks:
+        lines.append(f"marks = {json.dumps([list(mark) for mark in plate.marks])}  # row and column, from 0")
+    if plate.dictionary:
+        lines += [
+            f"dictionary = {_quoted(plate.dictionary)}",
+            f"tag_size = {plate.tag_share * (pitch or PITCH):.4g}  # {UNIT}, side of the tags: "
+            f"{plate.tag_share:g} of the pitch",
+        ]
+    if plate.first_tag:
+        lines.append(f"first_tag = {plate.first_tag}  # number of the first tag of the board")
+    return lines
+
+
+def _described(plate: PlateFamily) -> str:
+    marks = f", {counted(len(plate.marks), 'mark')}" if plate.marks else ""
+    return f"{plate.name} of {plate.rows} rows and {plate.columns} columns{marks}"
+
+
+def _example_lines(trial: TargetTrial) -> list[str]:
+    first, second = trial.repeated[:2] if len(trial.repeated) > 1 else ("1", "2")
+    ends, known, named = "targets", "coordinates", list[str]()
+    if trial.codes == "none":  # points of natural texture have other numbers in every run
+        first, second = "corner 1", "corner 2"
+        ends, known = "points with names", "coordinates of such points"
+        named = [
+            "# Points of texture have other names in every run. A point that you name in one photograph",
+            "# keeps its name and is found in the others (repeat the section for each point):",
+            "# [[point]]",
+            f"# name = {_quoted(first)}",
+            f"# image = {_quoted(next(iter(trial.photographs), 'photograph.jpg'))}",
+            "# x_px = 1200.5",
+            "# y_px = 800.5",
+            "#",
+        ]
+    return [
+        *named,
+        f"# The scale comes from a measured distance between two {ends} (repeat the section for more):",
+        "# [[scale_bar]]",
+        f"# from = {_quoted(first)}",
+        f"# to = {_quoted(second)}",
+        f"# length = 1000.0  # {UNIT}",
+        f"# sigma = 0.05  # {UNIT}",
+        "#",
+        f"# Known {known}, a table id,X,Y,Z[,sX,sY,sZ] beside this file:",
+        "# [control]",
+        '# file = "control.csv"',
+    ]
+
+
+def _position_lines(positions: int) -> list[str]:
+    """Return commented lines that show how to use the EXIF positions of so many photographs."""
+    east, _, up = USUAL_SIGMAS_M
+    state = agreeing(positions, "states|state")
+    return [
+        "#",
+        f"# {counted(positions, 'photograph')} {state} a position (EXIF), no better than the receiver.",
+        '# For scale and datum from positions, "control" and:',
+        "# [exterior]",
+        f"# exif_sigma_m = [{east:g}, {up:g}]  # m, in the plane and of the height, where none is stated",
+    ]
+
+
+def _findings(
+    grouping: Grouping, trial: TargetTrial, positions: int, masked: str, unused: str
+) -> tuple[tuple[str, str], ...]:
+    """Return the findings for the terminal."""
+    found = [
+        (
+            f"camera {camera.name}",
+            f"{counted(len(camera.photographs), 'photograph')}, {camera.size_px[0]} x "
+            f"{camera.size_px[1]} px, c "
+            f"{camera.c_mm:.4g} mm ({camera.c_source}), pixel {1000 * camera.pixel_mm[0]:.4g} um "
+            f"({camera.pixel_source})",
+        )
+        for camera in grouping.cameras
+    ]
+    found += [(f"lens of {one.name}", f"fisheye, {one.fisheye}") for one in grouping.cameras if one.fisheye]
+    if grouping.rig is not None:
+        found.append(
+            (
+                "rig",
+                f"{' and '.join(grouping.rig.cameras)}, {counted(grouping.rig.moments, 'moment')} by the "
+                f"{_what_pairs(grouping.rig)}; check that the cameras are fixed to one another, else remove "
+                "[[rig]]",
+            )
+        )
+    if trial.plate is not None:
+        found.append(("targets", "; ".join(map(_described, trial.plates))))
+        found += [("left out", f"{_described(plate)} ({why})") for plate, why in trial.left_out]
+    elif trial.codes != "none":
+        repeated = (
+            f"{counted(len(trial.repeated), 'code')} that two of {len(trial.photographs)} photographs have"
+        )
+        found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
+    else:
+        found.append(("targets", "none with codes: points of natural texture"))
+    if masked:
+        found.append(("masks", f"in {masked}; {unused or 'what is black in them is ignored'}"))
+    if positions:
+        found.append(
+            ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")
+        )
+    return tuple(found)
+
+
+def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tuple[Remark, ...]:
+    """Return the remarks on photographs, cameras and targets."""
+    remarks = [one for camera in grouping.cameras for one in camera.remarks]
+    assumed = [camera.name for camera in grouping.cameras if camera.assumed]
+    if assumed:
+        remarks.append(remark("camera_assumed", cameras=assumed))
+    if len(grouping.cameras) > 1:
+        each = [f"{camera.name} ({len(camera.photographs)})" for camera in grouping.cameras]
+        remarks.append(remark("several_cameras", cameras=each))
+    if trial.plate is not None and pitch is None:
+        remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
+    if np.isfinite(trial.blur_px):
+        remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
+    if trial.ringed:
+        most = max(trial.ringed, key=lambda one: len(one.crops))
+        remarks.append(
+            remark("rings_not_read", photograph=most.photograph, dots=most.dots, ringed=len(most.crops))
+        )
+    elif trial.codes == "none" and (trial.lattice is not None or trial.circles >= MIN_TARGETS):
+        rows, columns = trial.lattice or (None, None)
+        circles = round(trial.circles)
+        remarks.append(remark("circles_without_codes", circles=circles, rows=rows, columns=columns))
+    return tuple(remarks)
+
+
+def _quoted(text: str) -> str:
+    """Return a TOML basic string; JSON strings are a subset of these."""
+    return json.dumps(text, ensure_ascii=False)
