@@ -1,8 +1,8 @@
 """Drawings on the page of conventions: frames, rotations and directions of distortion, as SVG in the page.
 
-The program computes the drawings where possible: `sfm.model.camera.project` gives the image point of the pinhole
-camera, `sfm.model.conventions.rotation_from_angles` rotates the axes, and the distortion models give the vectors.
-Drawings use the colours of the page, so they are readable on a light and on a dark background.
+The program computes the drawings where possible: `sfm.model.camera.project` gives the image point of the
+pinhole camera, `sfm.model.conventions.rotation_from_angles` rotates the axes, and the distortion models give
+the vectors. Drawings use the colours of the page, so they are readable on a light and on a dark background.
 """
 
 from __future__ import annotations

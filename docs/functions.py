@@ -1,7 +1,7 @@
 """Links from names of functions on the pages to their docstrings; a name that does not exist is an error.
 
-A name in code font such as `sfm.model.camera.project` needs no markup. The directive `functions` makes the target
-page, which documents every name on the pages of docs/, sorted by module.
+A name in code font such as `sfm.model.camera.project` needs no markup. The directive `functions` makes the
+target page, which documents every name on the pages of docs/, sorted by module.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from tests.places import ROOMS, ROOT
 from tests.products.epochs.scenes import POINTS, epoch
 from tests.synthetic import make_network, seed_of
 
-OWN = [("sfm", sfm), *((f"sfm.{room}", getattr(sfm, room)) for room in ROOMS)]
+OWN = [("sfm", sfm), *((getattr(sfm, room).__name__, getattr(sfm, room)) for room in ROOMS)]
 FUNCTIONS = {
     f"{room}.{name}": getattr(module, name)
     for room, module in OWN
@@ -46,14 +46,14 @@ RAYS = {"positions": np.zeros((1, 3)), "rotations": np.eye(3)[None]}
 @pytest.mark.parametrize("room", ROOMS)
 def test_names_of_a_room_are_the_rows_of_its_stub(room: str) -> None:
     module = getattr(sfm, room)
-    stub = (ROOT / "sfm" / room / "__init__.pyi").read_text(encoding="utf-8")
+    stub = (Path(module.__path__[0]) / "__init__.pyi").read_text(encoding="utf-8")
     assert list(module.__all__) == dir(module) == sorted(module.__all__)
     inner = {one.name for one in pkgutil.iter_modules(module.__path__)}
     assert not inner & set(module.__all__), "which of the two is meant depends on what was imported before"
     for name in module.__all__:
         source = getattr(module, name).__module__
         assert f"\nfrom {source} import {name} as {name}\n" in stub
-    with pytest.raises(AttributeError, match=f"module 'sfm.{room}' has no attribute 'orientate'"):
+    with pytest.raises(AttributeError, match=f"module '{module.__name__}' has no attribute 'orientate'"):
         module.orientate  # noqa: B018
 
 

@@ -1,8 +1,8 @@
 """docs/symptoms.md has every message: the remarks of the catalogue, and an entry for each error.
 
 An entry is text in backticks in the first column of the tables of errors, … stands for what varies. The
-messages are read from the source: what every error of `sfm.model.errors` says, and the sentences of the rooms that
-find why a photograph cannot be used.
+messages are read from the source: what every error of `sfm.model.errors` says, and the sentences of the
+rooms that find why a photograph cannot be used.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ the solution of another model, the parameters that it adds, and what is reported
 solves the models and takes the solution with the most evidence, which is the gain minus the price. A choice
 that a test has decided before has evidence without limit.
 
-The price is that of the further parameters (`sfm.model.likelihood.price_of`), and ln of the number of alternatives
-over the level. Chance makes a wrong model likelier than the right one by the factor 1 / level in a share of
-at most `level` of all cases. Another solution with no further parameters has no price.
+The price is that of the further parameters (`sfm.model.likelihood.price_of`), and ln of the number of
+alternatives over the level. Chance makes a wrong model likelier than the right one by the factor 1 / level
+in a share of at most `level` of all cases. Another solution with no further parameters has no price.
 
 Source: Kass and Raftery (1995), J. Am. Stat. Assoc. 90 (parameters); Ville (1939), Etude critique de la
 notion de collectif (bound on a ratio of likelihoods).

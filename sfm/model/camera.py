@@ -289,7 +289,8 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
         a model that distorts the ideal point has the pixel. Models that correct the measured point give a
         ray to every pixel.
 
-    Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera (`sfm.model.distortion`).
+    Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera
+    (`sfm.model.distortion`).
     """
     xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
     corrects = MODELS[camera.model].corrects

@@ -319,8 +319,8 @@ def orient_absolute(
     Raises:
         GeometryError: fewer than three points, or all points on a line.
 
-    Source: document 004, "absolute orientation"; Horn (1987) for the closed form (sfm/model/similarity.py), Kraus
-    (2007), sec. 4.4.3, for the differential equations.
+    Source: document 004, "absolute orientation"; Horn (1987) for the closed form (sfm/model/similarity.py),
+    Kraus (2007), sec. 4.4.3, for the differential equations.
     """
     model, control = np.asarray(model, dtype=float), np.asarray(control, dtype=float)
     similarity = fit_similarity(model, control, weights=weights)

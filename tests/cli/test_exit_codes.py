@@ -166,7 +166,12 @@ def test_errors_of_kolinear_are_reported_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "place", ["survey.sources.targets.measure_photograph", "batch.run.read_survey", "batch.run.fingerprint"]
+    "place",
+    [
+        "survey.sources.targets.measure_photograph",
+        "products.batch.run.read_survey",
+        "products.batch.run.fingerprint",
+    ],
 )
 def test_a_fault_in_one_survey_of_a_batch_fails_it_alone(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -65,9 +65,9 @@ def test_an_error_that_is_called_detectable_is_found_with_the_stated_power() -> 
 def test_levels_have_one_home() -> None:
     """Other modules import them, or have a number of another kind."""
     theirs = [
-        ("distributions.py", "FALSE_ALARM"),
-        ("distributions.py", "LEVEL"),
-        ("distributions.py", "POWER"),
+        ("model/distributions.py", "FALSE_ALARM"),
+        ("model/distributions.py", "LEVEL"),
+        ("model/distributions.py", "POWER"),
         ("orientation/resection/ransac.py", "CHANCE"),  # an expected number
     ]
     found = [
@@ -84,14 +84,14 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
     without = {
         "targets/fits/": "targets are measured",
         "survey/sources/repeated.py": "tables of image points are read",
-        "survey/drafting/": "there is no survey file yet",
+        "products/drafting/": "there is no survey file yet",
         "survey/diagnosis/photograph_cameras.py": "a number of trials",
-        "planning/": "a plan",
+        "products/planning/": "a plan",
         "report/planning.py": "a plan",
         "comparison/": "two results",
         "cli/commands/solvers.py": "several results",
-        "epochs/": "several results",
-        "geometry/": "a shape",
+        "products/epochs/": "several results",
+        "products/geometry/": "a shape",
     }
     users = set()
     for path in sorted((ROOT / "sfm").rglob("*.py")):
@@ -102,7 +102,7 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
         )
         if re.search(r"(?<!: float = )\b(?:LEVEL|FAMILY|FALSE_ALARM)\b", code):
             users.add(next((prefix for prefix in without if name.startswith(prefix)), name))
-    assert users - {"distributions.py", "survey/inputs/settings.py"} == set(without)
+    assert users - {"model/distributions.py", "survey/inputs/settings.py"} == set(without)
 
 
 def test_all_levels_have_the_share_of_the_user() -> None:

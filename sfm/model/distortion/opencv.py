@@ -1,7 +1,8 @@
 """OpenCV's models, and equidistant models with decentring and thin prism distortion.
 
 All are in units of the focal lengths, as in COLMAP. The ideal point (a, b) is mapped to e = s(r2) (a, b), as
-in `radial`, and from there to the distorted point. The outputs are described in `sfm.model.distortion.models`.
+in `radial`, and from there to the distorted point. The outputs are described in
+`sfm.model.distortion.models`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Remark: one finding about a result, as data.
 
-Each kind of remark is a row of the catalogue (`sfm.model.remarks.catalogue`). Code that finds something returns a
-remark of that kind with its subjects and numbers, and contains no English. The catalogue supplies the
-sentence, the cause and the remedy.
+Each kind of remark is a row of the catalogue (`sfm.model.remarks.catalogue`). Code that finds something
+returns a remark of that kind with its subjects and numbers, and contains no English. The catalogue supplies
+the sentence, the cause and the remedy.
 
 A row of the catalogue is a `Kind`, or `Tested` of the table of tests, and turns a remark into sentences.
 
