@@ -53,8 +53,8 @@ COMPILING = 120.0  # s beside it, for kernels that a mutation makes compile agai
 Ended = Literal["killed", "survived", "timed out"]
 ROOMS = (  # modules, and folders with all that are in them
     "sfm/judgement",
-    "sfm/remarks",
-    "sfm/observations",
+    "sfm/model/remarks",
+    "sfm/model/observations",
     "sfm/adjustment/quality/statistics.py",
     "sfm/adjustment/quality/consistency.py",
     "sfm/adjustment/quality/other_solutions.py",

@@ -11,6 +11,11 @@ from tests.mutate import Module, Noticing, changes_of
 FILE = "sfm/judgement/checks.py"
 
 
+def test_every_room_has_modules() -> None:
+    """One that moved would be left out without a word."""
+    assert not [room for room in mutate.ROOMS if not mutate.files_of(room)]
+
+
 def test_a_mutation_changes_one_expression() -> None:
     module = Module(FILE)
     before = ast.dump(module.tree)
