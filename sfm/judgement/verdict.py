@@ -74,11 +74,11 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     a = result.adjustment
     statistics, consistency = statistics_of(a), consistency_of(a)
     of_sigma0 = sigma0_remarks(sigma0_of(a), a)
-    sigma0_is_high = any(said.kind == "sigma0_high" for said in of_sigma0)
+    sigma0_is_high = any(said.kind == "sigma0_high" for said in of_sigma0)  # by a cause, whatever it shifts
     remarks = (
         *convergence_remarks(a),
         *photograph_remarks(result),
-        *slight_as_tests(result.stage_remarks, sigma0_is_high=sigma0_is_high),
+        *(result.stage_remarks if sigma0_is_high else slight_as_tests(result.stage_remarks)),
         *other_solution_remarks(result),
         *of_sigma0,
         *residual_remarks(longest_residual(a)),
@@ -132,16 +132,12 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
     return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))
 
 
-def slight_as_tests(remarks: Sequence[Remark], *, sigma0_is_high: bool = False) -> tuple[Remark, ...]:
-    """Return remarks with a test in place of each effect that shifts the result less than users expect.
-
-    What explains a high sigma0, a wrong assumption, stays whatever it shifts.
-    """
+def slight_as_tests(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
+    """Return remarks with a test in place of each effect that shifts the result less than users expect."""
 
     def is_slight(one: Remark) -> bool:
         grade = None if one.test is not None else one.row.severity
-        slight = isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
-        return slight and not sigma0_is_high
+        return isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
 
     return tuple(
         remark("slight_effect", cause=one.kind, shift=one.number("shift")) if is_slight(one) else one

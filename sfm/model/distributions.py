@@ -43,7 +43,7 @@ class Levels:
 
     @property
     def family(self) -> float:
-        """Level of a question about the whole survey: FAMILY, for FALSE_ALARM."""
+        """Level of a question about the whole survey."""
         return self.false_alarm / WHOLE
 
     def of_each(self, tests: int) -> float:
