@@ -82,10 +82,16 @@ def main() -> None:
 
 
 def _print(
-    name: str, way: str, points: int, found: float, predicted: float, ratio: float, sigma: float | None = None
+    name: str,
+    way: str,
+    points: int,
+    deviation: float,
+    predicted: float,
+    ratio: float,
+    sigma: float | None = None,
 ) -> None:
     """Print one row of the table."""
-    row = f"{name[-17:]:<18}{way:<10}{points:>7}{1e6 * found:>10.1f}{1e6 * predicted:>11.1f}"
+    row = f"{name[-17:]:<18}{way:<10}{points:>7}{1e6 * deviation:>10.1f}{1e6 * predicted:>11.1f}"
     print(f"{row}{ratio:>8.2f}{'' if sigma is None else f'{sigma:>7.2f}'}", flush=True)
 
 
@@ -99,16 +105,16 @@ def _of_centres(
     """
     network, estimate, seen = whole.network, whole.estimate, whole.network.image_points
     m = len(network.images)
-    found, of_draws = np.zeros(draws), np.zeros((draws, len(seen), 2, 3 * m))
+    measured, of_draws = np.zeros(draws), np.zeros((draws, len(seen), 2, 3 * m))
     for n, half in enumerate(_halves(estimate.points, estimate.position, way, draws)):
-        one, other = (_adjusted(network, estimate, points) for points in (half, ~half))
-        a, b = one.estimate, other.estimate
+        half_result, other = (_adjusted(network, estimate, points) for points in (half, ~half))
+        a, b = half_result.estimate, other.estimate
         placed = fit_similarity(b.position, a.position)
         scale = np.linalg.norm(a.position - np.nanmean(a.points, axis=0), axis=1).mean()
         turned = placed.scale * np.kron(np.eye(m), placed.rotation.T)
-        of_draws[n, half[seen.point]] = _influence(one) / scale
+        of_draws[n, half[seen.point]] = _influence(half_result) / scale
         of_draws[n, ~half[seen.point]] = -_influence(other) @ turned / scale
-        found[n] = ((placed.apply(b.position) - a.position) ** 2).sum() / scale**2
+        measured[n] = ((placed.apply(b.position) - a.position) ** 2).sum() / scale**2
     Z = np.moveaxis(of_draws, 0, 2).reshape(len(seen), 2, -1)
     covariance = np.tensordot(Z, Z, axes=((0, 1), (0, 1)))
     if correlation is not None:
@@ -117,8 +123,8 @@ def _of_centres(
     predicted = np.diagonal(covariance).reshape(draws, -1).sum(axis=1)
     size = np.repeat(np.sqrt(predicted), 3 * m)
     sigma = np.sqrt(((covariance / np.outer(size, size)) ** 2).sum() / 2) / draws  # of a root near 1
-    rms, expected = (float(np.sqrt(one.mean() / m)) for one in (found, predicted))
-    return len(network.points), rms, expected, float(np.sqrt((found / predicted).mean())), float(sigma)
+    rms, expected = (float(np.sqrt(square.mean() / m)) for square in (measured, predicted))
+    return len(network.points), rms, expected, float(np.sqrt((measured / predicted).mean())), float(sigma)
 
 
 def _influence(adjustment: Adjustment) -> FloatArray:
@@ -175,21 +181,21 @@ def _of_points(network: Network, estimate: Estimate, sigma0: float) -> tuple[int
     J = np.stack(slope, axis=2)  # d (tangents) / d (px)
     weights = np.linalg.inv(J @ seen.covariance @ J.transpose(0, 2, 1))
     several = network.rays() >= 2 * MIN_RAYS
-    found = []
+    points_of_halves = []
     for part in (0, 1):
         rays = several[seen.point] & (rank % 2 == part)
         met = intersect(
             uv[rays], seen.image[rays], seen.point[rays], estimate.position, estimate.rotation,
             n_points=len(network.points), weights=weights[rays],
         )  # fmt: skip
-        found.append((met.points[several], met.cofactors[several]))
-    (a, of_a), (b, of_b) = found
+        points_of_halves.append((met.points[several], met.cofactors[several]))
+    (a, of_a), (b, of_b) = points_of_halves
     scale = np.linalg.norm(estimate.position[:, None] - np.nanmean(a, axis=0), axis=2).mean()
     trace = np.einsum("nii->n", of_a + of_b)
     usual = trace < np.quantile(trace, 0.99)  # a few points, uncertain along their rays, would dominate
     square = ((a - b) ** 2).sum(axis=1)[usual].mean()
     predicted = sigma0**2 * trace[usual].mean()
-    rms, expected = (float(np.sqrt(one) / scale) for one in (square, predicted))
+    rms, expected = (float(np.sqrt(mean_square) / scale) for mean_square in (square, predicted))
     return int(usual.sum()), rms, expected, rms / expected
 
 

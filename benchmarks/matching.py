@@ -47,7 +47,7 @@ def compare_lsm(patches: int) -> None:
     alone = _fastest(lambda: _all_lsm(rounds, pairs, ours, 1))
     both = _fastest(lambda: _all_lsm(rounds, pairs, ours, 2), clock=time.perf_counter)
     ecc = _fastest(lambda: _all_ecc(rounds, pairs, theirs))
-    rms = [_rms(np.array(one[-len(rounds) :]), pairs) for one in (ours, theirs)]
+    rms = [_rms(np.array(results[-len(rounds) :]), pairs) for results in (ours, theirs)]
     bound = SIGMA * np.sqrt(np.trace(pairs.bound, axis1=1, axis2=2).mean() / 2)
     print(f"LSM, {count} patches of 21 x 21 px, noise {SIGMA:g} of 256 in both photographs")
     print(f"  match_lsm, 1 thread    {alone / count * 1e6:7.1f} us a patch   RMS {rms[0]:.5f} px")
@@ -84,13 +84,13 @@ def compare_ncc(templates: int) -> None:
 
 
 def _all_lsm(
-    rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, found: list[FloatArray], threads: int
+    rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, results: list[FloatArray], threads: int
 ) -> None:
     for left, right in rounds:
-        found.append(match_lsm(left, right, pairs.centre, pairs.centre, threads=threads).xy)
+        results.append(match_lsm(left, right, pairs.centre, pairs.centre, threads=threads).xy)
 
 
-def _all_ecc(rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, found: list[FloatArray]) -> None:
+def _all_ecc(rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, results: list[FloatArray]) -> None:
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ECC_STEPS, ECC_EPS)
     centres = pairs.centre.astype(int).tolist()
     for left, right in rounds:
@@ -101,11 +101,11 @@ def _all_ecc(rounds: list[tuple[FloatArray, FloatArray]], pairs: Pairs, found: l
             warp = np.array([[1, 0, REACH - HALF], [0, 1, REACH - HALF]], dtype=np.float32)
             _, warp = cv2.findTransformECC(template, window, warp, cv2.MOTION_AFFINE, stop, None, 1)
             xy[k] = warp @ [HALF, HALF, 1.0] + [col - REACH, row - REACH]
-        found.append(xy)
+        results.append(xy)
 
 
-def _rms(found: FloatArray, pairs: Pairs) -> float:
-    return float(np.sqrt(np.nanmean((found - pairs.centre - pairs.shift) ** 2)))
+def _rms(matched: FloatArray, pairs: Pairs) -> float:
+    return float(np.sqrt(np.nanmean((matched - pairs.centre - pairs.shift) ** 2)))
 
 
 def _fastest(work: Callable[[], object], *, clock: Callable[[], float] = time.process_time) -> float:

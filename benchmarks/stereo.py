@@ -61,8 +61,8 @@ def cameras() -> tuple[Camera, ...]:
     made = []
     for name, cx, cy in (("left", 341.6, 235.2), ("right", 326.3, 250.1)):
         names = MODELS["opencv"].names
-        parameters = np.array([(values | {"cx": cx, "cy": cy})[one] for one in names])
-        on = np.array([one in free for one in names])
+        parameters = np.array([(values | {"cx": cx, "cy": cy})[name] for name in names])
+        on = np.array([name in free for name in names])
         made.append(Camera(name, "opencv", (640, 480), np.ones(2), parameters, free=on))
     return tuple(made)
 
@@ -138,8 +138,10 @@ def with_mrcal(python: str, truth: Estimate, drawn: list[FloatArray]) -> tuple[F
             pitch=PITCH,
         )
         said = subprocess.run([python, "-c", MRCAL, str(path)], capture_output=True, text=True, check=True)
-    found = json.loads(said.stdout.splitlines()[-1])
-    return np.array([np.linalg.norm(rt[3:]) for rt, _ in found]), np.array([rms for _, rms in found])
+    calibrated = json.loads(said.stdout.splitlines()[-1])
+    return np.array([np.linalg.norm(rt[3:]) for rt, _ in calibrated]), np.array(
+        [rms for _, rms in calibrated]
+    )
 
 
 def vector_of(R: FloatArray) -> FloatArray:

@@ -66,16 +66,16 @@ def main() -> None:
             seconds.append(of_scene)
         if len(arguments.photographs) > 1:
             power = np.polyfit(np.log(arguments.photographs), np.log(seconds), 1)[0]
-            print(f"{roughness:<17}time grows as n^" + ", n^".join(f"{one:.2f}" for one in power))
+            print(f"{roughness:<17}time grows as n^" + ", n^".join(f"{exponent:.2f}" for exponent in power))
 
 
 def _kolinear(scene: TexturedScene, folder: Path, jobs: int) -> float:
     """Run the survey, print its errors and return its processor time."""
     begun, started = time.process_time(), time.perf_counter()
-    found = run_survey(read_survey(folder / "survey.toml"), jobs=jobs)
+    result = run_survey(read_survey(folder / "survey.toml"), jobs=jobs)
     seconds, elapsed = time.process_time() - begun, time.perf_counter() - started
-    stages = ", ".join(f"{one.stage} {one.seconds:.1f} s" for one in found.seconds)
-    a = found.adjustment
+    stages = ", ".join(f"{stage.stage} {stage.seconds:.1f} s" for stage in result.seconds)
+    a = result.adjustment
     _print(scene, folder.name, "Kolinear", a.network, a.estimate, seconds, a)
     rejected = f"{int(a.rejected.sum())} of {len(a.rejected)} image points rejected"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
@@ -93,8 +93,8 @@ def _colmap(scene: TexturedScene, folder: Path) -> list[float]:
     mapped = map_photographs(folder, (names,))
     seconds = time.process_time() - begun
     _print(scene, folder.name, "COLMAP", mapped.network, mapped.estimate, seconds)
-    found = refine_model(mapped.network, mapped.estimate, folder)
-    a = found.adjustment
+    refined = refine_model(mapped.network, mapped.estimate, folder)
+    a = refined.adjustment
     whole = time.process_time() - begun
     _print(scene, folder.name, "COLMAP + refine", a.network, a.estimate, whole, a)
     return [seconds, whole]

@@ -96,28 +96,28 @@ def count_matches(left: AnyArray, right: AnyArray, xy: FloatArray, truth: FloatA
     """Match points by one of METHODS and compare them with the truth."""
     begun = time.process_time()
     if method == "key points":
-        found = match_points(left, right, xy)
+        matches = match_points(left, right, xy)
     else:
         off = np.random.default_rng(len(xy)).uniform(-OFF_PX, OFF_PX, xy.shape)
         nothing = affinities_around(xy[:0], xy[:0], xy)
         with patch.object(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(
             nothing.xy[:0], nothing.xy[:0], at
         )):  # fmt: skip
-            found = match_points(left, right, xy, xy_right=truth + off, wide=method == "turned")
+            matches = match_points(left, right, xy, xy_right=truth + off, wide=method == "turned")
     seconds = time.process_time() - begun
-    error = np.linalg.norm(found.right - truth, axis=1)
+    error = np.linalg.norm(matches.right - truth, axis=1)
     with np.errstate(invalid="ignore"):
-        told = error < WRONG_SIGMAS * np.linalg.norm(found.sigma, axis=1)
-    right_ones = found.good & ((error <= WRONG_PX) | told)
-    e = (found.right - truth)[right_ones]
+        told = error < WRONG_SIGMAS * np.linalg.norm(matches.sigma, axis=1)
+    right_ones = matches.good & ((error <= WRONG_PX) | told)
+    e = (matches.right - truth)[right_ones]
     some = len(e) > 0
     return Counts(
         len(xy),
         int(right_ones.sum()),
-        int((found.good & ~right_ones).sum()),
-        int((~found.good).sum()),
+        int((matches.good & ~right_ones).sum()),
+        int((~matches.good).sum()),
         float(np.sqrt((e**2).mean())) if some else np.nan,
-        float(np.sqrt((e**2 / found.sigma[right_ones] ** 2).mean())) if some else np.nan,
+        float(np.sqrt((e**2 / matches.sigma[right_ones] ** 2).mean())) if some else np.nan,
         seconds,
     )
 

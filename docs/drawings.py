@@ -149,7 +149,7 @@ def pinhole() -> Drawing:
     corners = [
         station + R @ np.array([x, y, -c]) for x, y in ((-0.9, -0.6), (0.9, -0.6), (0.9, 0.6), (-0.9, 0.6))
     ]
-    sheet.area(np.array([at(one) for one in corners]), "muted full faint")
+    sheet.area(np.array([at(corner) for corner in corners]), "muted full faint")
     for corner in corners:
         sheet.line(at(station), at(corner), "muted")
     U = R.T @ (point - station)
@@ -190,7 +190,9 @@ def rotations() -> Drawing:
             sheet.arrow(origin, at(R[:, axis]), "first", "xyz"[axis] + turned)
         start = before[:, (number + 1) % 3]
         end = R[:, (number + 1) % 3]
-        between = np.array([at(0.7 * one / np.linalg.norm(one)) for one in np.linspace(start, end, 12)])
+        between = np.array(
+            [at(0.7 * direction / np.linalg.norm(direction)) for direction in np.linspace(start, end, 12)]
+        )
         sheet.curve(between[:-1], "second")
         sheet.arrow(between[-3], between[-1], "second")
         sheet.words(moved(origin, 0.0, 112.0), f"{name}, {about}", "second", middle=True)
@@ -211,7 +213,7 @@ def distortions() -> Drawing:
             return origin + 9.0 * np.asarray(xy_mm) * (1.0, -1.0)
 
         box = np.array([[-18.0, -12.0], [18.0, -12.0], [18.0, 12.0], [-18.0, 12.0]])
-        sheet.area(np.array([at(one) for one in box]), "muted open")
+        sheet.area(np.array([at(corner) for corner in box]), "muted open")
         grid = np.array([[x, y] for y in (-9.0, -3.0, 3.0, 9.0) for x in (-14.0, -8.4, -2.8, 2.8, 8.4, 14.0)])
         grid *= 0.95
         if model == "brown":
@@ -297,7 +299,7 @@ def plates() -> Drawing:
                     )
                     dark = (row + column) % 2 == 0
                     kind = "muted full faint" if dark else "muted open"
-                    sheet.area(np.array([at(np.array(one)) for one in corners]), kind)
+                    sheet.area(np.array([at(np.array(corner)) for corner in corners]), kind)
         for k, place in enumerate(xy):
             row, column = divmod(k, plate.columns)
             is_mark = (row, column) in plate.marks

@@ -36,11 +36,11 @@ def setup(sphinx: Sphinx) -> dict[str, Any]:
 
 def names_on_pages() -> tuple[str, ...]:
     """Return every name in code font on the pages of docs/, except public names, which have another page."""
-    found: set[str] = set()
+    names: set[str] = set()
     for page in DOCS.rglob("*.md"):
         prose = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
-        found |= {name for name in re.findall(r"`([\w.]+)`", prose) if NAME.fullmatch(name)}
-    return tuple(sorted(found - PUBLIC))
+        names |= {name for name in re.findall(r"`([\w.]+)`", prose) if NAME.fullmatch(name)}
+    return tuple(sorted(names - PUBLIC))
 
 
 def module_of(name: str) -> str:

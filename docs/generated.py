@@ -56,15 +56,15 @@ class SurveyFileReference(_Made):
 
     def parts(self) -> list[tuple[str, list[nodes.Node]]]:
         """Return a table for each section of the file."""
-        found = []
+        rows = []
         for name, field in SurveyFile.model_fields.items():
             section = section_of(field.annotation)
             doc = (inspect.getdoc(section) or "").partition("]: ")[2] or inspect.getdoc(section) or ""
             table = table_of(("key", "type", "default", "meaning"), rows_of(section))
             said = field.alias or name
             title = f"[[{said}]]" if typing.get_origin(field.annotation) is tuple else f"[{said}]"
-            found.append((title, [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table]))
-        return found
+            rows.append((title, [nodes.paragraph("", doc.lstrip("]: ").capitalize()), table]))
+        return rows
 
 
 class CommandReference(_Made):
@@ -96,7 +96,7 @@ class PythonReference(_Made):
 
     def parts(self) -> list[tuple[str, list[nodes.Node]]]:
         """Return signature and docstring of each name."""
-        found = []
+        pages = []
         domain = self.env.domains["py"]
         assert isinstance(domain, PythonDomain)
         for name in sorted(sfm.__all__, key=str.lower):
@@ -105,18 +105,18 @@ class PythonReference(_Made):
             described = inspect.isfunction(value)
             signature = f"{name}{inspect.signature(value)}" if described else name
             text = f"{signature}\n\n{inspect.getdoc(value)}"
-            found.append((f"sfm.{name}", [nodes.literal_block("", text, language="text")]))
-        return found
+            pages.append((f"sfm.{name}", [nodes.literal_block("", text, language="text")]))
+        return pages
 
 
 def command_names() -> list[tuple[str, ...]]:
     """Return the words of every command; the commands of a group follow the group."""
     root: Any = typer.main.get_command(app)
-    found: list[tuple[str, ...]] = []
+    names: list[tuple[str, ...]] = []
     for name, command in root.commands.items():
-        found.append((name,))
-        found += [(name, inner) for inner in getattr(command, "commands", {})]
-    return found
+        names.append((name,))
+        names += [(name, inner) for inner in getattr(command, "commands", {})]
+    return names
 
 
 def table_of(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:

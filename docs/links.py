@@ -75,8 +75,8 @@ def faults_of(site: Path) -> list[str]:
                 if unquote(parts.fragment) not in places:
                     faults.append(f"{where}: link to {target}, which has no such place")
     for style in sorted(site.rglob("*.css")):
-        found = re.findall(r"url\(['\"]?(https?:[^)'\"]+)", style.read_text(encoding="utf-8"))
-        faults += [f"{style.relative_to(site)}: loads {target} from elsewhere" for target in found]
+        addresses = re.findall(r"url\(['\"]?(https?:[^)'\"]+)", style.read_text(encoding="utf-8"))
+        faults += [f"{style.relative_to(site)}: loads {target} from elsewhere" for target in addresses]
     return faults
 
 

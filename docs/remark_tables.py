@@ -50,8 +50,8 @@ def _row(kind: Kind) -> str:
 def _pattern(sentence: str) -> str:
     """Return a sentence with … for variable parts, and plural forms where a number decides."""
 
-    def field(found: re.Match[str]) -> str:
-        spec = found.group(2) or ""
+    def field(match: re.Match[str]) -> str:
+        spec = match.group(2) or ""
         if "|" in spec:
             return spec.split("|")[1]
         return f"{VARIES} {spec}s" if spec and spec[0].isalpha() else VARIES

@@ -47,9 +47,9 @@ def section_of(annotation: Any) -> type[Section]:
 def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
     """Return key, type, default and meaning of every key of a section."""
     comments: dict[str, str] = {}
-    for one in reversed(section.__mro__):
-        if issubclass(one, Section):  # inherited keys too
-            comments |= comments_of(one)
+    for parent in reversed(section.__mro__):
+        if issubclass(parent, Section):  # inherited keys too
+            comments |= comments_of(parent)
     rows = []
     for name, field in section.model_fields.items():
         default = "required" if field.default is PydanticUndefined else shown(field.default)
@@ -62,19 +62,19 @@ def rows_of(section: type[Section]) -> list[tuple[str, ...]]:
 def comments_of(section: type[Section]) -> dict[str, str]:
     """Return the comment on each field of a section, from the lines before it and at its own lines."""
     source = inspect.getsource(section)
-    lines, found = source.splitlines(), {}
+    lines, comments = source.splitlines(), {}
     body: Any = ast.parse(source).body[0]
-    for one in body.body:
-        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name):
-            said = [line.partition("  # ")[2] for line in lines[one.lineno - 1 : one.end_lineno]]
-            above = one.lineno - 2
+    for statement in body.body:
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            said = [line.partition("  # ")[2] for line in lines[statement.lineno - 1 : statement.end_lineno]]
+            above = statement.lineno - 2
             while lines[above].lstrip().startswith("# "):
                 said.insert(0, lines[above].strip().removeprefix("# "))
                 above -= 1
             texts = [text for text in said if text and not text.startswith("type:")]
             if texts:
-                found[one.target.id] = " ".join(texts)
-    return found
+                comments[statement.target.id] = " ".join(texts)
+    return comments
 
 
 def shown(value: Any) -> str:
@@ -96,27 +96,29 @@ def type_of(annotation: Any, metadata: Iterable[Any] = ()) -> str:
     for name, (words, each) in SHAPES.items():
         known = getattr(settings, name)
         if annotation == known or (annotation == typing.get_args(known)[0] and "tuple" in str(annotation)):
-            longest = [one.max_length for one in metadata if isinstance(one, MaxLen | Len) and one.max_length]
+            longest = [
+                limit.max_length for limit in metadata if isinstance(limit, MaxLen | Len) and limit.max_length
+            ]
             return words + bounds_of(typing.get_args(each)[1:]) + "".join(f", at most {n}" for n in longest)
     origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Literal:
-        return " | ".join(str(one) for one in inner)
+        return " | ".join(str(literal) for literal in inner)
     if origin is typing.Annotated:
         return type_of(inner[0], inner[1:])
     if type(None) in inner:
-        return " | ".join(type_of(one) for one in inner if one is not type(None))
+        return " | ".join(type_of(alternative) for alternative in inner if alternative is not type(None))
     return KINDS[annotation.__name__] + bounds_of(metadata)
 
 
 def bounds_of(metadata: Iterable[Any]) -> str:
     """Return the bounds of a number in words; an empty text if it has none."""
-    found = []
-    for one in metadata:
-        for part in getattr(one, "metadata", [one]):  # pydantic's Field has several parts
+    bounds = []
+    for constraint in metadata:
+        for part in getattr(constraint, "metadata", [constraint]):  # pydantic's Field has several parts
             if isinstance(part, Ge):
-                found.append(f"from {part.ge:g}")
+                bounds.append(f"from {part.ge:g}")
             elif isinstance(part, Gt):
-                found.append(f"above {part.gt:g}")
+                bounds.append(f"above {part.gt:g}")
             elif isinstance(part, Le):
-                found.append(f"to {part.le:g}")
-    return f", {' '.join(found)}" if found else ""
+                bounds.append(f"to {part.le:g}")
+    return f", {' '.join(bounds)}" if bounds else ""

@@ -83,13 +83,17 @@ class Marginal:
 
     def of_independent_errors(self) -> Covariance:
         """Return the covariance of points, exterior and interior orientation without the correlated part."""
-        found = marginal_covariance(self.optimum, self.layout, self.cofactors, self.adjustment.sigma0**2)
-        return without_held(found, self.layout, self.optimum)
+        marginal = marginal_covariance(self.optimum, self.layout, self.cofactors, self.adjustment.sigma0**2)
+        return without_held(marginal, self.layout, self.optimum)
 
     def covariance(self) -> Covariance:
         """Return the marginal covariances of points, exterior and interior orientation."""
-        found, variance = self.of_independent_errors(), self.adjustment.sigma0**2
-        return found if self.correlated is None else self.correlated.added_to(found, variance, self.optimum)
+        covariance, variance = self.of_independent_errors(), self.adjustment.sigma0**2
+        return (
+            covariance
+            if self.correlated is None
+            else self.correlated.added_to(covariance, variance, self.optimum)
+        )
 
     def joint(self, unknowns: IntArray, points: IntArray) -> FloatArray:
         """Return the joint covariance of some reduced unknowns and some object points.
@@ -181,16 +185,16 @@ class JointOnDemand:
         """
         with own_threads():
             m, p = self._marginal, 3 * len(points)
-            some = np.asarray(images, dtype=np.int64)
-            columns, by = m.layout.photograph_terms(m.optimum.state, some)
-            found = m.joint(columns.ravel(), np.asarray(points))
+            chosen = np.asarray(images, dtype=np.int64)
+            columns, by = m.layout.photograph_terms(m.optimum.state, chosen)
+            joint = m.joint(columns.ravel(), np.asarray(points))
         u = columns.size
-        J = block_diag(np.zeros((0, 0)), *(exterior_jacobian(m.optimum.state.M[some]) @ by))
+        J = block_diag(np.zeros((0, 0)), *(exterior_jacobian(m.optimum.state.M[chosen]) @ by))
         ordered = np.empty((p + len(J), p + len(J)))
-        ordered[:p, :p] = found[u:, u:]
-        ordered[p:, :p] = J @ found[:u, u:]
+        ordered[:p, :p] = joint[u:, u:]
+        ordered[p:, :p] = J @ joint[:u, u:]
         ordered[:p, p:] = ordered[p:, :p].T
-        ordered[p:, p:] = J @ found[:u, :u] @ J.T
+        ordered[p:, p:] = J @ joint[:u, :u] @ J.T
         return ordered
 
 

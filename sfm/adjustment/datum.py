@@ -223,7 +223,7 @@ def _motions_of(
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
-    of_scale = [one.kind.name for one in observed if one.kind.needs_scale]
+    of_scale = [kind_observed.kind.name for kind_observed in observed if kind_observed.kind.needs_scale]
     if of_scale and np.abs(open_motions[6]).max(initial=0.0) > SCALE_OPEN:
         raise GeometryError(
             f"{of_scale[0]}: nothing gives the network a scale, in which their standard deviations are; "
@@ -364,21 +364,21 @@ def _seen_by_datum(
         poses[~layout.pose_free & pose_on[:, None]],
         fixed_mounts,
     ]
-    for one in observed:
-        point = one.point
+    for kind_observed in observed:
+        point = kind_observed.point
         if point is not None:
-            J = one.kind.linearise(state).J[0]
+            J = kind_observed.kind.linearise(state).J[0]
             moved = J @ points[point]
         else:
-            columns, J, _ = reduced_rows(one, layout, state)
-            met = one.kind.met(state)
+            columns, J, _ = reduced_rows(kind_observed, layout, state)
+            met = kind_observed.kind.met(state)
             at = H
             if met is not state.points:
                 at, kept = H.copy(), np.zeros((len(layout.kept), 3, 7))
                 _fill_motions(met[layout.kept], *_extent(state, cloud), kept)
                 at[layout.kept_start :] = kept.reshape(-1, 7)
             moved = J @ at[columns]
-        rows.append(moved[np.diagonal(one.weight, axis1=1, axis2=2) > 0])
+        rows.append(moved[np.diagonal(kind_observed.weight, axis1=1, axis2=2) > 0])
     return np.concatenate([row.reshape(-1, 7) for row in rows])
 
 
@@ -450,16 +450,16 @@ def with_further(
         ) from None
     across = _product(on_points, on_reduced, motions.points, motions.reduced)
     d, e = len(motions.inverse), len(inverse)
-    whole = np.zeros((d + e, d + e))
-    whole[:d, :d], whole[d:, d:] = motions.inverse, inverse
-    whole[d:, :d] = -inverse @ across @ motions.inverse
+    bordered = np.zeros((d + e, d + e))
+    bordered[:d, :d], bordered[d:, d:] = motions.inverse, inverse
+    bordered[d:, :d] = -inverse @ across @ motions.inverse
     return replace(
         motions,
         reduced=np.hstack([motions.reduced, N]),
         points=np.concatenate([motions.points, moved], axis=2),
         constraints=np.concatenate([motions.constraints, on_points], axis=2),
         on_reduced=np.hstack([motions.on_reduced, on_reduced]),
-        inverse=whole,
+        inverse=bordered,
         further=e,
     )
 

@@ -196,15 +196,15 @@ class Adjustment:
     @property
     def group_parameters(self) -> tuple[GroupParameters, ...]:
         """Parameters of groups of observations that are results of a survey, with their covariance."""
-        found: list[GroupParameters] = []
+        groups: list[GroupParameters] = []
         for group in self.network.observations:
             if isinstance(group, Group) and group.reported and len(group):
                 fitted = group.own_parameters(values_of(self.estimate))
                 J = fitted.J.reshape(len(fitted.J), -1)
                 C = self.solution.covariance_of([self.network.points[j] for j in group.point])
                 C = self.sigma0**2 * fitted.cofactor + J @ C @ J.T
-                found.append(GroupParameters(group.group, group.reported, fitted.value, C))
-        return tuple(found)
+                groups.append(GroupParameters(group.group, group.reported, fitted.value, C))
+        return tuple(groups)
 
     @property
     def has_scale(self) -> bool:
@@ -352,8 +352,8 @@ def computed_once(
         key = (f"{compute.__module__}.{compute.__name__}", args, *sorted(options.items()))
         if key not in kept:
             kept[key] = compute(adjustment, *args, **options)
-        found: Computed = kept[key]
-        return found
+        computed: Computed = kept[key]
+        return computed
 
     return figure
 

@@ -249,7 +249,7 @@ def _with_open_start(
 def _has_open_c(result: Adjustment) -> bool:
     """Return whether a principal distance may lie anywhere, by its standard deviation."""
     for k, camera in enumerate(result.estimate.cameras):
-        focal = [one.role is Role.FOCAL for one in MODELS[camera.model].parameters]
+        focal = [parameter.role is Role.FOCAL for parameter in MODELS[camera.model].parameters]
         with np.errstate(invalid="ignore"):
             if (result.interior_sigma(k)[focal] > MAX_LINEAR * np.abs(camera.parameters[focal])).any():
                 return True
@@ -364,7 +364,9 @@ def _result(
         residual_weights=residual_weight,
         weights=np.take(weight, back, axis=0),
         inflation=factor,
-        observed=tuple(residuals_of_observed(one, layout, optimum, Q) for one in run.problem.observed),
+        observed=tuple(
+            residuals_of_observed(of_kind, layout, optimum, Q) for of_kind in run.problem.observed
+        ),
         datum_points=run.problem.datum.points,
         remarks=(*run.remarks, *_small_weight_remarks(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),

@@ -109,7 +109,7 @@ def _alternatives(hint: Any) -> tuple[tuple[Any, ...], frozenset[Any]]:
     """Return the types that an annotation allows, and those whose values need no further check."""
     allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
     arrays = {np.dtype(dtype) for array, _, dtype, _ in ARRAYS if dtype is not None and array in allowed}
-    return allowed, frozenset({one for one in allowed if type(one) is type} | arrays)
+    return allowed, frozenset({alternative for alternative in allowed if type(alternative) is type} | arrays)
 
 
 def _checked(where: str, value: object, allowed: tuple[Any, ...]) -> object:
@@ -141,7 +141,7 @@ def _as_annotated(value: Any, hint: Any) -> object:
     """Return a value that fits, converted to the annotated list or tuple of arrays."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if isinstance(value, list | tuple) and origin in SEQUENCES and any(row[0] == inner[0] for row in ARRAYS):
-        value = [_checked("", one, inner[:1]) for one in value]
+        value = [_checked("", element, inner[:1]) for element in value]
     return origin(value) if origin in (list, tuple) else value
 
 
@@ -166,7 +166,7 @@ def _fits(value: object, hint: Any) -> bool:
         return True
     if typing.get_origin(hint) is tuple and Ellipsis not in inner:
         return len(value) == len(inner) and all(map(_matches, value, inner))
-    return all(_matches(one, inner[0]) for one in value)
+    return all(_matches(element, inner[0]) for element in value)
 
 
 def _matches(value: object, hint: Any) -> bool:

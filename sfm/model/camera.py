@@ -256,13 +256,16 @@ def camera_families(cameras: tuple[Camera, ...], camera: IntArray) -> tuple[tupl
         Names of the families, and the family of each camera, shape (a,).
     """
     used = np.bincount(camera, minlength=len(cameras)).tolist()
-    owners = [sorted({one.owner_of(s) for s in range(len(one.names))}) for one in cameras]
+    owners = [sorted({camera.owner_of(s) for s in range(len(camera.names))}) for camera in cameras]
     photographs: Counter[str] = Counter()
     for of_family, count in zip(owners, used, strict=True):
         photographs.update(dict.fromkeys(of_family, count))
     names = [max(of_family, key=lambda owner: photographs[owner]) for of_family in owners]
     # in files of other programs two cameras with nothing in common may have the same name
-    keys = [(name, -1 if one.shared else a) for a, (name, one) in enumerate(zip(names, cameras, strict=True))]
+    keys = [
+        (name, -1 if camera.shared else a)
+        for a, (name, camera) in enumerate(zip(names, cameras, strict=True))
+    ]
     families = list(dict.fromkeys(keys))
     return tuple(name for name, _ in families), np.array(
         [families.index(key) for key in keys], dtype=np.int64
@@ -274,7 +277,7 @@ def base_name(name: str, names: Iterable[str]) -> str:
 
     If several fit, the longest is returned.
     """
-    return max((one for one in names if f"{name} ".startswith(f"{one} ")), key=len, default="")
+    return max((shorter for shorter in names if f"{name} ".startswith(f"{shorter} ")), key=len, default="")
 
 
 def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:

@@ -204,11 +204,11 @@ def find_unit(lengths: float, rest: float) -> UnitFactor | None:
         rest: largest relative difference from the factor between two units; for a power of ten at least
             SAME_POWER is allowed.
     """
-    found: list[tuple[float, UnitFactor]] = []
+    fitting: list[tuple[float, UnitFactor]] = []
     for size, units in UNITS.items():
         most = max(rest, SAME_POWER) if size in POWERS_OF_TEN else rest
         for factor in (size, 1 / size):
             off = abs(lengths / factor - 1)
             if off < most:
-                found.append((off, UnitFactor(factor, units)))
-    return min(found, key=lambda one: one[0])[1] if found else None
+                fitting.append((off, UnitFactor(factor, units)))
+    return min(fitting, key=lambda candidate: candidate[0])[1] if fitting else None

@@ -39,11 +39,11 @@ class Mounts:
 
     def by_rig(self) -> dict[str, list[int]]:
         """Return the indices of the cameras of each rig, its reference first."""
-        found: dict[str, list[int]] = {}
+        cameras: dict[str, list[int]] = {}
         for a in np.argsort(~self.at_reference, kind="stable").tolist():
             if self.rig[a]:
-                found.setdefault(self.rig[a], []).append(a)
-        return dict(sorted(found.items(), key=lambda one: self.rig.index(one[0])))
+                cameras.setdefault(self.rig[a], []).append(a)
+        return dict(sorted(cameras.items(), key=lambda item: self.rig.index(item[0])))
 
 
 @dataclass(frozen=True, repr=False)

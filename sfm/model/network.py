@@ -468,5 +468,5 @@ def index_of(names: Sequence[str], name: object, what: str) -> int:
     try:
         return names.index(str(name))
     except ValueError:
-        some = listed(get_close_matches(str(name), names, n=MAX_NAMES) or names, most=MAX_NAMES)
-        raise UnknownNameError(f"unknown {what} '{name}', expected one of {some or 'none'}") from None
+        similar = listed(get_close_matches(str(name), names, n=MAX_NAMES) or names, most=MAX_NAMES)
+        raise UnknownNameError(f"unknown {what} '{name}', expected one of {similar or 'none'}") from None

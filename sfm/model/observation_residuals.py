@@ -64,11 +64,11 @@ class GivenResiduals:
         values = (x[rows] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(self.kind, self.coordinates, names, units, *values)
 
-    def components(self, kind: str, some: slice) -> GivenResiduals:
+    def components(self, kind: str, components: slice) -> GivenResiduals:
         """Return some of the coordinates as a separate kind."""
-        values = (x[:, some] for x in (self.given, self.difference, self.sigma, self.r, self.w))
+        values = (x[:, components] for x in (self.given, self.difference, self.sigma, self.r, self.w))
         return GivenResiduals(
-            kind, self.coordinates[some], self.names, tuple(u[some] for u in self.units), *values
+            kind, self.coordinates[components], self.names, tuple(u[components] for u in self.units), *values
         )
 
     @property
@@ -98,13 +98,13 @@ class GivenResiduals:
     @property
     def by_w(self) -> tuple[GivenValue, ...]:
         """The coordinates with a redundancy number, largest |w| first."""
-        known = [one for one in self.values if np.isfinite(one.r)]
-        return tuple(sorted(known, key=lambda one: -abs(np.nan_to_num(one.w))))
+        known = [residual for residual in self.values if np.isfinite(residual.r)]
+        return tuple(sorted(known, key=lambda residual: -abs(np.nan_to_num(residual.w))))
 
     @property
     def worst(self) -> GivenValue | None:
         """The coordinate with the largest |w|; None where nothing is checked."""
-        return next((one for one in self.by_w if np.isfinite(one.w)), None)
+        return next((residual for residual in self.by_w if np.isfinite(residual.w)), None)
 
     @property
     def table_rows(self) -> list[tuple[Any, ...]]:
@@ -112,16 +112,16 @@ class GivenResiduals:
         return [
             (
                 self.kind,
-                one.name,
-                one.coordinate,
-                one.unit,
-                one.given,
-                one.difference,
-                one.sigma,
-                one.r,
-                one.w,
+                residual.name,
+                residual.coordinate,
+                residual.unit,
+                residual.given,
+                residual.difference,
+                residual.sigma,
+                residual.r,
+                residual.w,
             )
-            for one in self.values
+            for residual in self.values
         ]
 
 

@@ -58,7 +58,7 @@ def reduce_network(
         control=kept(network.control),
         scale_bars=kept(network.scale_bars),
         exterior=kept(network.exterior),
-        observations=tuple(one for one in map(kept, network.observations) if len(one)),
+        observations=tuple(kind for kind in map(kept, network.observations) if len(kind)),
     )
     return reduced, replace(
         estimate,
@@ -124,7 +124,7 @@ def select_determined(
     """
     images, points = select_supported(network, estimate, accepted, min_points=min_points, min_rays=min_rays)
     if images.sum() < 2:
-        needed = " or ".join(str(one) for one in np.unique(min_points))
+        needed = " or ".join(str(least) for least in np.unique(min_points))
         moments = 0 if network.moment is None else int((np.bincount(network.moment) > 1).sum())
         paired = (
             f"; {counted(moments, 'moment')} may pair photographs of different moments, see [[rig]] moment"
@@ -155,8 +155,8 @@ def check_network(network: Network, estimate: Estimate) -> None:
         GeometryError: the message states what was found, where, and what was expected.
     """
     if not isinstance(network, Network) or not isinstance(estimate, Estimate):
-        found = f"{type(network).__name__} and {type(estimate).__name__}"
-        raise GeometryError(f"adjustment: {found}, expected a Network and an Estimate")
+        given = f"{type(network).__name__} and {type(estimate).__name__}"
+        raise GeometryError(f"adjustment: {given}, expected a Network and an Estimate")
     m, n = len(network.images), len(network.points)
     seen = network.image_points
     k = len(seen)
@@ -282,7 +282,7 @@ def possible_covariances(covariance: FloatArray) -> BoolArray:
     unit = np.eye(n, dtype=bool)
     mixed = np.where(unit | ~usable[:, None, None], 0.0, covariance)
     correlation = np.where(unit, 1.0, mixed * scale[:, :, None] * scale[:, None, :])
-    both = free[:, :, None] & free[:, None, :]
-    bearable = unit | (correlation == 0) | (both & (np.abs(correlation) <= CORRELATION_LIMIT))
+    pairs = free[:, :, None] & free[:, None, :]
+    bearable = unit | (correlation == 0) | (pairs & (np.abs(correlation) <= CORRELATION_LIMIT))
     regular = np.linalg.eigvalsh(correlation).min(axis=1) > n * np.finfo(float).eps
     return np.asarray(usable & bearable.all(axis=(1, 2)) & regular)

@@ -108,10 +108,10 @@ def fit_similarity(
         raise GeometryError(
             "similarity: weights that are negative, not finite or all 0, expected positive ones"
         )
-    (found,) = _fitted(source[None], target[None], w / w.sum(), scale)
-    if found is None:
+    (similarity,) = _fitted(source[None], target[None], w / w.sum(), scale)
+    if similarity is None:
         raise GeometryError("similarity: the common points lie on a line or coincide")
-    return found
+    return similarity
 
 
 def fit_similarities(source: FloatArray, target: FloatArray) -> list[Similarity | None]:
@@ -140,14 +140,14 @@ def _fitted(
     sign = np.ones_like(d)
     sign[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
     R = (U * sign[:, None]) @ Vt
-    found: list[Similarity | None] = []
+    fitted: list[Similarity | None] = []
     for k, on_line in enumerate(spread[:, 1] <= MAX_COLLINEAR_RATIO * spread[:, 0]):
         if on_line:
-            found.append(None)
+            fitted.append(None)
             continue
         factor = float((d[k] * sign[k]).sum() / (w @ (s[k] ** 2).sum(axis=1))) if scale is None else scale
-        found.append(Similarity(factor, R[k], centre_t[k] - factor * R[k] @ centre_s[k]))
-    return found
+        fitted.append(Similarity(factor, R[k], centre_t[k] - factor * R[k] @ centre_s[k]))
+    return fitted
 
 
 def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> Similarity:
@@ -168,15 +168,15 @@ def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> 
         return Similarity(1.0, np.eye(3), np.zeros(3))
     centre, size = source.mean(axis=0), float(np.ptp(source, axis=0).max())
     along = motions_along(source, motions, centre=centre, size=size)
-    whole = fit_similarity(source, target)
+    overall = fit_similarity(source, target)
     axes = _space(along[3:6])
-    turn = Rotation.from_matrix(whole.rotation)
+    turn = Rotation.from_matrix(overall.rotation)
     if axes.shape[1] == 1:
         *v, q = turn.as_quat()
         w = 2 * np.arctan2(v @ axes[:, 0], q) * axes[:, 0]
     else:
         w = axes @ axes.T @ turn.as_rotvec()
-    towards = size * np.append(w, np.log(whole.scale))
+    towards = size * np.append(w, np.log(overall.scale))
     step, A = np.linalg.lstsq(along[3:], towards, rcond=OPEN)[0], np.eye(4)
     for _ in range(MAX_STEPS):
         A = _finite_motion(along @ step, centre, size) @ A

@@ -157,16 +157,16 @@ class Solution:
         """
         if self.covariance is not None or self.joint is None:
             return self
-        some = points_kept_together(self.network.points)
+        names = points_kept_together(self.network.points)
         try:
             # a copy, so that the normal equations, the largest part of it, are freed with the copy
-            found = copy(self.joint)(some, np.zeros(0, dtype=np.int64))
+            covariance = copy(self.joint)(names, np.zeros(0, dtype=np.int64))
         except GeometryError:  # normal equations that cannot be solved give no covariance at all
             return self
-        if not np.isfinite(found).all():
+        if not np.isfinite(covariance).all():
             return self
-        every = len(some) == len(self.network.points)
-        return replace(self, covariance=found, covariance_points=None if every else some)
+        every = len(names) == len(self.network.points)
+        return replace(self, covariance=covariance, covariance_points=None if every else names)
 
     def covariance_of(self, points: Sequence[str] = (), images: Sequence[str] = ()) -> FloatArray:
         """Return the joint covariance of some points and photographs, given by name.
@@ -230,8 +230,8 @@ class Solution:
         Raises:
             UnknownNameError: no point has that name.
         """
-        found: Point = self.points[str(name)]
-        return found
+        point: Point = self.points[str(name)]
+        return point
 
     def write(self, folder: str | Path) -> Path:
         """Write the tables of the solution into a folder, whole or not at all; return points.csv.
@@ -320,12 +320,12 @@ def solution_of(result: Any, what: str) -> Solution:
     Raises:
         GeometryError: the object has no solution.
     """
-    found = getattr(result, "solution", None)
-    if not isinstance(found, Solution):
+    solution = getattr(result, "solution", None)
+    if not isinstance(solution, Solution):
         raise GeometryError(
             f"{what}: {type(result).__name__}, expected what run_survey, adjust or read_result returned"
         )
-    return found
+    return solution
 
 
 @dataclass(frozen=True)
@@ -385,7 +385,7 @@ class PointTable(Sequence[Point]):
         if isinstance(key, int | np.integer):
             return Point(self.names[key], self.xyz[key], self.covariance[key])
         if not isinstance(key, slice | np.ndarray):
-            key = [self.index(one) if isinstance(one, str) else one for one in key]
+            key = [self.index(label) if isinstance(label, str) else label for label in key]
         rows = np.arange(len(self))[key]
         names = tuple(self.names[k] for k in rows)
         return PointTable(names, self.xyz[rows], self.covariance[rows], self.rays[rows], self.unit)

@@ -113,11 +113,11 @@ class Influence:
         Scores are the derivatives, by errors, of the right-hand side of the reduced normal equations and the
         datum. Scores of all image points would take more memory than the rest of the adjustment.
         """
-        both = (2 * rows[:, None] + np.arange(2)).ravel()
-        scores, reduced = self.linear.A[both] - self.linear.B[both] @ self.through.T, len(self.H)
-        some = np.flatnonzero(np.bincount(scores.indices, minlength=reduced))
-        S = scores[:, some].toarray().reshape(len(rows), 2, len(some))
-        columns = np.concatenate([some, np.arange(reduced, len(self.unknowns))])
+        xy_rows = (2 * rows[:, None] + np.arange(2)).ravel()
+        scores, reduced = self.linear.A[xy_rows] - self.linear.B[xy_rows] @ self.through.T, len(self.H)
+        touched = np.flatnonzero(np.bincount(scores.indices, minlength=reduced))
+        S = scores[:, touched].toarray().reshape(len(rows), 2, len(touched))
+        columns = np.concatenate([touched, np.arange(reduced, len(self.unknowns))])
         return columns, np.concatenate([S, self._scores_of_datum(rows)], axis=2)
 
     def _scores_of_datum(self, rows: IntArray) -> FloatArray:
@@ -149,14 +149,14 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
     B = motions.constraints.reshape(3 * n, d)
     of_datum = (motions.on_reduced - through @ B) @ motions.inverse.T
     Q = linear.cofactor()
-    whole = np.eye(layout.reduced + d)
-    whole[: layout.reduced, : layout.reduced] = Q
-    whole[: layout.reduced, layout.reduced :] = Q @ of_datum
+    identity = np.eye(layout.reduced + d)
+    identity[: layout.reduced, : layout.reduced] = Q
+    identity[: layout.reduced, layout.reduced :] = Q @ of_datum
     return Influence(
         linear,
         through,
         motions.constraints @ motions.inverse.T,
-        whole,
+        identity,
         motions.reduced,
         motions.points.reshape(3 * n, d),
     )
@@ -188,17 +188,17 @@ class CorrelatedPart:
         place = np.full(len(self.points), -1)
         place[points] = np.arange(p)
         of_all = np.zeros((3 * p, C.shape[1]))
-        for one in _photographs(o.image, o.xy, self.relative, self.correlation, self.which):
-            rows = one.rows
+        for photograph in _photographs(o.image, o.xy, self.relative, self.correlation, self.which):
+            rows = photograph.rows
             chosen = np.flatnonzero(place[o.point[rows]] >= 0)
             if not len(chosen):
                 continue
             columns, S = influence.scores_of(rows)
             O, at = by_ray[rows[chosen]], place[o.point[rows[chosen]]]
             lines = (3 * at[:, None] + np.arange(3)).ravel()
-            KS = one.times(S, chosen)
+            KS = photograph.times(S, chosen)
             of_all[lines] += (O.transpose(0, 2, 1) @ KS).reshape(len(lines), -1) @ C[columns]
-            added[np.ix_(u + lines, u + lines)] += one.between(O, chosen)
+            added[np.ix_(u + lines, u + lines)] += photograph.between(O, chosen)
         added[u:] += of_all
         added[:, u:] += of_all.T
         return np.asarray(added)
@@ -240,15 +240,15 @@ def correlated_part(
     relative = usual_px * linear.whitening
     o, n = linear.layout.observations, len(linear.layout.point_free)
     middle, added, limiting = np.zeros((r, r)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-    for one in _photographs(o.image, o.xy, relative, correlation, which):
-        rows = one.rows
+    for photograph in _photographs(o.image, o.xy, relative, correlation, which):
+        rows = photograph.rows
         columns, S = influence.scores_of(rows)
-        KS = one.times(S)
+        KS = photograph.times(S)
         middle[np.ix_(columns, columns)] += np.tensordot(S, KS, axes=((0, 1), (0, 1)))
         j, by_ray = o.point[rows], linear.by_ray[rows].transpose(0, 2, 1)
         right = influence.unknowns[columns] @ influence.of_points((3 * j[:, None] + np.arange(3)).ravel())
         half = by_ray @ (KS @ right.reshape(len(columns), len(rows), 3).transpose(1, 0, 2))
-        alone = by_ray @ one.variances() @ by_ray.transpose(0, 2, 1)
+        alone = by_ray @ photograph.variances() @ by_ray.transpose(0, 2, 1)
         np.add.at(limiting, j, alone)
         np.add.at(added, j, half + half.transpose(0, 2, 1) + alone)
     D = influence.unknowns.T @ middle @ influence.unknowns
@@ -278,9 +278,9 @@ def correlated_sum(
         which: image points with correlated errors, (k,).
     """
     total = np.zeros((Z.shape[2], Z.shape[2]))
-    for one in _photographs(image, xy, relative, correlation, which):
-        of_photograph = Z[one.rows]
-        total += np.tensordot(of_photograph, one.times(of_photograph), axes=((0, 1), (0, 1)))
+    for photograph in _photographs(image, xy, relative, correlation, which):
+        of_photograph = Z[photograph.rows]
+        total += np.tensordot(of_photograph, photograph.times(of_photograph), axes=((0, 1), (0, 1)))
     return total
 
 
@@ -293,31 +293,31 @@ class _Photograph:
     relative: FloatArray  # G, (r, 2, 2)
     correlation: ErrorCorrelation
 
-    def times(self, Z: FloatArray, some: IntArray | None = None) -> FloatArray:
+    def times(self, Z: FloatArray, rows: IntArray | None = None) -> FloatArray:
         """Return (R - I) Z of some image points, (s, 2, u), from Z (r, 2, u); C is formed in parts."""
-        some = np.arange(len(self.rows)) if some is None else some
+        rows = np.arange(len(self.rows)) if rows is None else rows
         of_shift = (np.swapaxes(self.relative, 1, 2) @ Z).reshape(len(Z), -1)
-        parts = np.array_split(some, 1 + 8 * len(some) * len(self.xy) // BYTES_AT_ONCE)
+        parts = np.array_split(rows, 1 + 8 * len(rows) * len(self.xy) // BYTES_AT_ONCE)
         moved = np.concatenate([self.common(part, slice(None)) @ of_shift for part in parts])
-        moved = moved.reshape(len(some), *Z.shape[1:])
-        return np.asarray((self.correlation.alone - 1.0) * Z[some] + self.relative[some] @ moved)
+        moved = moved.reshape(len(rows), *Z.shape[1:])
+        return np.asarray((self.correlation.alone - 1.0) * Z[rows] + self.relative[rows] @ moved)
 
-    def between(self, O: FloatArray, some: IntArray) -> FloatArray:
+    def between(self, O: FloatArray, rows: IntArray) -> FloatArray:
         """Return O'(R - I) O for functions O of some image points, three each (s, 2, 3), as (3 s, 3 s)."""
-        of_shift = np.swapaxes(self.relative[some], 1, 2) @ O
-        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(some, some), of_shift, optimize=True)
-        each = np.arange(len(some))
+        of_shift = np.swapaxes(self.relative[rows], 1, 2) @ O
+        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(rows, rows), of_shift, optimize=True)
+        each = np.arange(len(rows))
         pairs[each, :, each] += (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
-        return np.asarray(pairs.reshape(3 * len(some), 3 * len(some)))
+        return np.asarray(pairs.reshape(3 * len(rows), 3 * len(rows)))
 
     def variances(self) -> FloatArray:
         """Return the diagonal blocks of R - I, one per image point, (r, 2, 2)."""
         together = self.correlation.common * self.relative @ np.swapaxes(self.relative, 1, 2)
         return np.asarray((self.correlation.alone - 1.0) * np.eye(2) + together)
 
-    def common(self, some: IntArray, others: IntArray | slice) -> FloatArray:
+    def common(self, rows: IntArray, others: IntArray | slice) -> FloatArray:
         """Return C between some image points and others, (s, o)."""
-        C = cdist(self.xy[some], self.xy[others])
+        C = cdist(self.xy[rows], self.xy[others])
         C /= -self.correlation.length_px
         np.exp(C, out=C)
         C *= self.correlation.common

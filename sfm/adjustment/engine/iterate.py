@@ -158,43 +158,43 @@ def iterate(
     shortest = 1.0 if method == "undamped" else MIN_STEP_SHARE
     last: Factor | None = None
     while True:
-        found = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
-        if found is None:
+        move = _solve(problem, state, weight, single=single, limit=limit, last=last, tolerance=tolerance)
+        if move is None:
             if before is None:
                 if state is first:
                     _refuse(problem, state)
                 state = first  # the damped steps have led to equations that cannot be solved
                 continue
             start, tried = before
-            whole = share == 1.0
+            is_full_step = share == 1.0
             better = _line_search(problem, start, weight, tried, share / 2, shortest)
-            if whole and better is not None and better[1] < BENT_STEP_SHARE:
+            if is_full_step and better is not None and better[1] < BENT_STEP_SHARE:
                 better = _along_valley(problem, start, weight, tried, better[1]) or better
             if better is None:  # no share of the last step leads to equations that can be solved
-                state, found = start, _solve(problem, start, weight)
+                state, move = start, _solve(problem, start, weight)
                 break
             (state, share), limit = better, np.inf
             continue
-        start_vPv = found.equations.vPv if start_vPv is None else start_vPv
-        if found.within(tolerance) or taken >= max_iterations:
+        start_vPv = move.equations.vPv if start_vPv is None else start_vPv
+        if move.within(tolerance) or taken >= max_iterations:
             break
         taken += 1
-        single = single and not found.within(FAR_TOLERANCE)
-        before, share = (state, found.move()), 1.0
-        state = step(layout, state, found.reduced, found.points)  # tested by the next normal equations
+        single = single and not move.within(FAR_TOLERANCE)
+        before, share = (state, move.move()), 1.0
+        state = step(layout, state, move.reduced, move.points)  # tested by the next normal equations
         limit = _most_allowed(before[1], share, shortest)
-        last = None if exact or not found.within(SIMPLIFIED_TOLERANCE) else found.factor
-        del found  # its memory is needed for the next step
-    if found is None:
+        last = None if exact or not move.within(SIMPLIFIED_TOLERANCE) else move.factor
+        del move  # its memory is needed for the next step
+    if move is None:
         _refuse(problem, state)
-    converged, vPv = found.within(tolerance), found.equations.vPv
+    converged, vPv = move.within(tolerance), move.equations.vPv
     if converged:
-        moved = step(layout, state, found.reduced, found.points)
+        moved = step(layout, state, move.reduced, move.points)
         reached = total(problem, moved, weight)
         if reached <= vPv * (1 + ROUNDING):
             state, vPv = moved, reached
     start_vPv = vPv if start_vPv is None else start_vPv
-    return Optimum(state, found.equations, found.factor, found.motions, converged, taken, vPv, start_vPv)
+    return Optimum(state, move.equations, move.factor, move.motions, converged, taken, vPv, start_vPv)
 
 
 def _refuse(problem: Problem, state: State) -> NoReturn:
@@ -211,11 +211,11 @@ def optimum_at(problem: Problem, state: State, weight: FloatArray) -> Optimum | 
         state: values of all parameters.
         weight: factor on the weight of each image point, (k,).
     """
-    found = _solve(problem, state, weight)
-    if found is None:
+    move = _solve(problem, state, weight)
+    if move is None:
         return None
-    vPv = found.equations.vPv
-    return Optimum(state, found.equations, found.factor, found.motions, True, 0, vPv, vPv)
+    vPv = move.equations.vPv
+    return Optimum(state, move.equations, move.factor, move.motions, True, 0, vPv, vPv)
 
 
 def _solve(
@@ -251,16 +251,16 @@ def _solve(
         return None
     try:
         if last is not None:
-            found = _step(p, equations, last, motions)
-            if found.within(tolerance):
-                return found
+            step = _step(p, equations, last, motions)
+            if step.within(tolerance):
+                return step
         for coarse in (True, False) if single else (False,):
             factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
             if factored is None:
                 continue
-            found = _step(p, equations, factored, motions)
-            if not (coarse and found.within(SINGLE_TOLERANCE)):
-                return found
+            step = _step(p, equations, factored, motions)
+            if not (coarse and step.within(SINGLE_TOLERANCE)):
+                return step
     except DivergedError:
         return None
     return None
@@ -286,14 +286,14 @@ def _approach(
     damping, growth = START_DAMPING, 2.0
     start_vPv: float | None = None
     for taken in range(max_iterations):
-        found = _solve(problem, state, weight, damping=damping, single=single)
+        move = _solve(problem, state, weight, damping=damping, single=single)
         gain = -1.0
-        if found is not None:
-            start_vPv = found.equations.vPv if start_vPv is None else start_vPv
-            if found.within(UNDAMPED_TOLERANCE):
+        if move is not None:
+            start_vPv = move.equations.vPv if start_vPv is None else start_vPv
+            if move.within(UNDAMPED_TOLERANCE):
                 return state, taken, start_vPv
-            moved = step(problem.layout, state, found.reduced, found.points)
-            gain = (found.equations.vPv - total(problem, moved, weight)) / found.predicted
+            moved = step(problem.layout, state, move.reduced, move.points)
+            gain = (move.equations.vPv - total(problem, moved, weight)) / move.predicted
         if gain > ARMIJO:
             state = moved
             damping *= max(1 / 10, 1 - (2 * gain - 1) ** 3)
@@ -319,7 +319,7 @@ def total(problem: Problem, state: State, weight: FloatArray) -> float:
 
 
 def _line_search(
-    problem: Problem, state: State, weight: FloatArray, found: Move, share: float, shortest: float
+    problem: Problem, state: State, weight: FloatArray, move: Move, share: float, shortest: float
 ) -> tuple[State, float] | None:
     """Halve a share of a step until it meets Armijo's condition; return the new state and the share.
 
@@ -327,21 +327,21 @@ def _line_search(
         problem: constants of the adjustment.
         state: start of the step.
         weight: factor on the weight of each image point, shape (k,).
-        found: the step.
+        move: the step.
         share: first share to try.
         shortest: last share to try; 1 accepts the full step without a condition, if it can be computed.
     """
     while share >= shortest:
-        moved = step(problem.layout, state, share * found.reduced, share * found.points)
+        moved = step(problem.layout, state, share * move.reduced, share * move.points)
         reached = total(problem, moved, weight)
-        if np.isfinite(reached) and reached <= _most_allowed(found, share, shortest):
+        if np.isfinite(reached) and reached <= _most_allowed(move, share, shortest):
             return moved, share
         share /= 2
     return None
 
 
 def _along_valley(
-    problem: Problem, start: State, weight: FloatArray, found: Move, straight: float
+    problem: Problem, start: State, weight: FloatArray, move: Move, straight: float
 ) -> tuple[State, float] | None:
     """Follow a bent valley along a share of a step; return the new state and the share.
 
@@ -355,12 +355,12 @@ def _along_valley(
         problem: constants of the adjustment.
         start: start of the step.
         weight: factor on the weight of each image point, shape (k,).
-        found: the step.
+        move: the step.
         straight: share of the step that can be taken straight.
     """
-    along, share = found.reduced, float(np.sqrt(straight))
-    allowed, height = _most_allowed(found, share, MIN_STEP_SHARE), np.inf
-    moved = step(problem.layout, start, share * found.reduced, share * found.points)
+    along, share = move.reduced, float(np.sqrt(straight))
+    allowed, height = _most_allowed(move, share, MIN_STEP_SHARE), np.inf
+    moved = step(problem.layout, start, share * move.reduced, share * move.points)
     for _ in range(CORRECTIONS):
         back = _solve(problem, moved, weight)
         if back is None or back.vPv > height / 2:  # the correction does not lead back
@@ -377,8 +377,8 @@ def _along_valley(
     return None
 
 
-def _most_allowed(found: Move, share: float, shortest: float) -> float:
+def _most_allowed(move: Move, share: float, shortest: float) -> float:
     """Return the largest v'Pv at which a share of a step meets Armijo's condition."""
     if shortest == 1.0:
         return np.inf
-    return found.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * found.predicted
+    return move.vPv * (1 + ROUNDING) - share * 2 * ARMIJO * move.predicted

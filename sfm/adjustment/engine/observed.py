@@ -76,21 +76,21 @@ def observed_of(
         state: values of all unknowns.
         use_control: whether control points take part.
     """
-    found = []
+    observed = []
     for index, kind in enumerate(network.kinds):
         if not len(kind) or (isinstance(kind, ObjectPoints) and not use_control):
             continue
         rows = np.flatnonzero(_takes_part(kind, layout))
         if not len(rows):
             continue
-        some = kind.select(rows)
-        together = some.weight_of_all()
-        weight = inverse_of_observed(some.covariances()) if together is None else together[None]
+        taking_part = kind.select(rows)
+        together = taking_part.weight_of_all()
+        weight = inverse_of_observed(taking_part.covariances()) if together is None else together[None]
         if weight.any():
-            taken = some.linearise(state).taken
+            taken = taking_part.linearise(state).taken
             fitted = 0 if taken is None else round(float(np.einsum("nab,nba->", weight, taken)))
-            found.append(ObservedKind(index, some, rows, weight, fitted))
-    return tuple(found)
+            observed.append(ObservedKind(index, taking_part, rows, weight, fitted))
+    return tuple(observed)
 
 
 def _takes_part(kind: Kind, layout: Unknowns) -> BoolArray:
@@ -130,38 +130,38 @@ def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
 
 def count_of(observed: tuple[ObservedKind, ...]) -> int:
     """Return the number of scalar observations other than image points."""
-    return sum(one.count for one in observed)
+    return sum(of_kind.count for of_kind in observed)
 
 
 def vPv_of(observed: tuple[ObservedKind, ...], state: State) -> float:
     """Return v'Pv of the observations other than image points."""
-    return sum(one.vPv(state) for one in observed)
+    return sum(of_kind.vPv(state) for of_kind in observed)
 
 
-def reduced_rows(one: ObservedKind, layout: Unknowns, state: State) -> Reduced:
+def reduced_rows(observed: ObservedKind, layout: Unknowns, state: State) -> Reduced:
     """Return the derivatives of observations of a kind by the reduced unknowns, including kept points.
 
     Args:
-        one: observations of one kind.
+        observed: observations of one kind.
         layout: order of the unknowns.
         state: values of all unknowns.
     """
-    linear = one.kind.linearise(state)
+    linear = observed.kind.linearise(state)
     columns, parts = [], []
-    for block, J in zip(one.kind.blocks(), linear.J, strict=True):
+    for block, J in zip(observed.kind.blocks(), linear.J, strict=True):
         at, by = _of_block(block, layout, state)
         columns.append(at)
         parts.append(J @ by)
-    found = Reduced(np.hstack(columns), np.concatenate(parts, axis=2), linear.difference)
-    return found if len(one.weight) == len(one.kind) else _together(found)
+    reduced = Reduced(np.hstack(columns), np.concatenate(parts, axis=2), linear.difference)
+    return reduced if len(observed.weight) == len(observed.kind) else _together(reduced)
 
 
-def _together(found: Reduced) -> Reduced:
+def _together(reduced: Reduced) -> Reduced:
     """Return mutually correlated observations as a single observation."""
-    n, d, u = found.J.shape
+    n, d, u = reduced.J.shape
     J = np.zeros((n, d, n, u))
-    J[np.arange(n), :, np.arange(n)] = found.J
-    return Reduced(found.columns.reshape(1, n * u), J.reshape(1, n * d, n * u), found.l.reshape(1, n * d))
+    J[np.arange(n), :, np.arange(n)] = reduced.J
+    return Reduced(reduced.columns.reshape(1, n * u), J.reshape(1, n * d, n * u), reduced.l.reshape(1, n * d))
 
 
 def _of_block(block: Block, layout: Unknowns, state: State) -> tuple[IntArray, FloatArray]:
@@ -234,22 +234,22 @@ def terms_of(
         gp: right-hand side of each object point, to add to, (n, 3).
     """
     rows, vPv = [], 0.0
-    for one in observed:
-        point = one.point
+    for of_kind in observed:
+        point = of_kind.point
         if point is not None:
-            linear = one.kind.linearise(state)
+            linear = of_kind.kind.linearise(state)
             l, J = linear.difference, linear.J[0]
-            JP = np.swapaxes(J, 1, 2) @ one.weight
+            JP = np.swapaxes(J, 1, 2) @ of_kind.weight
             np.add.at(V, point, JP @ J)
             np.add.at(gp, point, np.einsum("nud,nd->nu", JP, l))
         else:
-            found = reduced_rows(one, layout, state)
-            l = found.l
-            rows.append((found, np.swapaxes(found.J, 1, 2) @ one.weight))
-        vPv += float(np.einsum("na,nab,nb->", l, one.weight, l))
+            reduced = reduced_rows(of_kind, layout, state)
+            l = reduced.l
+            rows.append((reduced, np.swapaxes(reduced.J, 1, 2) @ of_kind.weight))
+        vPv += float(np.einsum("na,nab,nb->", l, of_kind.weight, l))
     return Terms(tuple(rows), vPv)
 
 
 def couples_poses(observed: tuple[ObservedKind, ...]) -> bool:
     """Return whether any observations depend on two photographs each, which requires a full matrix."""
-    return any(sum(block.of == PHOTOGRAPH for block in one.kind.blocks()) > 1 for one in observed)
+    return any(sum(block.of == PHOTOGRAPH for block in of_kind.kind.blocks()) > 1 for of_kind in observed)

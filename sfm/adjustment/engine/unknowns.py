@@ -433,14 +433,14 @@ def _hold_undetermined(
 
 def _coupled_points(network: Network, point_on: BoolArray) -> IntArray:
     """Return the points that take part and that observations couple with other unknowns, (s,)."""
-    found = [np.zeros(0, dtype=np.int64)]
+    coupled = [np.zeros(0, dtype=np.int64)]
     for kind in network.kinds:
         blocks = kind.blocks()
         if len(kind) and len(blocks) > 1:
             of_points = [block.at for block in blocks if block.of == POINT]
             on = np.logical_and.reduce([point_on[index] for index in of_points])
-            found += [index[on] for index in of_points]
-    return np.unique(np.concatenate(found))
+            coupled += [index[on] for index in of_points]
+    return np.unique(np.concatenate(coupled))
 
 
 def _rigs_of(network: Network, estimate: Estimate) -> tuple[IntArray, int, Mounts, BoolArray]:

@@ -88,7 +88,11 @@ def consistency_of(adjustment: Adjustment) -> Consistency:
     rays = parts.rows_of_points(adjustment)
     of_point = zip(adjustment.network.points, adjustment.covariance.points, strict=True)
     fixed = {name for name, covariance in of_point if not covariance.any()}
-    doubtful = tuple(one for one in doubtful_points(adjustment, parts, rays) if one.point not in fixed)
+    doubtful = tuple(
+        doubtful_point
+        for doubtful_point in doubtful_points(adjustment, parts, rays)
+        if doubtful_point.point not in fixed
+    )
     level = adjustment.levels.family
     large, outlying, tested = _large(adjustment, parts, rays, level)
     uneven = _uneven(by_photograph(adjustment), level)
@@ -234,7 +238,7 @@ def doubtful_points(
     """
     images, seen = adjustment.network.images, adjustment.network.image_points
     limit = float(chi2_isf(adjustment.levels.question, 1))
-    found = []
+    doubtful = []
     for j in np.unique(seen.point[adjustment.rejected]).tolist():
         rows = rows_of[j]
         out, kept = rows[adjustment.rejected[rows]], rows[~adjustment.rejected[rows]]
@@ -252,8 +256,8 @@ def doubtful_points(
             and _moved(parts, kept, np.append(kept[kept != instead], r)) > EXPECTED_SIGMAS
         ):
             names = images[seen.image[r]], images[seen.image[instead]]
-            found.append(DoubtfulPoint(adjustment.network.points[j], *names, left, other))
-    return tuple(sorted(found, key=lambda one: one.other - one.misfit))
+            doubtful.append(DoubtfulPoint(adjustment.network.points[j], *names, left, other))
+    return tuple(sorted(doubtful, key=lambda doubtful_point: doubtful_point.other - doubtful_point.misfit))
 
 
 def _moved(parts: PointNormals, kept: IntArray, other: IntArray) -> float:
@@ -282,10 +286,10 @@ class PointNormals:
             groups: which image points are in each group, (g, m).
             rows: image points of one object point, (m,).
         """
-        some = groups.astype(float)
-        N, b = np.tensordot(some, self.N[rows], 1), some @ self.b[rows]
+        weights = groups.astype(float)
+        N, b = np.tensordot(weights, self.N[rows], 1), weights @ self.b[rows]
         fitted = np.einsum("gi,gij,gj->g", b, np.linalg.pinv(N, hermitian=True), b)
-        return np.asarray(some @ self.q[rows] - fitted)
+        return np.asarray(weights @ self.q[rows] - fitted)
 
     def intersections(
         self, rows: IntArray, point: IntArray, count: int

@@ -126,7 +126,7 @@ def strong_correlations(
     if not correlations.rho.size:
         return ()
     images = correlations.images
-    found = []
+    reported = []
     for c, (parameter, camera) in enumerate(correlations.parameters):
         size = np.abs(correlations.rho[:, :, c])
         strong = size > limit
@@ -134,12 +134,12 @@ def strong_correlations(
             continue
         i, p = np.unravel_index(int(np.argmax(size)), size.shape)
         counts = tuple((part, int(n)) for part, n in zip(PARTS, strong.sum(axis=0), strict=True) if n)
-        found.append(
+        reported.append(
             OrientationCorrelation(
                 f"{parameter} of {camera}", float(correlations.rho[i, p, c]), PARTS[p], images[i], counts
             )
         )
-    return tuple(sorted(found, key=lambda one: -abs(one.largest)))
+    return tuple(sorted(reported, key=lambda correlation: -abs(correlation.largest)))
 
 
 def _correlations(adjustment: Adjustment) -> tuple[list[tuple[str, str]], FloatArray]:
@@ -194,8 +194,8 @@ def _correlation_of(
     cells = [_cells(o.image, o.xy, used, size / 2.0**n) for n in range(1, HALVINGS + 1)]
     v = linear.whitening @ adjustment.residuals[m.layout.order][:, :, None]
     v[~used] = 0.0
-    found = _squares(v, cells)
-    count = np.array([used.sum(), *(one.shape[0] for one in cells)])
+    squares = _squares(v, cells)
+    count = np.array([used.sum(), *(cell.shape[0] for cell in cells)])
     rng = np.random.default_rng(0)
 
     def left_of(errors: FloatArray) -> FloatArray:
@@ -208,10 +208,10 @@ def _correlation_of(
     best, least = None, np.inf
     for length in size / 2.0 ** np.arange(HALVINGS):
         common = left_of(relative @ _fields(o.image, o.xy, length, rng))
-        expected = found
+        expected = squares
         for _ in range(ROUNDS):
             sigma = expected / np.sqrt(count)  # for the sum of squares of `count` pairs x, y
-            parts, misfit = nnls(np.column_stack([alone, common]) / sigma[:, None], found / sigma)
+            parts, misfit = nnls(np.column_stack([alone, common]) / sigma[:, None], squares / sigma)
             expected = parts[0] * alone + parts[1] * common
         if misfit < least:
             best, least = (parts / adjustment.sigma0**2, length), misfit
@@ -245,8 +245,8 @@ def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0)
     several directions.
     """
     m, linear, used = _correlating(adjustment)
-    found = _correlation_of(adjustment, m, linear, used)
-    if found is None:
+    correlation = _correlation_of(adjustment, m, linear, used)
+    if correlation is None:
         return 1.0
     o, rng = m.layout.observations, np.random.default_rng(0)
 
@@ -259,8 +259,8 @@ def design_effect_of_neighbours(adjustment: Adjustment, *, density: float = 1.0)
 
     alone = of_shared(rng.standard_normal((len(used), 2, DRAWS)))
     relative = adjustment.usual_px * linear.whitening
-    common = of_shared(relative @ _fields(o.image, o.xy, found.length_px, rng))
-    return max(found.alone + found.common * density * common / alone, 1.0) if alone > 0 else 1.0
+    common = of_shared(relative @ _fields(o.image, o.xy, correlation.length_px, rng))
+    return max(correlation.alone + correlation.common * density * common / alone, 1.0) if alone > 0 else 1.0
 
 
 @checked_arguments()
@@ -270,8 +270,8 @@ def with_neighbours(adjustment: Adjustment) -> Adjustment:
     Args:
         adjustment: finished adjustment.
     """
-    found = estimate_error_correlation(adjustment)
-    return adjustment if found is None else with_error_correlation(adjustment, found)
+    correlation = estimate_error_correlation(adjustment)
+    return adjustment if correlation is None else with_error_correlation(adjustment, correlation)
 
 
 def _cells(image: IntArray, xy: FloatArray, used: BoolArray, side_px: float) -> csr_matrix:
@@ -285,7 +285,7 @@ def _squares(v: FloatArray, cells: list[csr_matrix]) -> FloatArray:
     """Return the sums of squares of residuals, and of their sums over cells of each size, per draw."""
     v = v.reshape(cells[0].shape[1], -1)
     draws = v.shape[1] / 2
-    return np.array([float((v**2).sum()), *(float(((one @ v) ** 2).sum()) for one in cells)]) / draws
+    return np.array([float((v**2).sum()), *(float(((cell @ v) ** 2).sum()) for cell in cells)]) / draws
 
 
 def _fields(image: IntArray, xy: FloatArray, length_px: float, rng: np.random.Generator) -> FloatArray:

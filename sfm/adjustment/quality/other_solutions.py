@@ -89,23 +89,26 @@ def other_solutions(
         return ()
     limit = 1 + _allowed(base, a.levels.question) / base.vPv
     result = _Place(a)
-    found: list[OtherSolution] = []
+    others: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
-    for candidate in sorted(tried, key=lambda one: one.vPv):
+    for candidate in sorted(tried, key=lambda candidate: candidate.vPv):
         if _impossible(candidate.estimate, result.adjustment.estimate):
             continue
-        known = any(result.distance(candidate.estimate, one.estimate) < MIN_APART_SIGMAS for one in found)
+        known = any(
+            result.distance(candidate.estimate, known_solution.estimate) < MIN_APART_SIGMAS
+            for known_solution in others
+        )
         if candidate.vPv > base.vPv * limit or known:
             continue
-        one = result.describe(candidate.estimate, candidate.vPv / base.vPv)
-        if one.moved > MIN_APART_SIGMAS:
-            found.append(one)
-    if found and found[0].vPv < 1:
-        best = _with_c_freed(found[0].estimate, had_to_be_held)
+        described = result.describe(candidate.estimate, candidate.vPv / base.vPv)
+        if described.moved > MIN_APART_SIGMAS:
+            others.append(described)
+    if others and others[0].vPv < 1:
+        best = _with_c_freed(others[0].estimate, had_to_be_held)
         ended = search.adjusted(best, tolerance=TOLERANCE)
         if ended is not None and ended.converged:
-            found[0] = replace(found[0], estimate=ended.estimate, converges=True)
-    return tuple(found)
+            others[0] = replace(others[0], estimate=ended.estimate, converges=True)
+    return tuple(others)
 
 
 def _allowed(base: Adjustment, level: float) -> float:
@@ -137,7 +140,8 @@ def _impossible(other: Estimate, result: Estimate) -> bool:
     """
     pairs = zip(other.cameras, result.cameras, strict=True)
     return any(
-        one.free[one.parts[1]].any() and _is_beyond(one) and not _is_beyond(ours) for one, ours in pairs
+        theirs.free[theirs.parts[1]].any() and _is_beyond(theirs) and not _is_beyond(ours)
+        for theirs, ours in pairs
     )
 
 
@@ -169,7 +173,7 @@ class _Search:
         The damped method follows if it does not converge.
         """
         cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
-        found: list[Adjustment] = []
+        adjusted: list[Adjustment] = []
         for method in ("gauss-newton", "levenberg-marquardt"):
             try:
                 a = adjust(
@@ -189,28 +193,28 @@ class _Search:
                 continue
             if a.converged:
                 return a
-            found.append(a)
-        return min(found, key=lambda one: one.vPv, default=None)
+            adjusted.append(a)
+        return min(adjusted, key=lambda adjustment: adjustment.vPv, default=None)
 
     def candidates(
         self, result: Estimate, others: tuple[Estimate, ...], vPv: float, limit: float, *, follow_c: bool
     ) -> Iterator[_Candidate]:
         """Yield solutions of similar v'Pv along c, and minima beyond them."""
         free = [camera.free for camera in result.cameras]
-        steps = STEPS if follow_c or any(one[0] for one in free) else 0
+        steps = STEPS if follow_c or any(flags[0] for flags in free) else 0
         starts = [result, *others]
         if self.datum.kind != "control":
             starts.append(reverse_depth(result))
         for start in starts:
             for direction in (STEP, 1 / STEP) if steps else (1.0,):
                 track = self._along(start, direction, steps, vPv)
-                heights = [one.vPv for one in track]
-                for k, one in enumerate(track):
+                heights = [point.vPv for point in track]
+                for k, point in enumerate(track):
                     lower = heights[k] <= min(heights[max(k - 1, 0) : k + 2])
-                    if one.vPv <= limit * vPv:
-                        yield _Candidate(_with_free(one.estimate, free), one.vPv)
+                    if point.vPv <= limit * vPv:
+                        yield _Candidate(_with_free(point.estimate, free), point.vPv)
                     if lower and (k or start is not result):
-                        ended = self.adjusted(_with_free(one.estimate, free))
+                        ended = self.adjusted(_with_free(point.estimate, free))
                         if ended is not None and ended.converged:
                             yield _Candidate(_with_free(ended.estimate, free), ended.vPv)
 
@@ -226,13 +230,17 @@ class _Search:
             starts = (scale_estimate(estimate, factor), scale_estimate(start, factor**k))[: min(k, 2)] or (
                 start,
             )
-            ended = [self.adjusted(one, held=steps > 0) for one in starts]
-            found = min((one for one in ended if one is not None), key=lambda one: one.vPv, default=None)
-            if found is None:
+            ended = [self.adjusted(start, held=steps > 0) for start in starts]
+            lowest = min(
+                (adjustment for adjustment in ended if adjustment is not None),
+                key=lambda adjustment: adjustment.vPv,
+                default=None,
+            )
+            if lowest is None:
                 break
-            estimate = found.estimate
-            track.append(_Candidate(estimate, found.vPv))
-            if found.vPv > BARRIER * vPv:
+            estimate = lowest.estimate
+            track.append(_Candidate(estimate, lowest.vPv))
+            if lowest.vPv > BARRIER * vPv:
                 break
         return track
 
@@ -254,7 +262,7 @@ def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:
     """Return the estimate with the given parameters of its cameras free."""
-    cameras = tuple(replace(one, free=freed) for one, freed in zip(estimate.cameras, free, strict=True))
+    cameras = tuple(replace(camera, free=freed) for camera, freed in zip(estimate.cameras, free, strict=True))
     return replace(estimate, cameras=cameras)
 
 
@@ -297,9 +305,9 @@ class _Place:
             converges=False,
         )
 
-    def distance(self, one: Estimate, other: Estimate) -> float:
+    def distance(self, first: Estimate, other: Estimate) -> float:
         """Return the RMS difference of the points of two solutions, in standard deviations of the result."""
-        return _apart(one.points, other.points, self._sigma)
+        return _apart(first.points, other.points, self._sigma)
 
     @cached_property
     def _sigma(self) -> FloatArray:
@@ -310,7 +318,7 @@ class _Place:
     def _number(self) -> int:
         """The first camera with free c, otherwise the first camera."""
         cameras = self.adjustment.estimate.cameras
-        return next((k for k, one in enumerate(cameras) if one.free[one.parts[0]].any()), 0)
+        return next((k for k, camera in enumerate(cameras) if camera.free[camera.parts[0]].any()), 0)
 
 
 def _apart(points: FloatArray, others: FloatArray, sigma: FloatArray) -> float:

@@ -36,8 +36,8 @@ def rank_defect(optimum: Optimum, layout: Unknowns) -> int:
         optimum: undamped normal equations and their factor.
         layout: order of the unknowns.
     """
-    found = null_motions(optimum, layout) + optimum.motions.further
-    return found + int(optimum.equations.blocks.held.sum()) + layout.held_defect
+    motions = null_motions(optimum, layout) + optimum.motions.further
+    return motions + int(optimum.equations.blocks.held.sum()) + layout.held_defect
 
 
 def null_motions(optimum: Optimum, layout: Unknowns) -> int:

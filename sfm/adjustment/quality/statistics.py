@@ -332,15 +332,15 @@ def correlations(
         adjustment: finished adjustment.
         limit: absolute correlation above which a pair is reported.
     """
-    found = []
+    strong = []
     for camera, Q in zip(adjustment.estimate.cameras, adjustment.covariance.interior, strict=True):
         free = _free(camera, Q)
         names = [f"{camera.names[s]} of camera {camera.owner_of(s)}" for s in free]
-        found += _strong(Q, names, limit)
+        strong += _strong(Q, names, limit)
     parts = ("X0", "Y0", "Z0", "omega", "phi", "kappa")
     for image, Q in zip(adjustment.network.images, adjustment.covariance.exterior, strict=True):
-        found += _strong(Q, [f"{part} of photograph {image}" for part in parts], limit)
-    once = {(pair.first, pair.second): pair for pair in found}  # every camera repeats shared parameters
+        strong += _strong(Q, [f"{part} of photograph {image}" for part in parts], limit)
+    once = {(pair.first, pair.second): pair for pair in strong}  # every camera repeats shared parameters
     return tuple(sorted(once.values(), key=lambda pair: -abs(pair.value)))
 
 
@@ -424,31 +424,33 @@ def standardised_of_given(
 
 
 def residuals_of_observed(
-    one: ObservedKind, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
+    observed: ObservedKind, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
 ) -> ObservedResiduals:
     """Return the residuals of observations of a kind, with their redundancy numbers and tests.
 
     Args:
-        one: observations of one kind.
+        observed: observations of one kind.
         layout: order of the unknowns.
         optimum: undamped normal equations and their factor.
         cofactors: cofactors at the optimum; without them redundancy numbers and tests are NaN.
     """
-    linear = one.kind.linearise(optimum.state)
+    linear = observed.kind.linearise(optimum.state)
     shape = linear.difference.shape
-    l = linear.difference.reshape(one.weight.shape[:2])
-    vPv = float(np.einsum("na,nab,nb->", l, one.weight, l))
+    l = linear.difference.reshape(observed.weight.shape[:2])
+    vPv = float(np.einsum("na,nab,nb->", l, observed.weight, l))
     r, w, redundancy = np.full(shape, np.nan), np.full(shape, np.nan), float("nan")
     if cofactors is not None:
-        if one.point is not None:
-            Q = linear.J[0] @ cofactors.points[one.point] @ np.swapaxes(linear.J[0], 1, 2)
+        if observed.point is not None:
+            Q = linear.J[0] @ cofactors.points[observed.point] @ np.swapaxes(linear.J[0], 1, 2)
         else:
-            Q = _cofactors_of(reduced_rows(one, layout, optimum.state), optimum, cofactors)
+            Q = _cofactors_of(reduced_rows(observed, layout, optimum.state), optimum, cofactors)
         if linear.taken is not None:
             Q = Q + linear.taken
-        w, r = (part.reshape(shape) for part in standardised_of_given(l, one.weight, Q))
-        redundancy = float(one.components.sum() - np.einsum("nab,nba->", one.weight, Q))
-    return ObservedResiduals(one.index, one.rows, linear.difference, r, w, one.count, vPv, redundancy)
+        w, r = (part.reshape(shape) for part in standardised_of_given(l, observed.weight, Q))
+        redundancy = float(observed.components.sum() - np.einsum("nab,nba->", observed.weight, Q))
+    return ObservedResiduals(
+        observed.index, observed.rows, linear.difference, r, w, observed.count, vPv, redundancy
+    )
 
 
 def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> FloatArray:
@@ -459,12 +461,12 @@ def _cofactors_of(rows: Reduced, optimum: Optimum, cofactors: Cofactors) -> Floa
     pose = np.where(outer, columns // 6, -1)
     lone = pose.max(axis=1, initial=-1)
     if (outer & (pose != lone[:, None])).any():  # several poses in one observation
-        found = np.empty((n, d, d))
+        cofactors_of_rows = np.empty((n, d, d))
         for row in range(n):
             right = np.zeros((d, len(optimum.equations.parts.scale)))
             np.add.at(right, (np.arange(d)[:, None], columns[row]), J[row])
-            found[row] = right @ optimum.factor.solve(right.T)
-        return found
+            cofactors_of_rows[row] = right @ optimum.factor.solve(right.T)
+        return cofactors_of_rows
     Q = np.zeros((n, u, u))
     inner, part = np.where(outer, 0, columns - 6 * poses), np.where(outer, columns % 6, 0)
     r, c = outer[:, :, None], outer[:, None]

@@ -104,7 +104,7 @@ def by_source(adjustment: Adjustment) -> VarianceComponents:
         adjustment: finished adjustment.
     """
     network = adjustment.network
-    return variance_components(adjustment, network.source, tuple(one.name for one in network.sources))
+    return variance_components(adjustment, network.source, tuple(source.name for source in network.sources))
 
 
 def by_kind(adjustment: Adjustment) -> VarianceComponents:
@@ -117,15 +117,17 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
         adjustment: finished adjustment.
     """
     a, network = adjustment, adjustment.network
-    whole = np.zeros(len(a.rejected), dtype=np.int64)
-    image = _components(a, network.image_points.covariance, whole, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
-    found: dict[str, FloatArray] = {}
-    for one in a.observed:
-        name = network.kinds[one.index].name
-        found[name] = found.get(name, np.zeros(3)) + np.array([one.vPv, one.redundancy, one.count])
-    vPv, redundancies, count = np.array(list(found.values())).reshape(-1, 3).T
+    groups = np.zeros(len(a.rejected), dtype=np.int64)
+    image = _components(a, network.image_points.covariance, groups, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
+    squares: dict[str, FloatArray] = {}
+    for of_kind in a.observed:
+        name = network.kinds[of_kind.index].name
+        squares[name] = squares.get(name, np.zeros(3)) + np.array(
+            [of_kind.vPv, of_kind.redundancy, of_kind.count]
+        )
+    vPv, redundancies, count = np.array(list(squares.values())).reshape(-1, 3).T
     return VarianceComponents(
-        (IMAGE_POINTS, *found),
+        (IMAGE_POINTS, *squares),
         np.concatenate([image.sigma0, _root_ratio(vPv, redundancies, FEW_OF_A_KIND)]),
         np.concatenate([image.redundancy, redundancies]),
         np.concatenate([image.count, count.astype(np.int64)]),
@@ -173,13 +175,13 @@ def estimate_components(
     least = np.array([least_factor(float(np.median(stated[group == g]))) for g in range(len(names))])
     tried, rejected = [factor], [adjustment.rejected]
     for _ in range(MAX_ROUNDS):
-        found = _components(adjustment, adjustment.image_covariance, group, names, few=MIN_REDUNDANCY).sigma0
-        found = np.where(np.isfinite(found) & (found > 0), found, 1.0)
-        found = np.maximum(found, least / factor)
-        if np.abs(found - 1).max() <= LAST_CHANGE:
+        sigma0 = _components(adjustment, adjustment.image_covariance, group, names, few=MIN_REDUNDANCY).sigma0
+        sigma0 = np.where(np.isfinite(sigma0) & (sigma0 > 0), sigma0, 1.0)
+        sigma0 = np.maximum(sigma0, least / factor)
+        if np.abs(sigma0 - 1).max() <= LAST_CHANGE:
             at_least = (factor <= least).any() and adjustment.sigma0 < 1
             return _as_weighted(adjustment) if at_least else adjustment, factor, True
-        factor = factor * found
+        factor = factor * sigma0
         first = _cycle_start(tried, rejected, factor)
         if first is not None:
             chosen = min(range(first, len(tried)), key=lambda at: int(rejected[at].sum()))
@@ -224,8 +226,8 @@ def estimate_common_part(
         Pv = np.einsum("kab,kb->ka", P, adjustment.residuals[used])
         redundancy = adjustment.redundancy_numbers[used].mean(axis=1)
         S = np.einsum("k,pkab,qkba->pq", redundancy, PV, PV)
-        found = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
-        before, squares = squares, _solve_nonnegative(S, found)
+        scores = np.einsum("ka,pkab,kb->p", Pv, parts[:, used], Pv)
+        before, squares = squares, _solve_nonnegative(S, scores)
         change = np.sqrt(_median_trace(squares, parts) / _median_trace(before, parts)) - 1
         share = squares[1] / _median_trace(squares, parts) - before[1] / _median_trace(before, parts)
         if max(abs(change), abs(share)) <= LAST_CHANGE_OF_PARTS:
@@ -234,12 +236,12 @@ def estimate_common_part(
     return factor, max(common, MIN_SIGMA_PX)
 
 
-def _solve_nonnegative(S: FloatArray, found: FloatArray) -> FloatArray:
+def _solve_nonnegative(S: FloatArray, solution: FloatArray) -> FloatArray:
     """Return the solution of two normal equations, (2,), with 0 instead of a negative value."""
-    squares = np.linalg.solve(S, found)
-    for one, other in ((0, 1), (1, 0)):
-        if squares[one] < 0:
-            squares[one], squares[other] = 0.0, found[other] / S[other, other]
+    squares = np.linalg.solve(S, solution)
+    for on, other in ((0, 1), (1, 0)):
+        if squares[on] < 0:
+            squares[on], squares[other] = 0.0, solution[other] / S[other, other]
     return np.asarray(squares)
 
 
@@ -266,7 +268,7 @@ def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: Flo
     All rounds start from the same values, so the same factors lead to the same adjustments again.
     """
     for at in reversed(range(len(tried))):
-        others = any(not np.array_equal(rejected[at], one) for one in rejected[at + 1 :])
+        others = any(not np.array_equal(rejected[at], earlier) for earlier in rejected[at + 1 :])
         if others and np.abs(factor / tried[at] - 1).max() <= LAST_CHANGE:
             return at
     return None

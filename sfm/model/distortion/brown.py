@@ -256,8 +256,18 @@ def to_balanced(values: Values, R0: float) -> Values:
     if not (slope > 0 and s > 0):
         raise GeometryError(f"the radial distortion cannot be balanced at R0 = {R0:g} mm")
     A = [p[f"K{i}"] * s ** (2 * i + 1) for i in (1, 2, 3)]
-    found = (p["c"] / s, p["x0"], p["y0"], *A, R0, p["P1"] * s**2, p["P2"] * s**2, p["b1"] * s, p["b2"] * s)
-    return tuple(zip(BALANCED, found, strict=True))
+    balanced = (
+        p["c"] / s,
+        p["x0"],
+        p["y0"],
+        *A,
+        R0,
+        p["P1"] * s**2,
+        p["P2"] * s**2,
+        p["b1"] * s,
+        p["b2"] * s,
+    )
+    return tuple(zip(BALANCED, balanced, strict=True))
 
 
 def brown_by_balanced(values: Values) -> FloatArray:

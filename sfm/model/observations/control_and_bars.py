@@ -160,9 +160,9 @@ class InteriorObservations(Kind):
 
     def weight_of(self, rows: IntArray) -> FloatArray:
         """Return the inverse covariance of the parameters in some rows, (r, r)."""
-        some = self.select(rows)
-        together = some.weight_of_all()
-        return np.diag(1 / some.sigma**2) if together is None else together
+        selected = self.select(rows)
+        together = selected.weight_of_all()
+        return np.diag(1 / selected.sigma**2) if together is None else together
 
 
 @dataclass(frozen=True)

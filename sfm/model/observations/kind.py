@@ -258,9 +258,9 @@ class CoordinateKind(Kind):
 
     def with_coordinate_covariance(self, covariance: FloatArray) -> Self:
         """Return the observations with another covariance of X, Y, Z, object unit^2, (n, 3, 3)."""
-        whole = self.covariances().copy()
-        whole[:, :3, :3] = covariance
-        return self.with_covariance(whole)
+        covariance_of_all = self.covariances().copy()
+        covariance_of_all[:, :3, :3] = covariance
+        return self.with_covariance(covariance_of_all)
 
     def reordered(self, order: IntArray) -> Self:
         """Return the observations with the values of others, for example of exchanged names, (n,)."""
@@ -293,14 +293,14 @@ class TableKind(Kind):
     def mistakes(self) -> Mapping[str, Self]:
         """Return the observations in other units; some kinds add further mistakes."""
         turned = np.array([name in self.angles for name in self.components])
-        found: dict[str, Self] = {}
+        corrected: dict[str, Self] = {}
         for units, scaled in ((UNITS_OF_LENGTHS, ~turned), (UNITS_OF_ANGLES, turned)):
             for name, factor in (units if scaled.any() else {}).items():
                 by = np.where(scaled, factor, 1.0)
                 values = self.values * np.resize(by, self.values.shape)
                 sigma = self.sigma * np.resize(by, self.sigma.shape)
-                found[name] = self.with_values(values).with_sigma(sigma)
-        return found
+                corrected[name] = self.with_values(values).with_sigma(sigma)
+        return corrected
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:

@@ -130,8 +130,8 @@ class Lines(Group):
     def axes(cls, X: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the direction of the least-squares line, (3,), and two axes across it, (2, 3)."""
         away = X - (X * w[:, None]).sum(axis=0) / w.sum()
-        found = np.linalg.svd(away * np.sqrt(w)[:, None], full_matrices=False)[2]
-        return found[0], found[1:]
+        directions = np.linalg.svd(away * np.sqrt(w)[:, None], full_matrices=False)[2]
+        return directions[0], directions[1:]
 
     @classmethod
     def columns(cls) -> tuple[str, ...]:

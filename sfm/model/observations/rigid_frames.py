@@ -105,8 +105,8 @@ class RigidFrames(Group):
             local: R'(X - t), (p, 3).
         """
         shift = np.tile(-np.eye(3), (len(local), 1, 1))
-        found = skew(local - self.value.mean(axis=0))
-        turn, about = (found @ axes.T @ axes for axes in self._axes)
+        moments = skew(local - self.value.mean(axis=0))
+        turn, about = (moments @ axes.T @ axes for axes in self._axes)
         return np.concatenate([shift, turn], axis=2), about
 
     @cached_property

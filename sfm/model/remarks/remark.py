@@ -195,8 +195,8 @@ class Remark:
 
     def number(self, name: str) -> float:
         """Return the value of a number, or NaN if the remark has no number of that name."""
-        found = self.numbers.get(name)
-        return math.nan if found is None else found.value
+        quantity = self.numbers.get(name)
+        return math.nan if quantity is None else quantity.value
 
     def names(self, role: str) -> tuple[str, ...]:
         """Return the names of the subjects of a role; an empty tuple if the remark has no such role."""
@@ -216,8 +216,11 @@ class Remark:
             **texts,
             "subjects": {role: list(names) for role, names in self.subjects.items()},
             "numbers": {
-                name: {"value": one.value if math.isfinite(one.value) else None, "unit": one.unit}
-                for name, one in self.numbers.items()
+                name: {
+                    "value": quantity.value if math.isfinite(quantity.value) else None,
+                    "unit": quantity.unit,
+                }
+                for name, quantity in self.numbers.items()
             },
         }
 
@@ -255,19 +258,19 @@ def remark(kind: str, **parts: str | Iterable[str] | float | tuple[float, str] |
     return Remark(kind, subjects, numbers)
 
 
-def unless_note(one: Remark) -> tuple[Remark, ...]:
+def unless_note(said: Remark) -> tuple[Remark, ...]:
     """Return the remark in a tuple if it is more serious than a note, else an empty tuple."""
-    return () if one.severity == "note" else (one,)
+    return () if said.severity == "note" else (said,)
 
 
 def of_kind(remarks: Iterable[Remark], *kinds: str) -> tuple[Remark, ...]:
     """Return the remarks of the given kinds, in their order."""
-    return tuple(one for one in remarks if one.kind in kinds)
+    return tuple(said for said in remarks if said.kind in kinds)
 
 
 def kinds_of(remarks: Iterable[Remark]) -> tuple[str, ...]:
     """Return the kind of each remark, in their order."""
-    return tuple(one.kind for one in remarks)
+    return tuple(said.kind for said in remarks)
 
 
 @dataclass(frozen=True)
@@ -280,14 +283,14 @@ class Grade:
     also: Grade | None = None  # of another number, if there is one; the more serious severity counts
     at_most: Grade | None = None  # grade of another number; the less serious severity counts
 
-    def severity_of(self, one: Remark) -> Severity:
+    def severity_of(self, said: Remark) -> Severity:
         """Return the severity of a remark."""
-        found = self.of(one.number(self.number))
+        severity = self.of(said.number(self.number))
         if self.at_most is not None:
-            found = max(found, self.at_most.severity_of(one), key=SEVERITIES.index)
-        if self.also is not None and self.also.number in one.numbers:
-            found = min(found, self.also.severity_of(one), key=SEVERITIES.index)
-        return found
+            severity = max(severity, self.at_most.severity_of(said), key=SEVERITIES.index)
+        if self.also is not None and self.also.number in said.numbers:
+            severity = min(severity, self.also.severity_of(said), key=SEVERITIES.index)
+        return severity
 
     def of(self, value: float) -> Severity:
         """Return the severity of a value; NaN has the worst severity of this grade."""
@@ -304,9 +307,9 @@ class Unless:
     severity: Severity
     named: Severity
 
-    def severity_of(self, one: Remark) -> Severity:
+    def severity_of(self, said: Remark) -> Severity:
         """Return the severity of a remark."""
-        known = any(one.names(part) or part in one.numbers for part in self.parts)
+        known = any(said.names(part) or part in said.numbers for part in self.parts)
         return self.named if known else self.severity
 
 
@@ -316,27 +319,27 @@ class Row:
 
     name: str
 
-    def write(self, text: str, one: Remark) -> str:
+    def write(self, text: str, said: Remark) -> str:
         """Fill the fields of a text with the parts of a remark.
 
         Args:
             text: text of this row.
-            one: the remark.
+            said: the remark.
 
         Raises:
             KeyError: a part that is not optional is missing.
         """
-        stated: dict[str, tuple[str, ...] | Quantity] = {**one.subjects, **one.numbers}
-        parts = {**stated, **_readable(one.numbers)}
+        stated: dict[str, tuple[str, ...] | Quantity] = {**said.subjects, **said.numbers}
+        parts = {**stated, **_readable(said.numbers)}
 
-        def optional(found: re.Match[str]) -> str:
-            inner = found.group(1)
+        def optional(match: re.Match[str]) -> str:
+            inner = match.group(1)
             return inner if all(name in parts for name, _ in FIELD.findall(inner)) else ""
 
         text = OPTIONAL.sub(optional, text)
 
-        def field(found: re.Match[str]) -> str:
-            name, spec = found.group(1), found.group(2) or ""
+        def field(match: re.Match[str]) -> str:
+            name, spec = match.group(1), match.group(2) or ""
             # decimals refer to the stored unit
             return _written(stated if spec.startswith(".") else parts, name, spec)
 
@@ -368,25 +371,25 @@ class Kind(Row):
         """Names of the parts in the sentence."""
         return frozenset(name for name, _ in FIELD.findall(self.sentence))
 
-    def severity_of(self, one: Remark) -> Severity:
+    def severity_of(self, said: Remark) -> Severity:
         """Return the severity of a remark of this kind."""
         if isinstance(self.severity, str):
             return self.severity
-        return self.severity.severity_of(one)
+        return self.severity.severity_of(said)
 
 
 def _readable(numbers: Mapping[str, Quantity]) -> dict[str, Quantity]:
     """Return the numbers with lengths in a finer metric unit if their largest value reads better in it."""
     largest: dict[str, float] = {}
-    for one in numbers.values():
-        if one.unit in METRES and np.isfinite(one.value):
-            largest[one.unit] = max(abs(one.value), largest.get(one.unit, 0.0))
+    for quantity in numbers.values():
+        if quantity.unit in METRES and np.isfinite(quantity.value):
+            largest[quantity.unit] = max(abs(quantity.value), largest.get(quantity.unit, 0.0))
     finer = {unit: finer_unit(unit, value) for unit, value in largest.items()}
     shown = dict(numbers)
-    for name, one in numbers.items():
-        factor, unit = finer.get(one.unit, (1.0, one.unit))
+    for name, quantity in numbers.items():
+        factor, unit = finer.get(quantity.unit, (1.0, quantity.unit))
         if factor > 1:
-            shown[name] = Quantity(factor * one.value, unit)
+            shown[name] = Quantity(factor * quantity.value, unit)
     return shown
 
 
@@ -426,23 +429,23 @@ def _nouns(names: tuple[str, ...], other: str) -> list[str]:
     return [NOUNS.get(name, others[name]) for name in names]
 
 
-def _number(one: Quantity, spec: str, digits: int) -> str:
+def _number(quantity: Quantity, spec: str, digits: int) -> str:
     """Format a number and its unit, with so many significant digits unless the field asks otherwise."""
-    if not abs(one.value) <= LARGEST_SAID:
+    if not abs(quantity.value) <= LARGEST_SAID:
         return "not known"
     if spec == "<":
-        return probability(one.value)
+        return probability(quantity.value)
     if spec == "%":
-        return f"{significant(100 * one.value)} %"
+        return f"{significant(100 * quantity.value)} %"
     if spec == "+":
-        text = ("+" if one.value >= 0 else "") + significant(one.value, digits)
+        text = ("+" if quantity.value >= 0 else "") + significant(quantity.value, digits)
     elif spec:
-        text = format(one.value, spec)
-    elif not one.unit and float(one.value).is_integer() and abs(one.value) < 1e15:
-        text = f"{one.value:,.0f}"
+        text = format(quantity.value, spec)
+    elif not quantity.unit and float(quantity.value).is_integer() and abs(quantity.value) < 1e15:
+        text = f"{quantity.value:,.0f}"
     else:
-        text = significant(one.value, digits)
-    return f"{text} {one.unit}".rstrip()
+        text = significant(quantity.value, digits)
+    return f"{text} {quantity.unit}".rstrip()
 
 
 def significant(value: float, digits: int = DIGITS) -> str:

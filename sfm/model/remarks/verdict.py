@@ -47,14 +47,14 @@ class Verdict:
         """Headline and remarks, a line each; errors and warnings begin with an exclamation mark."""
         signs = {"note": " "}
         return "\n".join(
-            [self.headline, *(f"{signs.get(one.severity, '!')} {one.text}" for one in self.lines)]
+            [self.headline, *(f"{signs.get(line.severity, '!')} {line.text}" for line in self.lines)]
         )
 
     @property
     def summary(self) -> str:
         """Headline and numbers of remarks."""
-        counts = Counter(one.severity for one in self.remarks)
-        listed = ", ".join(counted(counts[one], one) for one in SEVERITIES if counts[one])
+        counts = Counter(said.severity for said in self.remarks)
+        listed = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
         return f"{self.headline} {listed}".rstrip()
 
     @property
@@ -65,8 +65,8 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        remarks = [one.as_dict() for one in self.remarks]
-        tests = [one.as_dict() for one in self.tests]
+        remarks = [said.as_dict() for said in self.remarks]
+        tests = [test.as_dict() for test in self.tests]
         return {"headline": self.headline, "verdict": self.level, "remarks": remarks, "tests": tests}
 
 
@@ -84,43 +84,45 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
         remarks: all remarks on the result, in reading order within a severity, and all tests.
         headlines: headline of each level for this kind of result.
     """
-    found = tuple(remarks)
-    tests = tuple(one for one in found if one.test is not None)
-    every = tuple(one for one in found if one.test is None)
+    said = tuple(remarks)
+    tests = tuple(candidate for candidate in said if candidate.test is not None)
+    every = tuple(candidate for candidate in said if candidate.test is None)
     every = tuple(
-        replace(one, at_least=_worst_explained(one, every))
-        for one in every
-        if not any(_explains(cause, one) for cause in every)
+        replace(candidate, at_least=_worst_explained(candidate, every))
+        for candidate in every
+        if not any(_explains(cause, candidate) for cause in every)
     )
-    order = tuple(one for severity in SEVERITIES for one in every if one.severity == severity)
+    order = tuple(
+        candidate for severity in SEVERITIES for candidate in every if candidate.severity == severity
+    )
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order, tests)
 
 
-def _explains(cause: Remark, one: Remark) -> bool:
+def _explains(cause: Remark, said: Remark) -> bool:
     """Return whether `cause` explains a remark; a note with a grade explains only other notes."""
     graded = not isinstance(cause.row.severity, str)
-    serious = cause.severity != "note" or one.severity == "note"
-    return one.kind in cause.row.explains and (serious or not graded)
+    serious = cause.severity != "note" or said.severity == "note"
+    return said.kind in cause.row.explains and (serious or not graded)
 
 
 def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
     """Return the worst severity of the remarks that a remark with a grade explains."""
     graded = not isinstance(cause.row.severity, str)
-    explained = [one.severity for one in every if graded and _explains(cause, one)]
+    explained = [effect.severity for effect in every if graded and _explains(cause, effect)]
     return min((cause.at_least, *explained), key=SEVERITIES.index)
 
 
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
     """Return the printed lines: the first remarks of each kind and severity, and the number of the others."""
     groups: dict[tuple[Severity, str], list[Remark]] = {}
-    for one in remarks:
-        groups.setdefault((one.severity, one.kind), []).append(one)
+    for said in remarks:
+        groups.setdefault((said.severity, said.kind), []).append(said)
     lines = []
     for (severity, _), same in groups.items():
         lines += [
-            Line(severity, one.text, "" if k else one.remedy, bool(one.row.explains))
-            for k, one in enumerate(same[:MAX_LISTED])
+            Line(severity, listed.text, "" if k else listed.remedy, bool(listed.row.explains))
+            for k, listed in enumerate(same[:MAX_LISTED])
         ]
         if len(same) > MAX_LISTED:
             lines.append(Line(severity, f"{len(same) - MAX_LISTED} more like these."))

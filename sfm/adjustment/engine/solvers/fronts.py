@@ -92,12 +92,12 @@ class Fronts:
         columns = BYTES * 6 * sum(front.pivots for front in self.fronts) * border
         return max(factoring, factor + vectors, factor + self._inversion_bytes() + 2 * columns) + 2 * columns
 
-    def _elimination_bytes(self, some: range, waiting: dict[int, float]) -> _Memory:
+    def _elimination_bytes(self, fronts: range, waiting: dict[int, float]) -> _Memory:
         """Return the memory for eliminating some fronts; `waiting` are remainders of other fronts, bytes."""
         waiting = dict(waiting)
         kept = peak = 0.0
-        space = max((_bytes(self.fronts[g])[0] for g in some), default=0.0)
-        for g in some:
+        space = max((_bytes(self.fronts[g])[0] for g in fronts), default=0.0)
+        for g in fronts:
             front = self.fronts[g]
             _, factor, rest = _bytes(front)
             for child in front.children:
@@ -288,20 +288,20 @@ def distances(indptr: IntArray, indices: IntArray, start: int) -> IntArray:
         start: node where the steps begin.
     """
     m = len(indptr) - 1
-    found = np.full(m, m)
+    distance = np.full(m, m)
     queue = np.empty(m, dtype=np.int64)
-    queue[0], found[start] = start, 0
+    queue[0], distance[start] = start, 0
     taken, end = 0, 1
     while taken < end:
         node = queue[taken]
         taken += 1
         for k in range(indptr[node], indptr[node + 1]):
             other = indices[k]
-            if found[other] == m:
-                found[other] = found[node] + 1
+            if distance[other] == m:
+                distance[other] = distance[node] + 1
                 queue[end] = other
                 end += 1
-    return found
+    return distance
 
 
 @dataclass(frozen=True)

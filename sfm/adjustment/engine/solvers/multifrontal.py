@@ -161,7 +161,7 @@ class MultifrontalSolver:
     def _eliminate(self, equations: Equations, added: FloatArray) -> list[EliminatedFront] | None:
         """Eliminate all fronts, with `added` on the diagonal; None if one is not positive definite."""
         fronts = self.fronts.fronts
-        found: list[EliminatedFront | None] = [None] * len(fronts)
+        eliminated: list[EliminatedFront | None] = [None] * len(fronts)
         left: dict[int, FloatArray] = {}  # remainders for the parents
 
         def eliminate(begin: int, end: int) -> bool:
@@ -176,14 +176,14 @@ class MultifrontalSolver:
                 done = _eliminate_pivots(F, 6 * front.pivots)
                 if done is None:
                     return False
-                found[g], left[g] = done
+                eliminated[g], left[g] = done
             return True
 
         half, end = self.fronts.halves
-        both = at_once(lambda: eliminate(0, half), lambda: eliminate(half, end))
-        if not (all(both) and eliminate(end, len(fronts))):
+        halves = at_once(lambda: eliminate(0, half), lambda: eliminate(half, end))
+        if not (all(halves) and eliminate(end, len(fronts))):
             return None
-        return [front for front in found if front is not None]
+        return [front for front in eliminated if front is not None]
 
     def _front(self, equations: Equations, front: Front, added: FloatArray, space: FloatArray) -> FloatArray:
         """Return the scaled lower triangle of a front without remainders of children, stored in `space`."""

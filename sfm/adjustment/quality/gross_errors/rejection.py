@@ -238,9 +238,9 @@ def _undistorted_optimum(
         optimum, plain = replace(begun, converged=False), weight
     limit, first = spread(optimum.state), max(spread(state), least_sigma(layout.observations))
 
-    def sound(found: Optimum) -> bool:
-        fits = spread(found.state) <= MIN_BENT_RATIO * first
-        return found.converged and fits and not _distorted_photographs(run, state, found.state).any()
+    def sound(optimum: Optimum) -> bool:
+        fits = spread(optimum.state) <= MIN_BENT_RATIO * first
+        return optimum.converged and fits and not _distorted_photographs(run, state, optimum.state).any()
 
     if sound(optimum):
         return optimum, plain
@@ -357,9 +357,9 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     o, count = problem.layout.observations, len(state.points)
     suspect = np.bincount(o.point[changed], minlength=count) > 0
     suspect &= problem.layout.point_free.all(axis=1)
-    for one in problem.observed:
-        if one.point is not None:
-            suspect[one.point] = False
+    for of_kind in problem.observed:
+        if of_kind.point is not None:
+            suspect[of_kind.point] = False
     rows = np.flatnonzero(used & suspect[o.point])
     ray = state.points[o.point[rows]] - state.position[o.image[rows]]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
