@@ -28,7 +28,6 @@ from sfm.adjustment.result import Adjustment, computed_once
 from sfm.model.camera import pixel_jacobian, project
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
-from sfm.model.estimate import Estimate
 from sfm.model.network import rows_of
 from sfm.model.remarks.remark import EXPECTED_SIGMAS
 
@@ -356,26 +355,21 @@ def intersect_rays(adjustment: Adjustment, rows: IntArray) -> tuple[FloatArray, 
         if step @ parts.N.sum(axis=0) @ step < LAST_STEP_SIGMAS**2:
             break
         X = X + step
-        alone = replace(alone, residuals=_residuals(alone, X), estimate=_with_point(alone.estimate, j, X))
-    return X, Q, parts.misfit(every)
-
-
-def _with_point(estimate: Estimate, point: int, X: FloatArray) -> Estimate:
-    points = estimate.points.copy()
-    points[point] = X
-    return replace(estimate, points=points)
-
-
-def _residuals(alone: Adjustment, X: FloatArray) -> FloatArray:
-    """Return v = computed - measured of the image points of one point at X, px, (k, 2)."""
-    seen, estimate = alone.network.image_points, alone.estimate
-    computed = [
-        project(
-            estimate.cameras[alone.network.camera[i]], estimate.position[i], estimate.rotation[i], X[None]
+        seen, estimate = alone.network.image_points, alone.estimate
+        points = estimate.points.copy()
+        points[j] = X
+        computed = [
+            project(
+                estimate.cameras[alone.network.camera[i]], estimate.position[i], estimate.rotation[i], X[None]
+            )
+            for i in seen.image
+        ]
+        alone = replace(
+            alone,
+            residuals=np.concatenate(computed) - seen.xy,
+            estimate=replace(estimate, points=points),
         )
-        for i in seen.image
-    ]
-    return np.asarray(np.concatenate(computed) - seen.xy)
+    return X, Q, parts.misfit(every)
 
 
 def point_normals(adjustment: Adjustment, sigma0: float | None = None) -> PointNormals:

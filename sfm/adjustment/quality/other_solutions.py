@@ -87,7 +87,11 @@ def other_solutions(
     base = search.adjusted(a.estimate)
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
-    limit = 1 + _allowed(base, a.levels.question) / base.vPv
+    # With little redundancy v'Pv hardly tests the stated weights, and any other solution would pass. So the
+    # stated weights count like STATED_FREEDOM observations.
+    freedom = base.redundancy + STATED_FREEDOM
+    variance = (base.vPv + STATED_FREEDOM) / freedom
+    limit = 1 + float(variance * f_isf(a.levels.question, 1, freedom)) / base.vPv
     result = _Place(a)
     others: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
@@ -104,22 +108,16 @@ def other_solutions(
         if described.moved > MIN_APART_SIGMAS:
             others.append(described)
     if others and others[0].vPv < 1:
-        best = _with_c_freed(others[0].estimate, had_to_be_held)
-        ended = search.adjusted(best, tolerance=TOLERANCE)
+        estimate = others[0].estimate
+        cameras = []
+        for camera in estimate.cameras:
+            free = camera.free.copy()
+            free[camera.parts[0]] |= camera.name in had_to_be_held
+            cameras.append(replace(camera, free=free))
+        ended = search.adjusted(replace(estimate, cameras=tuple(cameras)), tolerance=TOLERANCE)
         if ended is not None and ended.converged:
             others[0] = replace(others[0], estimate=ended.estimate, converges=True)
     return tuple(others)
-
-
-def _allowed(base: Adjustment, level: float) -> float:
-    """Return the largest excess of v'Pv of another solution.
-
-    With little redundancy v'Pv hardly tests the stated weights, and any other solution would pass. So the
-    stated weights count like STATED_FREEDOM observations.
-    """
-    freedom = base.redundancy + STATED_FREEDOM
-    variance = (base.vPv + STATED_FREEDOM) / freedom
-    return float(variance * f_isf(level, 1, freedom))
 
 
 def _weak(a: Adjustment) -> bool:
@@ -249,15 +247,6 @@ def _with_c_held(camera: Camera) -> Camera:
     free = camera.free.copy()
     free[camera.parts[0]] = False
     return replace(camera, free=free)
-
-
-def _with_c_freed(estimate: Estimate, names: tuple[str, ...]) -> Estimate:
-    cameras = []
-    for camera in estimate.cameras:
-        free = camera.free.copy()
-        free[camera.parts[0]] |= camera.name in names
-        cameras.append(replace(camera, free=free))
-    return replace(estimate, cameras=tuple(cameras))
 
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:

@@ -120,7 +120,7 @@ def describe_motions(optimum: Optimum, layout: Unknowns) -> str:
     opened = optimum.motions.points[sound, :, :d].reshape(-1, d)
     V = np.linalg.qr(np.linalg.lstsq(generators, opened, rcond=None)[0])[0]  # (7, d)
     turns = _null_space(V[3:])  # combinations that only shift
-    rest = _complement(turns, V.shape[1])
+    rest = _null_space(turns.T) if turns.shape[1] else np.eye(V.shape[1])
     scales = rest @ _null_space(V[6:] @ rest)  # other combinations, without a change of scale
     parts = []
     if turns.shape[1]:
@@ -136,11 +136,6 @@ def _null_space(A: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the null space of a matrix."""
     _, singular, Vt = np.linalg.svd(A, full_matrices=True)
     return np.asarray(Vt[int((singular > MAPPED_TO_ZERO).sum()) :].T)
-
-
-def _complement(basis: FloatArray, size: int) -> FloatArray:
-    """Return an orthonormal basis of the orthogonal complement of another basis."""
-    return _null_space(basis.T) if basis.shape[1] else np.eye(size)
 
 
 def _axes(directions: FloatArray) -> str:

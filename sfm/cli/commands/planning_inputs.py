@@ -92,7 +92,17 @@ def camera_of(text: str, name: str | None, c_mm: float | None, free: str | None)
     if path.is_dir():
         from adapters.formats.result_tables import read_result
 
-        camera = _choose_camera(text, read_result(path).estimate.cameras, name)
+        cameras = read_result(path).estimate.cameras
+        names = [camera.name for camera in cameras]
+        if name is None and len(cameras) > 1:
+            raise SurveyFileError(
+                f"{text}: has {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
+                "--camera-name"
+            )
+        named = [camera for camera in cameras if name in (None, camera.name)]
+        if not named:
+            raise SurveyFileError(f"--camera-name {name}: {text} has {', '.join(names)[:80]}")
+        camera = named[0]
     elif path.suffix.lower() == ".toml":
         camera = _camera_of_survey(path, name, c_mm)
     else:
@@ -176,19 +186,6 @@ def parse_numbers(what: str, text: str, count: int | None = None) -> tuple[float
         wanted = "numbers" if count is None else counted(count, "number")
         raise SurveyFileError(f"{what} {text:.60}: expected {wanted} separated by commas")
     return numbers
-
-
-def _choose_camera(where: str, cameras: tuple[Camera, ...], name: str | None) -> Camera:
-    names = [camera.name for camera in cameras]
-    if name is None and len(cameras) > 1:
-        raise SurveyFileError(
-            f"{where}: has {counted(len(cameras), 'camera')} ({', '.join(names)[:80]}), choose one with "
-            "--camera-name"
-        )
-    named = [camera for camera in cameras if name in (None, camera.name)]
-    if not named:
-        raise SurveyFileError(f"--camera-name {name}: {where} has {', '.join(names)[:80]}")
-    return named[0]
 
 
 def _camera_of_survey(path: Path, name: str | None, c_mm: float | None) -> Camera:

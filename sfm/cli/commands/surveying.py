@@ -21,7 +21,6 @@ from sfm.runtime.faults import working_on
 if TYPE_CHECKING:
     from sfm.model.remarks.remark import Remark
     from sfm.products.drafting.draft import Draft
-    from sfm.survey.inputs.survey import Survey
 
 PHOTOGRAPHS = "# Photographs: "  # comment with their folder, relative to the survey file, as a JSON string
 Pitch = Annotated[
@@ -224,6 +223,7 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
     with loading():
         from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
+        from sfm.files.open_folders import refuse_foreign_folder
         from sfm.photographs.reading import SUFFIXES
         from sfm.pipeline import run_survey
         from sfm.products.public_functions import colmap_writer, one_blas_thread, programs_of, read_result
@@ -232,6 +232,7 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
         from sfm.report.output import (
             Origin,
             SurveyLog,
+            folder_name,
             refuse_other_origin,
             write_result,
             write_unfinished,
@@ -278,7 +279,8 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
     elif options.weighted:
         raise KolinearError("--camera-weighted: expected --camera RESULT")
     others = programs_of(survey.compare.backend, survey.compare.baseline)
-    folder = _result_folder(survey, options.out)
+    folder = options.out or Path("out") / folder_name(survey.name)
+    refuse_foreign_folder(folder)  # before any work is done
     origin = Origin(survey_file, options.images or survey_file.parent)
     if not options.overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
@@ -329,16 +331,6 @@ def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
     if not print_result(findings, page, seconds=time.perf_counter() - begun, verbose=options.verbose):
         raise SystemExit(FAILED)
     return folder
-
-
-def _result_folder(survey: Survey, out: Path | None) -> Path:
-    """Return the result folder; a folder that cannot be used is refused before any work is done."""
-    from sfm.files.open_folders import refuse_foreign_folder
-    from sfm.report.output import folder_name
-
-    out = Path("out") / folder_name(survey.name) if out is None else out
-    refuse_foreign_folder(out)
-    return out
 
 
 @contextmanager
