@@ -407,8 +407,6 @@ def _renumber_points(
         network,
         points=tuple(network.points[j] for j in order),
         image_points=replace(network.image_points, point=place[network.image_points.point]),
-        control=network.control.renumbered(place),
-        scale_bars=network.scale_bars.renumbered(place),
         observations=tuple(kind.renumbered(place) for kind in network.observations),
     )
     if datum.points is not None:
@@ -447,8 +445,6 @@ def shifted(network: Network, estimate: Estimate, by: FloatArray) -> tuple[Netwo
     """
     moved = replace(
         network,
-        control=network.control.shifted(by),
-        exterior=network.exterior.shifted(by),
         observations=tuple(kind.shifted(by) for kind in network.observations),
     )
     return moved, replace(estimate, position=estimate.position + by, points=estimate.points + by)

@@ -79,7 +79,7 @@ class ErrorCorrelation:
 class ObservedResiduals:
     """Residuals of the observations of one kind, other than image points, that took part in an adjustment."""
 
-    index: int  # index of the kind in `Network.kinds`
+    index: int  # index of the kind in `Network.observations`
     rows: IntArray  # rows of the observations that took part, (n,)
     difference: FloatArray  # computed minus observed, (n, d)
     redundancy_numbers: FloatArray  # 0 to 1; NaN where a component was not observed, (n, d)

@@ -7,11 +7,12 @@ Photographs and points are identified by index: image i is `network.images[i]`, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import combinations, pairwise
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +43,9 @@ __all__ = [
     "without_given",
 ]
 
+# kinds of which a network has one set of observations at most, in the order of their tables
+SETS = (ObjectPoints, ExteriorObservations, InteriorObservations, ScaleBars)
+K = TypeVar("K", bound=Kind)
 MAX_NAMES = 10  # most names listed in a message
 MAX_PAIRS_AT_ONCE = 4_000_000  # pairs of photographs compared in one sparse product
 
@@ -151,11 +155,7 @@ class Network:
     camera: IntArray  # index of the camera of each photograph in Estimate.cameras, (m,)
     points: tuple[str, ...]  # names of the object points, n of them
     image_points: ImagePoints
-    control: ObjectPoints = field(default_factory=ObjectPoints)
-    scale_bars: ScaleBars = field(default_factory=ScaleBars)
-    exterior: ExteriorObservations = field(default_factory=ExteriorObservations)
-    interior: InteriorObservations = field(default_factory=InteriorObservations)
-    observations: tuple[Kind, ...] = ()  # further kinds
+    observations: tuple[Kind, ...] = ()  # of all other kinds, those of `SETS` first
     # number of the moment of each photograph, 0, 1, ...; cameras of one rig share a pose at one moment; if
     # None, each photograph has its own, (m,)
     moment: IntArray | None = None
@@ -203,10 +203,34 @@ class Network:
         named[self.image_points.point[lasting]] = True
         return named
 
+    def of_kind(self, kind: type[K]) -> K:
+        """Return the set of observations of a kind, which is empty if there is none."""
+        return next((given for given in self.observations if isinstance(given, kind)), kind())
+
     @property
-    def kinds(self) -> tuple[Kind, ...]:
-        """All kinds of observations other than image points, including empty ones."""
-        return (self.control, self.exterior, self.interior, self.scale_bars, *self.observations)
+    def control(self) -> ObjectPoints:
+        """Control points."""
+        return self.of_kind(ObjectPoints)
+
+    @property
+    def exterior(self) -> ExteriorObservations:
+        """Observed exterior orientation."""
+        return self.of_kind(ExteriorObservations)
+
+    @property
+    def interior(self) -> InteriorObservations:
+        """Observed interior orientation."""
+        return self.of_kind(InteriorObservations)
+
+    @property
+    def scale_bars(self) -> ScaleBars:
+        """Scale bars."""
+        return self.of_kind(ScaleBars)
+
+    @property
+    def further(self) -> tuple[Kind, ...]:
+        """Observations of kinds of which a network may have several sets."""
+        return tuple(kind for kind in self.observations if not isinstance(kind, SETS))
 
     @classmethod
     def from_arrays(
@@ -287,7 +311,7 @@ class Network:
                 )
         covariance = np.zeros((len(index), 3, 3))
         covariance[:, range(3), range(3)] = s**2
-        return replace(self, control=ObjectPoints(index, np.where(np.isfinite(s), known, 0.0), covariance))
+        return self.with_given(ObjectPoints(index, np.where(np.isfinite(s), known, 0.0), covariance))
 
     def with_scale_bar(self, start: str, end: str, length: float, sigma: float) -> Network:
         """Return the network with one more scale bar, a measured distance between two of its points.
@@ -309,7 +333,19 @@ class Network:
             np.append(bars.sigma, sigma),
             np.append(bars.table, 0) if len(bars.table) else bars.table,
         )
-        return replace(self, scale_bars=added)
+        return self.with_given(added)
+
+    def with_given(self, *sets: Kind, further: Iterable[Kind] | None = None) -> Network:
+        """Return the network with given values in place of its present ones of the same kinds.
+
+        Args:
+            sets: control, exterior or interior observations, or scale bars; an empty set removes them.
+            further: observations of all other kinds, in place of the present ones; unchanged if None.
+        """
+        given = {type(kind): kind for kind in (*self.observations, *sets) if isinstance(kind, SETS)}
+        present = [given[kind] for kind in SETS if len(given.get(kind, ()))]
+        rest = self.further if further is None else tuple(further)
+        return replace(self, observations=(*present, *rest))
 
     def with_observations(self, *kinds: Kind) -> Network:
         """Return the network with further observations, of kinds of `sfm.model.observations` or one's own.
@@ -331,8 +367,8 @@ class Network:
         """
         size = {POINT: len(self.points), PHOTOGRAPH: len(self.images)}
         for kind in kinds:
-            if isinstance(kind, ObjectPoints | ScaleBars | ExteriorObservations | InteriorObservations):
-                raise GeometryError(f"{kind.name}: not with_observations, expected the field of the network")
+            if isinstance(kind, SETS):
+                raise GeometryError(f"{kind.name}: not with_observations, expected with_given")
             for block in kind.blocks():
                 outside = block.at[(block.at < 0) | (block.at >= size.get(block.of, np.inf))]
                 if outside.size:
@@ -412,13 +448,7 @@ class Network:
 
 def without_given(network: Network) -> Network:
     """Return the network with its image points and interior observations only."""
-    return replace(
-        network,
-        control=ObjectPoints(),
-        scale_bars=ScaleBars(),
-        exterior=ExteriorObservations(),
-        observations=(),
-    )
+    return replace(network, observations=(network.interior,))
 
 
 def rows_of(index: IntArray, count: int) -> list[IntArray]:

@@ -128,7 +128,7 @@ class GivenResiduals:
 def given_residuals(
     network: Network, estimate: Estimate, length_unit: str, tests: Mapping[int, Tests] | None = None
 ) -> Iterator[tuple[int, GivenResiduals]]:
-    """Yield the residuals of every kind of given values, with the index of the kind in `network.kinds`.
+    """Yield the residuals of every kind of given values, with its index in `network.observations`.
 
     Exterior orientation gives two kinds, projection centres and angles. Without tests r and w are NaN.
 
@@ -138,7 +138,7 @@ def given_residuals(
         length_unit: unit of its coordinates.
         tests: tests of the kinds that took part in an adjustment, by the index of the kind.
     """
-    for index, kind in enumerate(network.kinds):
+    for index, kind in enumerate(network.observations):
         if not len(kind):
             continue
         variance = np.diagonal(kind.covariances(), axis1=1, axis2=2)

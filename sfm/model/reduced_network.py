@@ -55,9 +55,6 @@ def reduce_network(
         moment=None if network.moment is None else network.moment[images],
         points=tuple(name for name, keep in zip(network.points, points, strict=True) if keep),
         image_points=replace(seen, image=image_index[seen.image], point=point_index[seen.point]),
-        control=kept(network.control),
-        scale_bars=kept(network.scale_bars),
-        exterior=kept(network.exterior),
         observations=tuple(kind for kind in map(kept, network.observations) if len(kind)),
     )
     return reduced, replace(

@@ -20,7 +20,6 @@ from sfm.adjustment.engine.collinearity import State
 from sfm.adjustment.engine.unknowns import Unknowns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.network import Network
-from sfm.model.observations.control_and_bars import ObjectPoints
 from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, inverse_of_observed
 
 
@@ -28,7 +27,7 @@ from sfm.model.observations.kind import MOUNT, PHOTOGRAPH, POINT, Block, Kind, i
 class ObservedKind:
     """Observations of one kind that take part in an adjustment."""
 
-    index: int  # index of the kind in `Network.kinds`
+    index: int  # index of the kind in `Network.observations`
     kind: Kind  # the n observations that take part
     rows: IntArray  # their rows among all observations of the kind, (n,)
     weight: FloatArray  # inverse covariance, 0 where not observed, (n, d, d); or joint, (1, n d, n d)
@@ -77,8 +76,8 @@ def observed_of(
         use_control: whether control points take part.
     """
     observed = []
-    for index, kind in enumerate(network.kinds):
-        if not len(kind) or (isinstance(kind, ObjectPoints) and not use_control):
+    for index, kind in enumerate(network.observations):
+        if not len(kind) or (kind.carries_datum and not use_control):
             continue
         rows = np.flatnonzero(_takes_part(kind, layout))
         if not len(rows):

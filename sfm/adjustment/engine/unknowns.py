@@ -210,7 +210,7 @@ def unknowns_of(
         free_index[a, : counts[a]] = np.concatenate([free_ones, MAX_PARAMETERS + of_mount])
         free_column[a, : counts[a]] = np.concatenate([column, mount_column[a, of_mount]])
     coupled = [np.zeros(0, dtype=np.int64)]  # points that observations couple with other unknowns
-    for kind in network.kinds:
+    for kind in network.observations:
         blocks = kind.blocks()
         if len(kind) and len(blocks) > 1:
             of_points = [block.at for block in blocks if block.of == POINT]

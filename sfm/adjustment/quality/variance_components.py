@@ -110,8 +110,10 @@ def by_source(adjustment: Adjustment) -> VarianceComponents:
 def by_kind(adjustment: Adjustment) -> VarianceComponents:
     """Return the variance factor of each kind of observation.
 
-    Kinds are image points and those of `Network.kinds` that took part. The redundancies of all kinds add up
-    to that of the adjustment.
+    Kinds are image points and those of `Network.observations` that took part. The redundancies of all kinds
+    add up to that of the adjustment.
+
+
 
     Args:
         adjustment: finished adjustment.
@@ -121,7 +123,7 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     image = _components(a, network.image_points.covariance, groups, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
     squares: dict[str, FloatArray] = {}
     for of_kind in a.observed:
-        name = network.kinds[of_kind.index].name
+        name = network.observations[of_kind.index].name
         squares[name] = squares.get(name, np.zeros(3)) + np.array(
             [of_kind.vPv, of_kind.redundancy, of_kind.count]
         )

@@ -30,6 +30,7 @@ class ObjectPoints(CoordinateKind):
     name: ClassVar[str] = "control points"
     single: ClassVar[str] = "control point"
     components: ClassVar[tuple[str, ...]] = ("X", "Y", "Z")
+    carries_datum: ClassVar[bool] = True
 
     point: IntArray = field(default_factory=no_index)  # index of the point, (n,)
     xyz: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # object unit, (n, 3)

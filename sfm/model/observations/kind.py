@@ -105,6 +105,7 @@ class Kind(ABC):
     single: ClassVar[str]  # "scale bar"
     components: ClassVar[tuple[str, ...]]  # names of the d components
     needs_scale: ClassVar[bool] = False  # whether they are meaningless if the scale of the network is open
+    carries_datum: ClassVar[bool] = False  # whether they take part only where they define the datum
 
     @abstractmethod
     def __len__(self) -> int: ...
