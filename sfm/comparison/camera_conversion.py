@@ -146,7 +146,7 @@ def convert_cameras(
         )
         for camera in estimate.cameras
     )
-    return replace(estimate, cameras=tuple(one.camera for one in conversions)), conversions
+    return replace(estimate, cameras=tuple(conversion.camera for conversion in conversions)), conversions
 
 
 def needs_less(camera: Camera, held: tuple[str, ...]) -> bool:
@@ -238,8 +238,12 @@ def corresponding_free(camera: Camera, model: str) -> BoolArray:
     of one focal length and an affinity, each of these corresponds to both.
     """
     source, target = MODELS[camera.model], MODELS[model]
-    free = {one.role for one, is_free in zip(source.parameters, camera.free, strict=True) if is_free}
-    return np.array([bool(free & _counterparts(one.role, source, target)) for one in target.parameters])
+    free = {
+        parameter.role for parameter, is_free in zip(source.parameters, camera.free, strict=True) if is_free
+    }
+    return np.array(
+        [bool(free & _counterparts(parameter.role, source, target)) for parameter in target.parameters]
+    )
 
 
 def _counterparts(role: Role, source: Model, target: Model) -> set[Role]:

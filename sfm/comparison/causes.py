@@ -194,12 +194,14 @@ def _fit(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost:
     plain = replace(row, names=False)
     given = nothing if plain == NOTHING else _fitted(pairs, plain, reference, cost)
     if given.agreed:  # most names are correct, and the others are exchanged among themselves
-        found: Similarity | None = given.a_from_b
+        a_from_b: Similarity | None = given.a_from_b
     else:
-        found = find_pattern(pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror)
-    if found is None:
+        a_from_b = find_pattern(
+            pairs.a, pairs.b, scale=None if row.scale else pairs.scale, mirrored=row.mirror
+        )
+    if a_from_b is None:
         return None
-    other = _assigned(pairs, found, given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool))
+    other = _assigned(pairs, a_from_b, given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool))
     kept = other >= 0
     if kept.sum() < max(MIN_STABLE, STABLE_FRACTION * len(pairs.a)):
         return None
@@ -210,9 +212,11 @@ def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntA
     """Return the point of b for each point of a: by its name if that fits, else by its position, (n,)."""
     every = np.ones(len(pairs.a), dtype=bool)
     rows = np.flatnonzero(given)
-    found = nearest_places((pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1))
+    nearest = nearest_places(
+        (pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1)
+    )
     other = np.where(given, np.arange(len(every)), -1)
-    other[found[:, 0]] = found[:, 1]
+    other[nearest[:, 0]] = nearest[:, 1]
     return np.asarray(other)
 
 
@@ -221,18 +225,18 @@ def _fitted(
 ) -> _Fit:
     """Compute and test the differences under a row."""
     n = len(pairs.a)
-    whole = row.strain or row.bending
-    estimated = row.scale or whole or pairs.scale is None
+    deforms = row.strain or row.bending
+    estimated = row.scale or deforms or pairs.scale is None
     source = pairs.b @ MIRROR if row.mirror else pairs.b
     T = fit_robustly(source[reference], pairs.a[reference], scale=None if estimated else pairs.scale)
     if row.mirror:
         T = replace(T, rotation=T.rotation @ MIRROR)
-    if whole:  # also for large deformations
+    if deforms:  # also for large deformations
         T = fit_affinity(T, pairs.a, pairs.b, reference)
     d, Q = pairs.differences(T)
     similarity = motions(pairs.a)
     G = similarity[:, : MOTIONS["similarity" if estimated else "rigid"]]
-    if whole:
+    if deforms:
         G = _independent(np.hstack([G, (bending if row.bending else strain)(pairs.a)]), 3 * n)
     parameters = G.shape[1] - MOTIONS["similarity" if pairs.scale is None else "rigid"]
     lost = 0 if other is None else len(other) - n
@@ -252,26 +256,26 @@ def _fitted(
     if fits.sum() < least:
         return failed
     among = candidates_of(d, Q, G, reference)
-    found = find_stable_points(
+    search = find_stable_points(
         among, least=least, start=fits, redundancy=pairs.redundancy, alpha=LEVEL, alpha_single=LEVEL
     )
-    if not found.agreed:
+    if not search.agreed:
         return failed
-    last = found.steps[-1]
+    last = search.steps[-1]
     r = pairs.redundancy
     ln_p = -last.omega / 2 if r is None else -(r + last.freedom) / 2 * math.log1p(last.omega / r)
     candidates = int(reference.sum())
-    moved = candidates - int(found.stable.sum())
+    moved = candidates - int(search.stable.sum())
     penalty += moved * cost + math.log(math.comb(candidates, moved))
-    lengths = _lengths(pairs, T, d, Q, similarity, found.stable) if row.scale else (1.0, 0.0)
+    lengths = _lengths(pairs, T, d, Q, similarity, search.stable) if row.scale else (1.0, 0.0)
     unit = None
     if pairs.scale is not None:
         size, sigma = lengths if row.scale else (pairs.scale / T.scale, 0.0)
         beside = max(SWELLING, math.sqrt(critical_value(LEVEL, 1, r)) * sigma / size)
         unit = find_unit(size, beside)  # the remaining difference is reported
     factor = unit.factor if unit else 1.0
-    stretches = _stretches(pairs, T, d, Q, similarity, found.stable, factor) if row.strain else ()
-    return _Fit(row, pairs, T, ln_p - penalty, True, found.stable, lengths, unit, stretches, other)
+    stretches = _stretches(pairs, T, d, Q, similarity, search.stable, factor) if row.strain else ()
+    return _Fit(row, pairs, T, ln_p - penalty, True, search.stable, lengths, unit, stretches, other)
 
 
 def _relative_sigma(pairs: PointPairs) -> float:
@@ -288,12 +292,12 @@ def _independent(columns: FloatArray, rows: int) -> FloatArray:
 
 
 def _lengths(
-    pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, whole: FloatArray, stable: BoolArray
+    pairs: PointPairs, T: Similarity, d: FloatArray, Q: FloatArray, similarity: FloatArray, stable: BoolArray
 ) -> tuple[float, float]:
     """Return the ratio of lengths b over a from the stable points, and its standard deviation."""
     assert pairs.scale is not None
-    among = candidates_of(d, Q, whole[:, : MOTIONS["rigid"]], stable)
-    g = whole[np.repeat(stable, 3), 6]
+    among = candidates_of(d, Q, similarity[:, : MOTIONS["rigid"]], stable)
+    g = similarity[np.repeat(stable, 3), 6]
     weight = float(g @ among.P @ g)
     size = mean_distance(pairs.a)  # the column of the scale is divided by it
     left = float(g @ among.P @ among.d) / weight / size
@@ -306,7 +310,7 @@ def _stretches(
     T: Similarity,
     d: FloatArray,
     Q: FloatArray,
-    whole: FloatArray,
+    similarity: FloatArray,
     stable: BoolArray,
     unit: float,
 ) -> tuple[Stretch, ...]:
@@ -315,7 +319,9 @@ def _stretches(
     Lengths of the second result are divided by the unit factor `unit`. If not both results have a scale, the
     stretches are relative to the median one.
     """
-    among = candidates_of(d, Q, whole[:, : MOTIONS["similarity" if pairs.scale is None else "rigid"]], stable)
+    among = candidates_of(
+        d, Q, similarity[:, : MOTIONS["similarity" if pairs.scale is None else "rigid"]], stable
+    )
     axes, along = extended_axes(pairs.a)
     i, j = np.triu_indices(len(axes))
     tensors = np.zeros((len(i), 3, 3))
@@ -397,13 +403,13 @@ def find_pattern(
     for k, candidates in zip(order, near, strict=True):
         for j in candidates:
             try:
-                found, count = _refined(
+                refined, count = _refined(
                     a, source, fit_similarity(source[theirs[j]], a[ours[k]], scale=scale), scale
                 )
             except GeometryError:
                 continue
             if count > most:
-                best, most = found, count
+                best, most = refined, count
         if most >= ENOUGH_FRACTION * min(len(a), len(b)):
             break
     if best is None:
@@ -417,14 +423,14 @@ def _refined(
     """Return the similarity fitted to all points that it brings onto others, and their number."""
     none = np.empty((0, 2), dtype=np.int64)
     every_a, every_b = np.ones(len(a), dtype=bool), np.ones(len(b), dtype=bool)
-    found, count = proposed, 0
+    similarity, count = proposed, 0
     for _ in range(ROUNDS):
-        pairs = nearest_places((a, every_a), (found.apply(b), every_b), none)
+        pairs = nearest_places((a, every_a), (similarity.apply(b), every_b), none)
         if len(pairs) <= max(3, count):
             break
         count = len(pairs)
-        found = fit_similarity(b[pairs[:, 1]], a[pairs[:, 0]], scale=scale)
-    return found, count
+        similarity = fit_similarity(b[pairs[:, 1]], a[pairs[:, 0]], scale=scale)
+    return similarity, count
 
 
 def _triangles(xyz: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -128,22 +128,22 @@ def congruency(
         )
 
     level = np.where(reference, alpha / 2 / first, alpha / 2 / max(1, n - first))
-    value = {one: critical_value(one, 3, redundancy) for one in set(level.tolist())}
-    critical = np.array([value[one] for one in level.tolist()])
-    whole = best = search(reference)
+    value = {tail: critical_value(tail, 3, redundancy) for tail in set(level.tolist())}
+    critical = np.array([value[tail] for tail in level.tolist()])
+    from_all = best = search(reference)
     robust = None
-    if len(whole.steps) > 1:
+    if len(from_all.steps) > 1:
         weight = robust_weights(difference, G, reference)
         fits = reference & ~(critical < tests_in_datum(difference, covariance, G, weight))
         if fits.sum() >= least:
             robust = search(fits)
-            more = not whole.agreed or robust.stable.sum() > whole.stable.sum()
-            best = robust if robust.agreed and more else whole
-    stable, drops = (best.stable, best.drops) if best.agreed else (reference, whole.drops_of_all)
+            more = not from_all.agreed or robust.stable.sum() > from_all.stable.sum()
+            best = robust if robust.agreed and more else from_all
+    stable, drops = (best.stable, best.drops) if best.agreed else (reference, from_all.drops_of_all)
     d, Q = in_datum(difference, covariance, G, stable.astype(float))
     return Congruency(
         reference=reference,
-        search=whole,
+        search=from_all,
         robust=robust,
         stable=stable,
         agreed=best.agreed,
@@ -153,7 +153,7 @@ def congruency(
         statistic=np.where(stable, drops, single_tests(d, Q)),
         level=level,
         critical=critical,
-        weights=best.weights if best.agreed else whole.weights_of_all,
+        weights=best.weights if best.agreed else from_all.weights_of_all,
     )
 
 

@@ -20,9 +20,9 @@ HEADLINES: Mapping[Level, str] = {
 }
 
 
-def verdict_of_comparison(found: ResultComparison) -> Verdict:
+def verdict_of_comparison(comparison: ResultComparison) -> Verdict:
     """Return the verdict on a comparison, with its remarks."""
-    return judge(_remarks(found), HEADLINES)
+    return judge(_remarks(comparison), HEADLINES)
 
 
 def remarks_of_cause(
@@ -58,11 +58,13 @@ def remarks_of_cause(
         exchanged = [f"{ours} = {theirs}" for ours, theirs in cause.renamed]
         yield remark("names_differ", count=len(exchanged), exchanged=exchanged, **between)
     if row.strain:
-        for one in cause.stretches:
-            numbers = {"lengths": one.lengths, "sigma": one.sigma}
+        for stretch in cause.stretches:
+            numbers = {"lengths": stretch.lengths, "sigma": stretch.sigma}
             if cause.unit is not None:
                 numbers["factor"] = cause.unit.factor
-            yield remark("strained", axis=_describe_direction(one.axis), moved=moved, **numbers, **between)
+            yield remark(
+                "strained", axis=_describe_direction(stretch.axis), moved=moved, **numbers, **between
+            )
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)
 
@@ -73,54 +75,58 @@ def _describe_direction(axis: FloatArray) -> str:
     return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
 
 
-def _remarks(found: ResultComparison) -> Iterator[Remark]:
-    first, second = found.names
-    longest = np.linalg.norm(found.point_difference, axis=1)
-    unit = found.unit or "object units"
-    if found.cause is not None:
+def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
+    first, second = comparison.names
+    longest = np.linalg.norm(comparison.point_difference, axis=1)
+    unit = comparison.unit or "object units"
+    if comparison.cause is not None:
         yield from remarks_of_cause(
-            found.cause, first, second, len(found.points), (float(longest.max()), unit)
+            comparison.cause, first, second, len(comparison.points), (float(longest.max()), unit)
         )
-    elif found.changed:
-        yield _remark_on_differences(found, longest, unit)
-    tested = int(np.isfinite(found.statistic).sum())
-    if found.untested is not None:
-        if found.cause is None or found.untested.kind != "untestable":  # a cause was found and tested
-            yield found.untested
-    elif found.approximate:
+    elif comparison.changed:
+        yield _remark_on_differences(comparison, longest, unit)
+    tested = int(np.isfinite(comparison.statistic).sum())
+    if comparison.untested is not None:
+        if (
+            comparison.cause is None or comparison.untested.kind != "untestable"
+        ):  # a cause was found and tested
+            yield comparison.untested
+    elif comparison.approximate:
         yield remark("tested_singly")
-    elif tested <= MAX_POINTS < len(found.points):
-        yield remark("tested_part", tested=tested, points=len(found.points))
-    if found.changed and found.independent:
-        yield from _remarks_on_cameras(found)
+    elif tested <= MAX_POINTS < len(comparison.points):
+        yield remark("tested_part", tested=tested, points=len(comparison.points))
+    if comparison.changed and comparison.independent:
+        yield from _remarks_on_cameras(comparison)
 
 
-def _remark_on_differences(found: ResultComparison, longest: FloatArray, unit: str) -> Remark:
+def _remark_on_differences(comparison: ResultComparison, longest: FloatArray, unit: str) -> Remark:
     """Return the remark on differences without any other cause than that points moved."""
-    if not found.majority:
-        return remark("no_majority_agrees", first=found.names[0], second=found.names[1])
-    names = [name for name, differs in zip(found.points, found.significant, strict=True) if differs]
+    if not comparison.majority:
+        return remark("no_majority_agrees", first=comparison.names[0], second=comparison.names[1])
+    names = [name for name, differs in zip(comparison.points, comparison.significant, strict=True) if differs]
     if not names:
-        return remark("points_differ", statistic=found.global_statistic, critical=found.global_critical)
-    largest = float(longest[found.significant].max())
-    tested = int(np.isfinite(found.statistic).sum())
+        return remark(
+            "points_differ", statistic=comparison.global_statistic, critical=comparison.global_critical
+        )
+    largest = float(longest[comparison.significant].max())
+    tested = int(np.isfinite(comparison.statistic).sum())
     return remark(
         "points_differ", points=names, differing=len(names), tested=tested, distance=(largest, unit)
     )
 
 
-def _remarks_on_cameras(found: ResultComparison) -> Iterator[Remark]:
+def _remarks_on_cameras(comparison: ResultComparison) -> Iterator[Remark]:
     """Yield remarks on cameras whose interior orientation differs, which shows that a lens moved."""
-    for one in found.interior:
+    for camera in comparison.interior:
         with np.errstate(invalid="ignore", divide="ignore"):
-            sigmas = np.where(one.sigma > 0, np.abs(one.difference) / one.sigma, 0.0)
+            sigmas = np.where(camera.sigma > 0, np.abs(camera.difference) / camera.sigma, 0.0)
         worst = int(np.argmax(sigmas))
         if sigmas[worst] >= WRONG_SIGMAS:
-            difference = float(abs(one.difference[worst])), one.units[worst]
+            difference = float(abs(camera.difference[worst])), camera.units[worst]
             yield remark(
                 "interior_differs",
-                camera=one.camera,
-                parameter=one.names[worst],
+                camera=camera.camera,
+                parameter=camera.names[worst],
                 difference=difference,
                 sigmas=float(sigmas[worst]),
             )

@@ -63,21 +63,21 @@ def pair_results(a: Solution, b: Solution) -> Pairing:
     ours, theirs = identified(a), identified(b)
     points = _by_name(a.network.points, ours, b.network.points, theirs)
     named = len(points)
-    found = _points_by_image_points(a, b, xy, images, points)
-    points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
+    further = _points_by_image_points(a, b, xy, images, points)
+    points = np.concatenate([points, further[~(ours[further[:, 0]] & theirs[further[:, 1]])]])
     seen = len(points)
     transform = _frame(a, b, points, images)
     if transform is not None:
         moved = transform.apply_estimate(b.estimate)
-        found = nearest_places(
+        further = nearest_places(
             (a.estimate.points, a.estimate.determined), (moved.points, moved.determined), points
         )
-        points = np.concatenate([points, found[~(ours[found[:, 0]] & theirs[found[:, 1]])]])
+        points = np.concatenate([points, further[~(ours[further[:, 0]] & theirs[further[:, 1]])]])
         if not (a.images_named and b.images_named):
-            found = nearest_places(
+            further = nearest_places(
                 (a.estimate.position, a.estimate.oriented), (moved.position, moved.oriented), images
             )
-            images = np.concatenate([images, found])
+            images = np.concatenate([images, further])
     return Pairing(
         points[np.argsort(points[:, 0], kind="stable")],
         images[np.argsort(images[:, 0], kind="stable")],
@@ -130,13 +130,13 @@ def _images_by_image_points(
     as_they_are = a.network.image_points.xy, b.network.image_points.xy
     if a.images_named and b.images_named:
         return images, as_they_are
-    found = _images_of_places(a, b, as_they_are, images, SAME_PX)
-    if len(found):
-        return np.concatenate([images, found]), as_they_are
+    further = _images_of_places(a, b, as_they_are, images, SAME_PX)
+    if len(further):
+        return np.concatenate([images, further]), as_they_are
     c_px = float(np.median([camera.c_px for camera in a.estimate.cameras]))
     of_rays = c_px * directions(a), c_px * directions(b)
-    found = _images_of_places(a, b, of_rays, images, SAME_RAY_PX)
-    return np.concatenate([images, found]), of_rays if len(found) else as_they_are
+    further = _images_of_places(a, b, of_rays, images, SAME_RAY_PX)
+    return np.concatenate([images, further]), of_rays if len(further) else as_they_are
 
 
 def directions(result: Solution) -> FloatArray:
@@ -162,10 +162,12 @@ def _images_of_places(
     if not len(rows_a) or not len(rows_b):
         return none
     near = cKDTree(xy[0][rows_a]).query_ball_tree(cKDTree(xy[1][rows_b]), same_px)
-    found = [(ours.image[i], theirs.image[j]) for i, js in zip(rows_a, near, strict=True) for j in rows_b[js]]
-    if not found:
+    near_pairs = [
+        (ours.image[i], theirs.image[j]) for i, js in zip(rows_a, near, strict=True) for j in rows_b[js]
+    ]
+    if not near_pairs:
         return none
-    votes, weight = np.unique(np.array(found), axis=0, return_counts=True)
+    votes, weight = np.unique(np.array(near_pairs), axis=0, return_counts=True)
     count_a, count_b = np.bincount(ours.image), np.bincount(theirs.image)
     return _best_pairs(votes, weight, MAJORITY * np.minimum(count_a[votes[:, 0]], count_b[votes[:, 1]]))
 
@@ -179,7 +181,7 @@ def _points_by_image_points(
     free_b = _free(len(b.network.points), points[:, 1]) & b.estimate.determined
     use_a = free_a[ours.point] & np.isfinite(xy[0]).all(axis=1)
     use_b = free_b[theirs.point] & np.isfinite(xy[1]).all(axis=1)
-    found = []
+    near_pairs = []
     of_image_a = rows_of(ours.image, len(a.network.images))
     of_image_b = rows_of(theirs.image, len(b.network.images))
     for i, j in images:
@@ -191,10 +193,10 @@ def _points_by_image_points(
         back = cKDTree(xy[0][rows_a]).query(xy[1][rows_b], distance_upper_bound=NEAR_PX)[1]
         k = np.flatnonzero(there < len(rows_b))
         k = k[back[there[k]] == k]
-        found.append(np.stack([ours.point[rows_a[k]], theirs.point[rows_b[there[k]]]], axis=1))
-    if not found or not sum(map(len, found)):
+        near_pairs.append(np.stack([ours.point[rows_a[k]], theirs.point[rows_b[there[k]]]], axis=1))
+    if not near_pairs or not sum(map(len, near_pairs)):
         return np.empty((0, 2), dtype=np.int64)
-    votes, weight = np.unique(np.concatenate(found), axis=0, return_counts=True)
+    votes, weight = np.unique(np.concatenate(near_pairs), axis=0, return_counts=True)
     shared_a = np.bincount(ours.point[np.isin(ours.image, images[:, 0])], minlength=len(free_a))
     shared_b = np.bincount(theirs.point[np.isin(theirs.image, images[:, 1])], minlength=len(free_b))
     return _best_pairs(votes, weight, MAJORITY * np.minimum(shared_a[votes[:, 0]], shared_b[votes[:, 1]]))
@@ -232,14 +234,14 @@ def fit_robustly(source: FloatArray, target: FloatArray, *, scale: float | None 
 
     Source: Caspary (2000), Concepts of network and deformation analysis, sec. 8.3 (robust transformation).
     """
-    found = fit_similarity(source, target, scale=scale)
+    similarity = fit_similarity(source, target, scale=scale)
     for _ in range(ROUNDS):
-        length = np.linalg.norm(found.apply(source) - target, axis=1)
+        length = np.linalg.norm(similarity.apply(source) - target, axis=1)
         least = 1e-3 * np.median(length)
         if not least > 0:
             break
-        found = fit_similarity(source, target, scale=scale, weights=1 / np.maximum(length, least))
-    return found
+        similarity = fit_similarity(source, target, scale=scale, weights=1 / np.maximum(length, least))
+    return similarity
 
 
 def fit_affinity(start: Similarity, a: FloatArray, b: FloatArray, reference: BoolArray) -> Similarity:
@@ -294,16 +296,16 @@ def nearest_places(
     good = distance[k] < MAX_PLACE_FRACTION * np.minimum(
         _spacing(a, rows_a[k]), _spacing(b, rows_b[there[k]])
     )
-    found: IntArray = np.stack([rows_a[k], rows_b[there[k]]], axis=1)[good]
-    return found
+    nearest: IntArray = np.stack([rows_a[k], rows_b[there[k]]], axis=1)[good]
+    return nearest
 
 
-def _spacing(one: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
+def _spacing(result: tuple[FloatArray, BoolArray], rows: IntArray) -> FloatArray:
     """Return the distance of each position to its nearest neighbour in the same result, else infinite."""
-    places = one[0][one[1]]
+    places = result[0][result[1]]
     if len(places) < 2:
         return np.full(len(rows), np.inf)
-    return np.asarray(cKDTree(places).query(one[0][rows], k=2)[0][:, 1])
+    return np.asarray(cKDTree(places).query(result[0][rows], k=2)[0][:, 1])
 
 
 @dataclass(frozen=True)
@@ -368,14 +370,16 @@ def pairs_of_results(
     Returns:
         The pairs; their rows in `points`, (k,); and which rows of `points` have a known covariance, (n,).
     """
-    known = [one for one in (a, b) if one.point_covariance is not None or one.covariance is not None]
-    joint = all(one.covariance is not None for one in known)
-    rows_a, rows_b = (one.covariance_rows(p) for one, p in zip((a, b), points.T, strict=True))
+    known = [
+        result for result in (a, b) if result.point_covariance is not None or result.covariance is not None
+    ]
+    joint = all(result.covariance is not None for result in known)
+    rows_a, rows_b = (result.covariance_rows(p) for result, p in zip((a, b), points.T, strict=True))
     together = (rows_a >= 0) & (rows_b >= 0) if joint else _has_sigma(a, b, points)
     chosen = np.flatnonzero(together)
     chosen = chosen[:: -(-len(chosen) // MAX_POINTS)] if len(chosen) else chosen
     pa, pb = points[chosen].T
-    redundancies = [one.redundancy for one in known if one.redundancy is not None]
+    redundancies = [result.redundancy for result in known if result.redundancy is not None]
     pairs = PointPairs(
         tuple(a.network.points[j] for j in pa),
         a.estimate.points[pa],
@@ -386,7 +390,7 @@ def pairs_of_results(
         scale,
         sum(redundancies) if redundancies else None,
     )
-    if all(one.datum == "control" for one in known):
+    if all(result.datum == "control" for result in known):
         variance = np.diagonal(pairs.Q_a) + (scale or 1.0) ** 2 * np.diagonal(pairs.Q_b)
         free = np.flatnonzero(~held_points(variance.reshape(-1, 3)))
         pairs, chosen = pairs.chosen(free), chosen[free]
@@ -419,9 +423,9 @@ def coordinates_of(points: IntArray) -> IntArray:
 def _has_sigma(a: Solution, b: Solution, points: IntArray) -> BoolArray:
     """Return whether the covariance of either point of each pair is known, (n,)."""
     known = [
-        np.isfinite(one.point_covariance[p]).all(axis=(1, 2))
-        for one, p in zip((a, b), points.T, strict=True)
-        if one.point_covariance is not None
+        np.isfinite(result.point_covariance[p]).all(axis=(1, 2))
+        for result, p in zip((a, b), points.T, strict=True)
+        if result.point_covariance is not None
     ]
     return np.any(known, axis=0) if known else np.zeros(len(points), dtype=bool)
 

@@ -179,7 +179,7 @@ def compare_results(
     tested = test.untested is None
     points, free, _ = pairs
     cause = None
-    if align != "none" and any(has_sigma(one) for one in (a, b)):
+    if align != "none" and any(has_sigma(result) for result in (a, b)):
         agrees = tested and test.agrees
         cause = find_cause(points, reference=chosen[free], changed=not agrees)
     nothing = np.full(len(pa), np.nan)
@@ -260,7 +260,7 @@ def _same_share(a: Network, b: Network, pairing: Pairing) -> float:
 
 def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[InteriorDifference, ...]:
     """Return the differences of cameras with common photographs or the same name, each pair once."""
-    found = []
+    differences = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
     if a.images_named and b.images_named:
         pairs |= dict.fromkeys(_of_one_name(a.estimate.cameras, b.estimate.cameras, set(pairs)))
@@ -275,11 +275,12 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
             theirs = conversion.camera
         else:
             known = [
-                sigma if one.interior_sigma is None else one.interior_sigma[k] for one, k in ((a, p), (b, q))
+                sigma if result.interior_sigma is None else result.interior_sigma[k]
+                for result, k in ((a, p), (b, q))
             ]  # if only one sigma is known, it is that of the difference; if none is known, NaN
-            total = np.hypot(*(np.nan_to_num(one) for one in known))
+            total = np.hypot(*(np.nan_to_num(column) for column in known))
             sigma = np.where(np.isfinite(known).any(axis=0), total, np.nan)
-        found.append(
+        differences.append(
             InteriorDifference(
                 ours.name,
                 ours.model,
@@ -290,7 +291,7 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
                 conversion,
             )
         )
-    return tuple(found)
+    return tuple(differences)
 
 
 def _of_one_name(
@@ -298,11 +299,11 @@ def _of_one_name(
 ) -> list[tuple[int, int]]:
     """Pair cameras with the same name and the same size of photographs that are not paired yet."""
     ours, theirs = {p for p, _ in paired}, {q for _, q in paired}
-    index = {(one.name, one.size_px): q for q, one in enumerate(b) if q not in theirs}
+    index = {(camera.name, camera.size_px): q for q, camera in enumerate(b) if q not in theirs}
     return [
-        (p, index[one.name, one.size_px])
-        for p, one in enumerate(a)
-        if p not in ours and (one.name, one.size_px) in index
+        (p, index[camera.name, camera.size_px])
+        for p, camera in enumerate(a)
+        if p not in ours and (camera.name, camera.size_px) in index
     ]
 
 
@@ -365,16 +366,16 @@ def judge_points(
 
     if not n:
         return without(remark("untestable", reason="no points are common"))
-    if not any(has_sigma(one) for one in (a, b)):
+    if not any(has_sigma(result) for result in (a, b)):
         return without(remark("no_covariance", unknown="sigmas"))
-    known = [one for one in (a, b) if has_sigma(one)]
+    known = [result for result in (a, b) if has_sigma(result)]
     points, free, together = pairs
-    if all(one.covariance is not None for one in known):
-        if align == "none" and not all(one.datum == "control" for one in known):
+    if all(result.covariance is not None for result in known):
+        if align == "none" and not all(result.datum == "control" for result in known):
             return without(remark("no_common_datum"))
         d, Q = points.differences(transform)
         try:
-            found = congruency(
+            test = congruency(
                 *(d, Q, points.a),
                 motion="none" if align == "none" else "similarity" if points.scale is None else "rigid",
                 redundancy=points.redundancy,
@@ -384,8 +385,8 @@ def judge_points(
         except GeometryError as error:
             return without(remark("untestable", reason=str(error)))
         sigma[together] = 0.0  # held in both results, or overwritten below
-        return _congruency_test(found, free, sigma, together)
-    if not all(one.datum in FREE_DATUMS for one in known):
+        return _congruency_test(test, free, sigma, together)
+    if not all(result.datum in FREE_DATUMS for result in known):
         return without(remark("no_covariance", unknown="covariance"))
     difference = transform.apply(b.estimate.points[pb]) - a.estimate.points[pa]
     statistic, critical, global_critical = _single_tests(difference, blocks, points.redundancy, alpha)
@@ -398,22 +399,20 @@ def judge_points(
     )
 
 
-def _congruency_test(
-    found: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray
-) -> PointTest:
+def _congruency_test(test: Congruency, tested: IntArray, sigma: FloatArray, together: BoolArray) -> PointTest:
     """Return the test of all points, of which some took no part; `sigma` is overwritten in place."""
     n = len(together)
     statistic = np.full(n, np.nan)
-    sigma[tested] = np.sqrt(np.diagonal(found.covariance).reshape(-1, 3).clip(0))
-    statistic[tested] = found.statistic
+    sigma[tested] = np.sqrt(np.diagonal(test.covariance).reshape(-1, 3).clip(0))
+    statistic[tested] = test.statistic
     stable = together.copy()
-    stable[tested] = found.stable
+    stable[tested] = test.stable
     significant = np.zeros(n, dtype=bool)
-    significant[tested] = found.moved
-    first, critical = found.first_test, float(found.critical[found.reference][0])
+    significant[tested] = test.moved
+    first, critical = test.first_test, float(test.critical[test.reference][0])
     return PointTest(
         *(sigma, None, statistic, critical, significant, first.statistic, first.critical),
-        *(stable, False, found.agreed),
+        *(stable, False, test.agreed),
     )
 
 

@@ -118,20 +118,20 @@ def compare(
     Source: the 7-parameter similarity of Horn (1987) over all points, as for any two free networks: Caspary
     (2000), Concepts of network and deformation analysis, sec. 7.
     """
-    both = a.determined & b.determined
-    a_from_b = fit_similarity(b.points[both], a.points[both])
+    common = a.determined & b.determined
+    a_from_b = fit_similarity(b.points[common], a.points[common])
     moved = a_from_b.apply_estimate(b)
     images = a.oriented & b.oriented
-    size = float(np.linalg.norm(np.ptp(a.points[both], axis=0)))
+    size = float(np.linalg.norm(np.ptp(a.points[common], axis=0)))
     position = np.where(images[:, None], moved.position - a.position, np.nan)
-    points = np.where(both[:, None], moved.points - a.points, np.nan)
+    points = np.where(common[:, None], moved.points - a.points, np.nan)
     angle = np.full(len(images), np.nan)
     angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
     squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
     rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
     interior = tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True))
     interior_px = [interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]
-    rounding = rounding_of(a.points[both])
+    rounding = rounding_of(a.points[common])
     return Comparison(
         names,
         a,
@@ -197,14 +197,14 @@ def _in_sigmas(
         if len(Q) == len(free):
             names = tuple(f"{camera.names[k]} of camera {camera.name}" for k in free)
             kinds.append((names, difference[free, None], np.diagonal(Q)[:, None]))
-    found = []
+    largest = []
     for names, difference, variance in kinds:
         known = np.isfinite(difference) & (variance > 0)
         if known.any():
             ratio = np.where(known, np.abs(difference), 0.0) / np.sqrt(np.where(known, variance, 1.0))
             worst = int(np.argmax(ratio.max(axis=1)))
-            found.append((names[worst], float(ratio[worst].max())))
-    return tuple(found)
+            largest.append((names[worst], float(ratio[worst].max())))
+    return tuple(largest)
 
 
 def reprojection(network: Network, estimate: Estimate) -> FloatArray:
@@ -344,7 +344,7 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
     image = of_survey[seen.image]
     tangents = image_tangents(replace(seen, image=image), network.camera, estimate.cameras)
     known = np.isfinite(tangents).all(axis=1)
-    found = intersect(
+    intersection = intersect(
         tangents[known],
         image[known],
         seen.point[known],
@@ -352,14 +352,14 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
         estimate.rotation,
         n_points=len(survey.points),
     )
-    points = np.where((found.rays >= MIN_RAYS)[:, None], found.points, np.nan)
-    both = np.isfinite(points).all(axis=1) & adjustment.estimate.determined
-    if both.sum() < 3:
+    points = np.where((intersection.rays >= MIN_RAYS)[:, None], intersection.points, np.nan)
+    common = np.isfinite(points).all(axis=1) & adjustment.estimate.determined
+    if common.sum() < 3:
         raise GeometryError(
-            f"baseline {baseline.name}: its photographs determine {counted(both.sum(), 'target')} of the "
+            f"baseline {baseline.name}: its photographs determine {counted(common.sum(), 'target')} of the "
             "survey, 3 are needed"
         )
-    transform = fit_similarity(points[both], adjustment.estimate.points[both])
+    transform = fit_similarity(points[common], adjustment.estimate.points[common])
     oriented = (of_survey >= 0) & adjustment.estimate.oriented
     m = len(survey.images)
     position, angle = np.full((m, 3), np.nan), np.full(m, np.nan)
@@ -380,9 +380,9 @@ def compare_baseline(adjustment: Adjustment, baseline: Baseline, *, seconds: flo
         (int(adjustment.estimate.oriented.sum()), len(index)),
         baseline.total,
         (adjustment.rms_px, baseline.rms_px),
-        int(both.sum()),
+        int(common.sum()),
         float(np.sqrt(np.nanmean(v**2))),
-        np.where(both[:, None], transform.apply(points) - adjustment.estimate.points, np.nan),
+        np.where(common[:, None], transform.apply(points) - adjustment.estimate.points, np.nan),
         position,
         angle,
         (seconds, baseline.seconds),

@@ -99,7 +99,7 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
     image points have the weight that their residuals suggest.
     """
     kinds = by_kind(adjustment)
-    found, w, tau, pairs = (
+    detectable, w, tau, pairs = (
         reliability(adjustment),
         w_test(adjustment),
         tau_test(adjustment),
@@ -118,9 +118,9 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
         tau=tau,
         largest_w=summarise_redundancy(np.abs(w.statistic)).largest,
         largest_tau=summarise_redundancy(np.abs(tau.statistic)).largest,
-        reliability=found,
-        minimal_bias=summarise_redundancy(found.minimal_bias),
-        external=summarise_redundancy(found.external),
+        reliability=detectable,
+        minimal_bias=summarise_redundancy(detectable.minimal_bias),
+        external=summarise_redundancy(detectable.external),
         redundancy=summarise_redundancy(adjustment.redundancy_numbers),
         redundancy_of_image_points=float(np.nansum(adjustment.redundancy_numbers)),
         redundancy_sum=float(kinds.redundancy.sum()),
@@ -240,7 +240,7 @@ class Given:
 
     def of(self, kind: str) -> GivenResiduals | None:
         """Return the residuals of a kind by its singular name; None without any."""
-        return next((one for one in self.kinds if one.kind == kind), None)
+        return next((residuals for residuals in self.kinds if residuals.kind == kind), None)
 
     @property
     def exterior(self) -> tuple[GivenResiduals, ...]:
@@ -257,11 +257,11 @@ def given_of(a: Adjustment, length_unit: str) -> Given:
         a: result of `adjust`.
         length_unit: unit of its coordinates.
     """
-    took_part = {one.index: (one.rows, one.redundancy_numbers, one.standardised) for one in a.observed}
-    found: list[GivenResiduals] = []
+    took_part = {part.index: (part.rows, part.redundancy_numbers, part.standardised) for part in a.observed}
+    residuals: list[GivenResiduals] = []
     for index, part in given_residuals(a.network, a.estimate, length_unit, took_part):
         if part.kind == InteriorObservations.single:
-            found += [part.rows(took_part[index][0])] if index in took_part else []
+            residuals += [part.rows(took_part[index][0])] if index in took_part else []
         elif part.kind != ObjectPoints.single or a.datum == "control":
-            found.append(part)
-    return Given(tuple(found))
+            residuals.append(part)
+    return Given(tuple(residuals))

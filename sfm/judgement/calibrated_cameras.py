@@ -86,7 +86,7 @@ def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ())
     for plate in plates:
         sigma[plate.points] = plate.sigma
     sigma[given.point] = np.sqrt(np.trace(given.covariance, axis1=1, axis2=2) / 3)
-    c = np.array([one.c_px for one in adjustment.estimate.cameras])[network.camera[seen.image]]
+    c = np.array([camera.c_px for camera in adjustment.estimate.cameras])[network.camera[seen.image]]
     away = adjustment.estimate.points[seen.point] - adjustment.estimate.position[seen.image]
     known[seen.point[c * sigma[seen.point] < np.linalg.norm(away, axis=1)]] = True
     unknown = np.zeros(len(known), dtype=bool)
@@ -102,17 +102,22 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
     """
     adjustment = result.adjustment
     failed = {
-        name for one in result.stage_remarks if one.kind == CALIBRATION_FAILED for name in one.names("camera")
+        name
+        for stage_remark in result.stage_remarks
+        if stage_remark.kind == CALIBRATION_FAILED
+        for name in stage_remark.names("camera")
     }
     if not camera_is_result(adjustment, result.plates):
         return ()
-    found = []
+    calibrated = []
     for f, family in enumerate(interior.families):
         if family.name in failed:
             continue
         projection = projection_of(adjustment, interior.family == f)
-        parameters = tuple(one for one in family.parameters if one.parameter.role in OF_CAMERA)
-        if projection is None and not any(np.isinf(one.sigma) for one in family.parameters):
+        parameters = tuple(
+            parameter for parameter in family.parameters if parameter.parameter.role in OF_CAMERA
+        )
+        if projection is None and not any(np.isinf(parameter.sigma) for parameter in family.parameters):
             continue  # held
         rms = largest = inner = np.inf
         seen = adjustment.network.image_points.select(~adjustment.rejected)
@@ -129,12 +134,12 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
                 float(sigma[known].max()) if known.any() else np.nan,
             )
             inner = root_mean_square(sigma[known & inside.reshape(sigma.shape)])
-        found.append(
+        calibrated.append(
             CalibratedCamera(
                 family.name, parameters, rms, largest, inner, area / float(np.prod(family.camera.size_px))
             )
         )
-    return tuple(found)
+    return tuple(calibrated)
 
 
 def projection_of(
@@ -191,17 +196,21 @@ def interior_of(adjustment: Adjustment) -> InteriorOrientation:
     """Return the interior orientation of an adjustment."""
     parameters, listed = interior_parameters(adjustment), families(adjustment)
     common = {
-        name: tuple(one for one in parameters if one.owner == name) for name in (name for name, _ in listed)
+        name: tuple(parameter for parameter in parameters if parameter.owner == name)
+        for name in (name for name, _ in listed)
     }
     return InteriorOrientation(
         parameters,
         tuple(
             CameraFamily(
-                name, camera, common[name], max((one.photographs for one in common[name]), default=0)
+                name,
+                camera,
+                common[name],
+                max((parameter.photographs for parameter in common[name]), default=0),
             )
             for name, camera in listed
         ),
-        tuple(one for one in parameters if one.owner not in common),
+        tuple(parameter for parameter in parameters if parameter.owner not in common),
         tuple(adjustment.interior_sigma(a) for a in range(len(adjustment.estimate.cameras))),
         family_of_photographs(adjustment),
     )
@@ -211,7 +220,7 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
     """Return every parameter of interior orientation once, common ones first, without those fixed at 0."""
     network = adjustment.network
     used = np.bincount(network.camera, minlength=len(adjustment.estimate.cameras))
-    found: dict[tuple[str, str, int], InteriorParameter] = {}
+    listed: dict[tuple[str, str, int], InteriorParameter] = {}
     for a, camera in enumerate(adjustment.estimate.cameras):
         sigma = adjustment.interior_sigma(a)
         for s, parameter in enumerate(MODELS[camera.model].parameters):
@@ -220,11 +229,11 @@ def interior_parameters(adjustment: Adjustment) -> tuple[InteriorParameter, ...]
                 continue
             owner = camera.owner_of(s)
             key = (owner, parameter.name, -1 if camera.group_of(s) else a)
-            known = found.get(key)
+            known = listed.get(key)
             count = int(used[a]) + (known.photographs if known else 0)
-            found[key] = InteriorParameter(owner, count, parameter, value, float(sigma[s]))
+            listed[key] = InteriorParameter(owner, count, parameter, value, float(sigma[s]))
     common = {name for name, _ in families(adjustment)}
-    return tuple(sorted(found.values(), key=lambda one: one.owner not in common))
+    return tuple(sorted(listed.values(), key=lambda parameter: parameter.owner not in common))
 
 
 def families(adjustment: Adjustment) -> tuple[tuple[str, Camera], ...]:
@@ -294,15 +303,15 @@ def rigs_of(a: Adjustment, *, planned: bool = False) -> tuple[Rig, ...]:
     mounts, moment = a.estimate.mounts, a.network.moment
     if mounts is None or moment is None:
         return ()
-    found = []
+    rigs = []
     for rig, (reference, *others_on) in mounts.by_rig().items():
         of_rig = np.isin(a.network.camera, [reference, *others_on])
         others = tuple(
             _mount(a, k, None if planned else _epipolar(a, reference, k, moment)) for k in others_on
         )
         shared = int((np.bincount(moment[of_rig]) > 1).sum())
-        found.append(Rig(rig, a.estimate.cameras[reference].name, others, shared))
-    return tuple(found)
+        rigs.append(Rig(rig, a.estimate.cameras[reference].name, others, shared))
+    return tuple(rigs)
 
 
 def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> EpipolarDistances:
@@ -313,9 +322,9 @@ def _epipolar(a: Adjustment, reference: int, camera: int, moment: IntArray) -> E
     mounts, k = a.estimate.mounts, a.network.image_points
     assert mounts is not None
     rows = [np.flatnonzero(~a.rejected & (a.network.camera[k.image] == of)) for of in (reference, camera)]
-    keys = [moment[k.image[some]] * len(a.network.points) + k.point[some] for some in rows]
+    keys = [moment[k.image[of_camera]] * len(a.network.points) + k.point[of_camera] for of_camera in rows]
     _, *common = np.intersect1d(keys[0], keys[1], return_indices=True)
-    first, second = (some[at] for some, at in zip(rows, common, strict=True))
+    first, second = (of_camera[at] for of_camera, at in zip(rows, common, strict=True))
     d1, d2 = (
         np.column_stack([tangents_from_pixel(a.estimate.cameras[of], k.xy[at]), -np.ones(len(at))])
         for of, at in ((reference, first), (camera, second))

@@ -30,34 +30,34 @@ def _not_calibrated(result: SurveyResult, calibrated: tuple[CalibratedCamera, ..
     If the camera is well known between the image points, the remark says that the margin of the photograph
     lacks image points.
     """
-    sigma, found = result.adjustment.sigma0_px, list[Remark]()
-    for one in calibrated:
-        rms = one.projection_rms_px
+    sigma, remarks = result.adjustment.sigma0_px, list[Remark]()
+    for camera in calibrated:
+        rms = camera.projection_rms_px
         if np.isinf(rms):
-            found.append(remark(CALIBRATION_FAILED, camera=one.name))
+            remarks.append(remark(CALIBRATION_FAILED, camera=camera.name))
             continue
         times = rms / sigma if sigma > 0 else None
-        weak = remark("camera_not_calibrated", camera=one.name, rms=(rms, "px"), times=times)
-        if remark("camera_not_calibrated", rms=one.observed_rms_px, times=times).severity == "note":
-            numbers = {**weak.numbers, "observed": Quantity(one.observed)}
+        weak = remark("camera_not_calibrated", camera=camera.name, rms=(rms, "px"), times=times)
+        if remark("camera_not_calibrated", rms=camera.observed_rms_px, times=times).severity == "note":
+            numbers = {**weak.numbers, "observed": Quantity(camera.observed)}
             weak = replace(weak, kind="margin_not_calibrated", numbers=numbers)
-        found += unless_note(weak)
-    return tuple(found)
+        remarks += unless_note(weak)
+    return tuple(remarks)
 
 
 def _poorly_determined(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on principal distances that the photographs hardly determine, as with long lenses."""
-    strong = {one.parameter: one.partners for one in result.orientation_correlations}
-    found: dict[str, tuple[Remark, ...]] = {}
+    strong = {correlation.parameter: correlation.partners for correlation in result.orientation_correlations}
+    of_owner: dict[str, tuple[Remark, ...]] = {}
     for number, camera in enumerate(result.adjustment.estimate.cameras):
         name, c = camera.names[0], float(camera.parameters[0])
         sigma = float(result.adjustment.interior_sigma(number)[0])
         owner = camera.owner_of(0)
         if np.isfinite(sigma):
             share, partners = sigma / abs(c), strong.get(f"{name} of camera {owner}")
-            one = remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
-            found.setdefault(owner, unless_note(one))
-    return tuple(one for remarks in found.values() for one in remarks)
+            of_c = remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
+            of_owner.setdefault(owner, unless_note(of_c))
+    return tuple(determined for remarks in of_owner.values() for determined in remarks)
 
 
 def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
@@ -91,15 +91,15 @@ def _principal_sigma_px(result: SurveyResult, number: int) -> float:
 
 def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on adjusted affinity and shear of pixels that no sensor has."""
-    found: list[Remark] = []
+    remarks: list[Remark] = []
     for number, camera in enumerate(result.adjustment.estimate.cameras):
         sigma = dict(zip(camera.names, result.adjustment.interior_sigma(number).tolist(), strict=True))
         values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
         adjusted = camera.free & camera.plays(Role.AFFINITY, Role.SHEAR)
         shares = {
             name: values[name]
-            for name, one in zip(camera.names, adjusted, strict=True)
-            if one and abs(values[name]) > EXPECTED_SIGMAS * sigma[name]
+            for name, is_adjusted in zip(camera.names, adjusted, strict=True)
+            if is_adjusted and abs(values[name]) > EXPECTED_SIGMAS * sigma[name]
         }
         if camera.free[camera.parts[0]].sum() == 2:  # a focal length for each direction
             first, second = np.flatnonzero(camera.parts[0])
@@ -109,18 +109,18 @@ def _pixels(result: SurveyResult) -> tuple[Remark, ...]:
             if abs(ratio - 1) > EXPECTED_SIGMAS * of_ratio:
                 shares[f"{camera.names[second]} / {camera.names[first]} - 1"] = float(ratio) - 1
         for name, value in shares.items():
-            found += unless_note(
+            remarks += unless_note(
                 remark("pixels_distorted", camera=camera.name, parameter=name, share=abs(value))
             )
-    return tuple(found)
+    return tuple(remarks)
 
 
 def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] | None:
     """Return the format centred at a position: sides exchanged, doubled or halved; None without one."""
     formats = [(height, width), *((round(s * width), round(s * height)) for s in (0.5, 2.0))]
-    for one in formats:
-        if np.linalg.norm(at - np.array(one) / 2) < DECENTRING_FRACTION * np.hypot(*one):
-            return one
+    for size_px in formats:
+        if np.linalg.norm(at - np.array(size_px) / 2) < DECENTRING_FRACTION * np.hypot(*size_px):
+            return size_px
     return None
 
 
@@ -133,12 +133,12 @@ def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
     Returns:
         Standard deviation of an edge, px, by name; photographs without measured edges are left out.
     """
-    found = {}
-    for one in photographs:
-        blur = np.zeros(0) if one.blur is None else one.blur[np.isfinite(one.blur)]
+    median_blur = {}
+    for photograph in photographs:
+        blur = np.zeros(0) if photograph.blur is None else photograph.blur[np.isfinite(photograph.blur)]
         if len(blur):
-            found[one.image] = float(np.median(blur))
-    return found
+            median_blur[photograph.image] = float(np.median(blur))
+    return median_blur
 
 
 def sharpness_remarks(
@@ -154,18 +154,20 @@ def sharpness_remarks(
     unseen = n - np.bincount(a.network.image_points.image[~a.rejected], minlength=m)
     level = a.levels.family
     few = np.flatnonzero(more_than_chance(unseen, np.full(m, n), level))
-    suspected = {one.image for one in result.failed} | {a.network.images[i] for i in few}
+    suspected = {photograph.image for photograph in result.failed} | {a.network.images[i] for i in few}
     if consistency.uneven is not None:
         suspected.add(consistency.uneven.worst)
     cameras: dict[str, list[str]] = {}
-    for one in result.photographs:
-        if one.image in edges:
-            cameras.setdefault(one.camera, []).append(one.image)
+    for photograph in result.photographs:
+        if photograph.image in edges:
+            cameras.setdefault(photograph.camera, []).append(photograph.image)
     remarks = []
     for camera, names in cameras.items():
         blur = np.array([edges[name] for name in names])
         large = larger_than_the_others(np.log(blur), level=level / len(cameras))
-        blurred = [name for name, one in zip(names, large, strict=True) if one and name in suspected]
+        blurred = [
+            name for name, is_large in zip(names, large, strict=True) if is_large and name in suspected
+        ]
         if blurred:
             remarks.append(
                 remark(

@@ -139,7 +139,7 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     sigma = network.interior.sigma
     interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
     first = len(network.kinds) - len(network.observations)
-    further = sum(one.count for one in adjustment.observed if one.index >= first)
+    further = sum(part.count for part in adjustment.observed if part.index >= first)
     bars = adjustment.observations - image - control - exterior - interior - further
     return ObservationCounts(
         image,
@@ -259,8 +259,8 @@ def rms_of_groups(index: IntArray, v: FloatArray, count: int) -> FloatArray:
 def largest(values: FloatArray) -> FloatArray:
     """Return the largest known value of each column (n, d) and of all, (d + 1,)."""
     columns = np.where(np.isfinite(values), values, -np.inf).max(axis=0, initial=-np.inf)
-    found = np.array([*columns, columns.max()])
-    return np.asarray(np.where(np.isfinite(found), found, np.nan))
+    maxima = np.array([*columns, columns.max()])
+    return np.asarray(np.where(np.isfinite(maxima), maxima, np.nan))
 
 
 def point_sigma(covariance: FloatArray) -> tuple[float, float]:
@@ -295,11 +295,11 @@ def check_coordinates(result: SurveyResult, *, placed: bool = False) -> tuple[Co
     points = a.estimate.points
     return tuple(
         compare_coordinate(
-            one.point, c, given, one.sigma[c], points[j, c], posterior[j, c], points[j, c] - given
+            point.point, c, given, point.sigma[c], points[j, c], posterior[j, c], points[j, c] - given
         )
-        for one in (result.check_points if compared else ())
-        if (j := index_of.get(one.point)) is not None
-        for c, given in enumerate(one.xyz)
+        for point in (result.check_points if compared else ())
+        if (j := index_of.get(point.point)) is not None
+        for c, given in enumerate(point.xyz)
         if np.isfinite(given)
     )
 

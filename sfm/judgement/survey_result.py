@@ -239,32 +239,44 @@ class SurveyResult:
     def seen_targets(self) -> SeenTargets:
         """Measured targets and rejected candidates in the photographs of the result."""
         index = {name: i for i, name in enumerate(self.network.images)}
-        of_index = [one for one in self.photographs if one.image in index]
-        of_index.sort(key=lambda one: index[one.image])
+        of_index = [photograph for photograph in self.photographs if photograph.image in index]
+        of_index.sort(key=lambda photograph: index[photograph.image])
         nothing = np.full((0, 3), np.nan)
         return SeenTargets(
             np.array(
-                [index[one.image] for one in of_index for _ in range(len(one.xy) + len(one.rejected_xy))],
+                [
+                    index[photograph.image]
+                    for photograph in of_index
+                    for _ in range(len(photograph.xy) + len(photograph.rejected_xy))
+                ],
                 dtype=np.int64,
             ),
-            np.vstack([np.zeros((0, 2)), *(part for one in of_index for part in (one.xy, one.rejected_xy))]),
+            np.vstack(
+                [
+                    np.zeros((0, 2)),
+                    *(part for photograph in of_index for part in (photograph.xy, photograph.rejected_xy)),
+                ]
+            ),
             np.vstack(
                 [
                     nothing,
                     *(
                         part
-                        for one in of_index
+                        for photograph in of_index
                         for part in (
-                            np.column_stack([one.semi_axes, one.angle]),
-                            np.full((len(one.rejected_xy), 3), np.nan),
+                            np.column_stack([photograph.semi_axes, photograph.angle]),
+                            np.full((len(photograph.rejected_xy), 3), np.nan),
                         )
                     ),
                 ]
             ),
             tuple(
                 words
-                for one in of_index
-                for words in (*[""] * len(one.xy), *(_reason(int(flag)) for flag in one.rejected_flag))
+                for photograph in of_index
+                for words in (
+                    *[""] * len(photograph.xy),
+                    *(_reason(int(flag)) for flag in photograph.rejected_flag),
+                )
             ),
         )
 
@@ -309,7 +321,7 @@ class SurveyResult:
         a = self.adjustment
         sigma = np.sqrt(np.nanmean(np.diagonal(a.covariance.points, axis1=1, axis2=2), axis=0))
         state = "converged" if a.converged else "did NOT converge"
-        both = self.comparison
+        comparison = self.comparison
         rows = [
             ("photographs", f"{len(a.network.images)} of {self.images_total} oriented"),
             ("points", f"{len(a.network.points)}, {int((self.code >= 0).sum())} coded"),
@@ -318,8 +330,8 @@ class SurveyResult:
             ("sigma0", f"{a.sigma0_px:.4f} px"),
             ("RMS sigma of points", f"{', '.join(f'{s:.3g}' for s in sigma)} {self.length_unit}"),
         ]
-        if both is not None:
-            rows.append((both.backend, both.outcome))
+        if comparison is not None:
+            rows.append((comparison.backend, comparison.outcome))
         return rows
 
     def __repr__(self) -> str:
@@ -327,7 +339,7 @@ class SurveyResult:
         return f"{table}\n{self.verdict.text}"
 
     def _repr_html_(self) -> str:
-        remarks = [(one.severity, one.text) for one in self.verdict.lines]
+        remarks = [(line.severity, line.text) for line in self.verdict.lines]
         rows = [("verdict", self.verdict.headline), *self._rows(), *remarks]
         return html_table(f"Survey {self.survey}", ("", ""), rows)
 
@@ -369,7 +381,7 @@ class SurveyResult:
 @cache
 def _reason(flag: int) -> str:
     """Return the reasons why a candidate was not measured, in words."""
-    names = [in_words(str(one.name).lower()) for one in Flag if one.value and flag & one.value]
+    names = [in_words(str(reason.name).lower()) for reason in Flag if reason.value and flag & reason.value]
     return ", ".join(names) or "no reason kept"
 
 

@@ -135,13 +135,15 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
 def slight_as_tests(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
     """Return remarks with a test in place of each effect that shifts the result less than users expect."""
 
-    def is_slight(one: Remark) -> bool:
-        grade = None if one.test is not None else one.row.severity
-        return isinstance(grade, Grade) and grade.number == "shift" and one.severity == "note"
+    def is_slight(effect: Remark) -> bool:
+        grade = None if effect.test is not None else effect.row.severity
+        return isinstance(grade, Grade) and grade.number == "shift" and effect.severity == "note"
 
     return tuple(
-        remark("slight_effect", cause=one.kind, shift=one.number("shift")) if is_slight(one) else one
-        for one in remarks
+        remark("slight_effect", cause=effect.kind, shift=effect.number("shift"))
+        if is_slight(effect)
+        else effect
+        for effect in remarks
     )
 
 
@@ -152,8 +154,8 @@ def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:
 
 def _headlines(templates: Mapping[Level, str], a: Adjustment, photographs: str) -> dict[Level, str]:
     """Return the headline of each level."""
-    found = f"{photographs}, {counted(int(a.estimate.determined.sum()), 'object point')}"
-    return {level: text.format(found=found) for level, text in templates.items()}
+    counts = f"{photographs}, {counted(int(a.estimate.determined.sum()), 'object point')}"
+    return {level: text.format(found=counts) for level, text in templates.items()}
 
 
 def _took_part(a: Adjustment) -> BoolArray:
@@ -187,8 +189,8 @@ def convergence_remarks(a: Adjustment) -> tuple[Remark, ...]:
 
 def photograph_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on photographs that are not in the result, on unreadable files, and on copies."""
-    copies = [one.image for one in result.failed if one.is_copy]
-    unreadable = [one.image for one in result.failed if one.is_unreadable]
+    copies = [photograph.image for photograph in result.failed if photograph.is_copy]
+    unreadable = [photograph.image for photograph in result.failed if photograph.is_unreadable]
     total = result.images_total
     missing = total - len(result.adjustment.network.images)
     remarks: list[Remark] = []
@@ -207,23 +209,23 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
 
     If nothing checks the handedness, only a much larger part shows that the other part is mirrored.
     """
-    single = [one for one in result.failed if one.reason.kind == "photograph_mirrored"]
+    single = [photograph for photograph in result.failed if photograph.reason.kind == "photograph_mirrored"]
     groups = {
-        one.reason.names("photographs"): one.reason
-        for one in result.failed
-        if one.reason.kind == "photograph_of_mirror_image"
+        photograph.reason.names("photographs"): photograph.reason
+        for photograph in result.failed
+        if photograph.reason.kind == "photograph_of_mirror_image"
     }
     right, mirrored = len(result.adjustment.network.images), len(single) + sum(map(len, groups))
     decided: dict[str, tuple[str, ...]] = {}
     unknown = not result.adjustment.network.named.any() or any(
-        one.kind == "handedness_unchecked" for one in result.stage_remarks
+        stage_remark.kind == "handedness_unchecked" for stage_remark in result.stage_remarks
     )
     if not unknown:
         decided = {"decided_by": ("known handedness",)}
     elif binomial_sf(right - 1, right + mirrored, 0.5) < result.adjustment.false_alarm:  # a sign test
         decided = {"decided_by": ("most photographs",)}
     return (
-        *(replace(one.reason, subjects={"photograph": (one.image,)}) for one in single),
+        *(replace(photograph.reason, subjects={"photograph": (photograph.image,)}) for photograph in single),
         *(replace(reason, subjects={**reason.subjects, **decided}) for reason in groups.values()),
     )
 
@@ -233,13 +235,13 @@ def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
 
     A flat valley of c contains many solutions; those in between add nothing.
     """
-    found: dict[bool, Remark] = {}
-    for other in sorted(result.other_solutions, key=lambda one: -one.moved):
+    farthest_of: dict[bool, Remark] = {}
+    for other in sorted(result.other_solutions, key=lambda solution: -solution.moved):
         of_camera = {"camera": other.camera, "c": (other.c, other.unit), "c_moved": other.c_moved or None}
         parts = {"reversed": "object"} if other.reflected else of_camera
         farthest = remark("other_solution", vPv=other.vPv, moved=other.moved, **parts)
-        found.setdefault(other.reflected, farthest)
-    return tuple(found.values())
+        farthest_of.setdefault(other.reflected, farthest)
+    return tuple(farthest_of.values())
 
 
 def sigma0_remarks(sigma0: Sigma0, adjustment: Adjustment) -> tuple[Remark, ...]:
@@ -275,15 +277,15 @@ def residual_remarks(worst: LongestResidual) -> tuple[Remark, ...]:
 
 def gross_error_remarks(a: Adjustment, *, rejects: bool) -> tuple[Remark, ...]:
     """Return the test of the accepted image coordinates; as a remark if nothing was rejected."""
-    found = robust_test(a)
+    test = robust_test(a)
     numbers = {
-        "beyond": found.beyond,
-        "tested": found.tested,
-        "critical": found.critical,
-        "chance": found.expected,
+        "beyond": test.beyond,
+        "tested": test.tested,
+        "critical": test.critical,
+        "chance": test.expected,
     }
-    tested = (remark("gross_errors_tested", **numbers),) if found.tested else ()
-    return tested if rejects or not found.far_more else (*tested, remark("gross_errors_kept", **numbers))
+    tested = (remark("gross_errors_tested", **numbers),) if test.tested else ()
+    return tested if rejects or not test.far_more else (*tested, remark("gross_errors_kept", **numbers))
 
 
 def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
@@ -309,28 +311,30 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
 
 
 def consistency_remarks(
-    found: Consistency, rejected: int, *, automatic: frozenset[str] = frozenset()
+    consistency: Consistency, rejected: int, *, automatic: frozenset[str] = frozenset()
 ) -> tuple[Remark, ...]:
     """Return the tests of points and photographs, and remarks on those that a person can correct.
 
     Args:
-        found: the tests.
+        consistency: the tests.
         rejected: number of rejected image points.
         automatic: names of the points that nobody named, such as those of natural texture, or can correct.
     """
     remarks = []
-    doubtful = [one.point for one in found.doubtful]
-    if found.tested:
-        large = {"larger": len(found.large), "points": found.large or None}
+    doubtful = [point.point for point in consistency.doubtful]
+    if consistency.tested:
+        large = {"larger": len(consistency.large), "points": consistency.large or None}
         of_rejected = {"doubtful": len(doubtful), "points": doubtful or None}
         remarks += [
-            remark("points_tested", tested=found.tested, **large),
+            remark("points_tested", tested=consistency.tested, **large),
             remark("doubtful_tested", tested=rejected, **of_rejected),
         ]
-    if found.parts:
-        remarks.append(remark("parts_tested", parts=found.parts, different=int(found.change is not None)))
-    if found.change is not None:
-        change = found.change
+    if consistency.parts:
+        remarks.append(
+            remark("parts_tested", parts=consistency.parts, different=int(consistency.change is not None))
+        )
+    if consistency.change is not None:
+        change = consistency.change
         differ = remark(
             "photographs_differ",
             first=change.first,
@@ -340,11 +344,14 @@ def consistency_remarks(
             shift=change.shift,
         )
         remarks += unless_note(differ)
-    for kind, points in (("points_doubtful", doubtful), ("points_with_large_residuals", found.outlying)):
+    for kind, points in (
+        ("points_doubtful", doubtful),
+        ("points_with_large_residuals", consistency.outlying),
+    ):
         correctable = [name for name in points if name not in automatic]
         if correctable:
             remarks.append(remark(kind, points=correctable))
-    uneven = found.uneven
+    uneven = consistency.uneven
     if uneven is not None:
         remarks.append(
             remark(
@@ -359,15 +366,15 @@ def consistency_remarks(
 
 def comparison_remarks(result: SurveyResult) -> tuple[Remark, ...]:
     """Return remarks on whether the other adjuster agrees, and whether its camera fits better."""
-    both = result.comparison
-    if both is None:
+    comparison = result.comparison
+    if comparison is None:
         return ()
-    program, better = program_name(both.backend), both.better
+    program, better = program_name(comparison.backend), comparison.better
     remarks = []
-    if both.outcome == "differs":
+    if comparison.outcome == "differs":
         remarks.append(remark("adjuster_differs", program=program))
-    elif both.outcome == "fits alike":
-        remarks.append(remark("adjuster_fits_alike", program=program, gap=both.gap))
+    elif comparison.outcome == "fits alike":
+        remarks.append(remark("adjuster_fits_alike", program=program, gap=comparison.gap))
     if better is not None:
         remarks.append(
             remark(
@@ -400,9 +407,9 @@ def given_remarks(
         *_checks(checks, result.length_unit, level),
         *_scale(result),
         *(
-            remark("given_tested", of=one.what, chi2=one.statistic, dof=one.dof, p=one.probability)
-            for one in result.given_tests
-            if one.dof  # else nothing was tested
+            remark("given_tested", of=test.what, chi2=test.statistic, dof=test.dof, p=test.probability)
+            for test in result.given_tests
+            if test.dof  # else nothing was tested
         ),
     )
 
@@ -412,14 +419,14 @@ def _kinds(statistics: Statistics, judged: set[str], level: float) -> tuple[Rema
 
     Kinds that were judged against the free network already have a remark.
     """
-    found = statistics.kinds
-    level /= max(len(found.names) - 1, 1)
+    kinds = statistics.kinds
+    level /= max(len(kinds.names) - 1, 1)
     return tuple(
-        remark("given_sigmas", of=test.of, factor=float(found.sigma0[g]))
-        for g, test in enumerate(component_tests(found, alpha=2 * level))
+        remark("given_sigmas", of=test.of, factor=float(kinds.sigma0[g]))
+        for g, test in enumerate(component_tests(kinds, alpha=2 * level))
         if test.of not in (IMAGE_POINTS, INTERIOR)
         and JUDGED_AS.get(test.of) not in judged
-        and found.count[g] > 1
+        and kinds.count[g] > 1
         and test.statistic > test.upper
     )
 
@@ -443,32 +450,32 @@ def _differing(given: Given, level: float) -> Iterator[Remark]:
 
 def _beyond_chance(kind: GivenResiduals, level: float) -> GivenValue | None:
     """Return the value of a kind with the largest w, if w is larger than by chance."""
-    tested = [one for one in kind.by_w if np.isfinite(one.w) and one.r >= MIN_REDUNDANCY]
+    tested = [value for value in kind.by_w if np.isfinite(value.w) and value.r >= MIN_REDUNDANCY]
     if not tested or not abs(tested[0].w) > -normal_ppf(level / (2 * len(tested))):
         return None
     return tested[0]
 
 
-def _parts(one: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tuple[float, str]]:
+def _parts(value: GivenValue, kind: GivenResiduals) -> dict[str, str | float | tuple[float, str]]:
     """Return a value, its difference and its w in the form of a remark."""
     return {
-        "given": f"{one.coordinate} of {kind.kind} {one.name}",
-        "difference": (abs(one.difference), one.unit),
-        "sigmas": abs(one.w),
+        "given": f"{value.coordinate} of {kind.kind} {value.name}",
+        "difference": (abs(value.difference), value.unit),
+        "sigmas": abs(value.w),
     }
 
 
 def _checks(checks: Sequence[ControlCoordinate], unit: str, level: float) -> tuple[Remark, ...]:
     """Return the remark on the coordinates that took no part and differ."""
-    tested = [one for one in checks if np.isfinite(one.test)]
+    tested = [check for check in checks if np.isfinite(check.test)]
     critical = -normal_ppf(level / (2 * max(len(tested), 1)))
-    beyond = [one for one in tested if abs(one.test) > critical]
+    beyond = [check for check in tested if abs(check.test) > critical]
     if not beyond:
         return ()
-    points = {one.point for one in tested}
-    differing = list(dict.fromkeys(one.point for one in beyond))
-    coordinates = sorted({one.coordinate for one in beyond})
-    farthest = max(abs(one.difference) for one in beyond)
+    points = {check.point for check in tested}
+    differing = list(dict.fromkeys(check.point for check in beyond))
+    coordinates = sorted({check.coordinate for check in beyond})
+    farthest = max(abs(check.difference) for check in beyond)
     return (
         remark(
             "checks_differ",
@@ -478,7 +485,7 @@ def _checks(checks: Sequence[ControlCoordinate], unit: str, level: float) -> tup
             all=len(points),
             more=2 * len(differing) - len(points),
             distance=(farthest, unit),
-            sigmas=max(abs(one.test) for one in beyond),
+            sigmas=max(abs(check.test) for check in beyond),
         ),
     )
 

@@ -143,7 +143,7 @@ def match_points(
     by = Settings(
         method, template_px, template_px + 2 * reach, equalise, interpolation, min_correlation, back
     )
-    found = _match_by_size(
+    matched = _match_by_size(
         seen.left,
         seen.right,
         seen.small(a),
@@ -152,11 +152,11 @@ def match_points(
         given=xy_right is not None,
         wide=wide and template_px >= MIN_TEMPLATE_PX,
     )
-    right_xy = np.where(found.good[:, None], seen.full(found.right), np.nan)
-    covariance = np.where(found.good[:, None, None], seen.shrink**2 * found.covariance, np.nan)
-    warp = found.warp.copy()
+    right_xy = np.where(matched.good[:, None], seen.full(matched.right), np.nan)
+    covariance = np.where(matched.good[:, None, None], seen.shrink**2 * matched.covariance, np.nan)
+    warp = matched.warp.copy()
     warp[:, :2, 2], warp[:, 2, :2] = seen.full(warp[:, :2, 2]), warp[:, 2, :2] / seen.shrink
-    return replace(found, left=a, right=right_xy, covariance=covariance, warp=warp)
+    return replace(matched, left=a, right=right_xy, covariance=covariance, warp=warp)
 
 
 def _match_by_size(
@@ -251,12 +251,12 @@ def match_turned(
             contain a similar patch. The template must then be unique in the left photograph within OWN_PX.
     """
     best, rival, second = _starts(left, right, xy_left, xy_right, by)
-    one, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
-    swap = other.good & ~(one.good & (one.correlation >= other.correlation))
-    r = np.where(swap, other.correlation, one.correlation)
+    direct, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
+    swap = other.good & ~(direct.good & (direct.correlation >= other.correlation))
+    r = np.where(swap, other.correlation, direct.correlation)
     lesser, is_other = (
-        np.where(swap, one.correlation, other.correlation),
-        np.where(swap, one.good, other.good),
+        np.where(swap, direct.correlation, other.correlation),
+        np.where(swap, direct.good, other.good),
     )
     second = np.where(is_other, np.fmax(lesser, second), second)
     if not given:
@@ -265,11 +265,11 @@ def match_turned(
         )
         second = np.fmax(second, to_left.second)
     pixels = independent_pixels(grey_of(left), xy_left, by.template_px)
-    doubt = one.good | other.good
+    doubt = direct.good | other.good
     doubt &= ambiguous(r, second, pixels)
-    reason = np.where(swap, np.array(other.reason, dtype=object), np.array(one.reason, dtype=object))
+    reason = np.where(swap, np.array(other.reason, dtype=object), np.array(direct.reason, dtype=object))
     reason[doubt] = in_words(NccFlag, NccFlag.AMBIGUOUS)
-    chosen = one.with_rows(np.flatnonzero(swap), other.rows(swap))
+    chosen = direct.with_rows(np.flatnonzero(swap), other.rows(swap))
     return replace(chosen, second=second, reason=tuple(reason.tolist()))
 
 
@@ -283,7 +283,7 @@ def _starts(
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         for scale in SCALES:
             linear = np.tile(scale * turn, (len(xy_left), 1, 1))
-            found = match_ncc_warped(
+            correlated = match_ncc_warped(
                 grey_left,
                 grey_right,
                 xy_left,
@@ -294,18 +294,18 @@ def _starts(
                 min_correlation=by.start_correlation,
             )
             shapes.append(linear)
-            peaks.append(found.peak)
-            r.append(np.nan_to_num(found.correlation, nan=-1.0))
-            second.append(np.nan_to_num(found.second, nan=-1.0))
-    every, positions, one = np.array(r), np.array(peaks), np.arange(len(xy_left))
+            peaks.append(correlated.peak)
+            r.append(np.nan_to_num(correlated.correlation, nan=-1.0))
+            second.append(np.nan_to_num(correlated.second, nan=-1.0))
+    every, positions, rows = np.array(r), np.array(peaks), np.arange(len(xy_left))
     best = every.argmax(axis=0)
-    elsewhere = np.where(np.linalg.norm(positions - positions[best, one], axis=2) > SAME_PX, every, -1.0)
+    elsewhere = np.where(np.linalg.norm(positions - positions[best, rows], axis=2) > SAME_PX, every, -1.0)
     rival = elsewhere.argmax(axis=0)
     starts = []
-    for number, least in ((best, every[best, one]), (rival, elsewhere[rival, one])):
-        position = np.where((least >= by.start_correlation)[:, None], positions[number, one], np.nan)
-        starts.append(Starts(position, np.array(shapes)[number, one], np.full(len(one), REACH_PX)))
-    return starts[0], starts[1], np.array(second)[best, one]
+    for number, least in ((best, every[best, rows]), (rival, elsewhere[rival, rows])):
+        position = np.where((least >= by.start_correlation)[:, None], positions[number, rows], np.nan)
+        starts.append(Starts(position, np.array(shapes)[number, rows], np.full(len(rows), REACH_PX)))
+    return starts[0], starts[1], np.array(second)[best, rows]
 
 
 @dataclass(frozen=True)
@@ -316,9 +316,9 @@ class LocalAffinities:
     linear: FloatArray  # right px per left px, (k, 2, 2)
     spread_px: FloatArray  # standard deviation of the position along an axis, right px, (k,)
 
-    def rows(self, some: IntArray) -> LocalAffinities:
+    def rows(self, rows: IntArray) -> LocalAffinities:
         """Return the entries of some points."""
-        return LocalAffinities(self.xy[some], self.linear[some], self.spread_px[some])
+        return LocalAffinities(self.xy[rows], self.linear[rows], self.spread_px[rows])
 
 
 def local_affinities(
@@ -342,7 +342,7 @@ def local_affinities(
     low = np.maximum(np.floor(at.min(axis=0) - MARGIN_PX), 0).astype(int)  # only the part near points matters
     high = np.ceil(at.max(axis=0) + MARGIN_PX).astype(int)
     part = left[low[1] : high[1], low[0] : high[0]]
-    a, b = (sift_features(one, max_features=max_features) for one in (part, right))
+    a, b = (sift_features(photograph, max_features=max_features) for photograph in (part, right))
     pairs = match_features(a, b, seed=seed)
     return affinities_around(a.xy[pairs[:, 0]] + low, b.xy[pairs[:, 1]], at)
 
@@ -350,11 +350,11 @@ def local_affinities(
 def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArray) -> LocalAffinities:
     """Return the affine maps around points, px, (k, 2), from conjugate key points, px, (m, 2) each."""
     at = np.asarray(xy, dtype=float).reshape(-1, 2)
-    found = LocalAffinities(
+    maps = LocalAffinities(
         np.full((len(at), 2), np.nan), np.full((len(at), 2, 2), np.nan), np.full(len(at), np.nan)
     )
     if len(key_left) < NEAR_KEY_POINTS:
-        return found
+        return maps
     for k, point in enumerate(at):
         if not np.isfinite(point).all():
             continue
@@ -362,10 +362,10 @@ def affinities_around(key_left: FloatArray, key_right: FloatArray, xy: FloatArra
         near = np.argpartition(distance, NEAR_KEY_POINTS - 1)[:NEAR_KEY_POINTS]
         if np.sort(distance[near])[2] > FARTHEST_PX:
             continue
-        one = _agreed_map(key_left[near] - point, key_right[near])
-        if one is not None:
-            found.linear[k], found.xy[k], found.spread_px[k] = one[0], one[1], one[2]
-    return found
+        agreed = _agreed_map(key_left[near] - point, key_right[near])
+        if agreed is not None:
+            maps.linear[k], maps.xy[k], maps.spread_px[k] = agreed[0], agreed[1], agreed[2]
+    return maps
 
 
 def _agreed_map(offset: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
@@ -455,18 +455,22 @@ def difference_of_blur(left: AnyArray, right: AnyArray) -> float:
     logarithm of the ratio of two power spectra is linear in the squared frequency, and its slope is the
     difference of the variances.
     """
-    spectra = [_power_spectrum(grey_of_8_bit(one)) for one in (left, right)]
+    spectra = [_power_spectrum(grey_of_8_bit(photograph)) for photograph in (left, right)]
     if len(spectra[0]) != len(spectra[1]) or len(spectra[0]) <= LOBE + NOISE_FREQUENCIES + MIN_FREQUENCIES:
         return 0.0
-    noise = [float(one[-NOISE_FREQUENCIES:].mean()) for one in spectra]
+    noise = [float(spectrum[-NOISE_FREQUENCIES:].mean()) for spectrum in spectra]
     above = np.all(
-        [one > (1.0 + MIN_SIGNAL_TO_NOISE) * floor for one, floor in zip(spectra, noise, strict=True)], axis=0
+        [
+            spectrum > (1.0 + MIN_SIGNAL_TO_NOISE) * floor
+            for spectrum, floor in zip(spectra, noise, strict=True)
+        ],
+        axis=0,
     )
     first = LOBE
     end = first + int(np.cumprod(above[first:]).sum())
     if end - first < MIN_FREQUENCIES:
         return 0.0
-    a, b = ((one - floor)[first:end] for one, floor in zip(spectra, noise, strict=True))
+    a, b = ((spectrum - floor)[first:end] for spectrum, floor in zip(spectra, noise, strict=True))
     frequency = np.pi * (np.arange(first, end) + 1.0) / len(spectra[0])  # rad/px
     A = np.column_stack([np.ones(end - first), frequency**2])
     y = np.log(a / b)

@@ -65,9 +65,9 @@ class ConjugatePoints:
         """Standard deviations of the right coordinates, px, (k, 2)."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
-    def rows(self, some: BoolArray) -> ConjugatePoints:
-        """Return only the points marked in `some`, (k,)."""
-        return self._changed(lambda column: column[some])
+    def rows(self, rows: BoolArray) -> ConjugatePoints:
+        """Return only the points where `rows` is True, (k,)."""
+        return self._changed(lambda column: column[rows])
 
     def with_rows(self, rows: IntArray, others: ConjugatePoints) -> ConjugatePoints:
         """Return the points with the given rows replaced by those of `others`, in order."""
@@ -82,9 +82,9 @@ class ConjugatePoints:
         """Return the points with each column changed by a function of its copy and of the others' columns."""
         columns: dict[str, Any] = {"method": self.method}
         for field in fields(self):
-            parts = [getattr(one, field.name) for one in (self, *others)]
+            parts = [getattr(points, field.name) for points in (self, *others)]
             if field.name == "reason":
-                changed = change(*(np.array(one, dtype=object) for one in parts))
+                changed = change(*(np.array(column, dtype=object) for column in parts))
                 columns["reason"] = tuple(changed.tolist())
             elif field.name != "method":
                 columns[field.name] = change(parts[0].copy(), *parts[1:])
@@ -129,7 +129,7 @@ def match_upright(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
 ) -> ConjugatePoints:
     """Match points, px, (k, 2), whose templates are neither rotated nor scaled on the right."""
-    found = match_ncc(
+    correlated = match_ncc(
         left,
         right,
         xy_left,
@@ -138,14 +138,14 @@ def match_upright(
         search_px=by.search_px,
         min_correlation=by.start_correlation,
     )
-    return _refined(left, right, xy_left, found, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
+    return _refined(left, right, xy_left, correlated, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
 
 
 def match_warped(
     left: AnyArray, right: AnyArray, xy_left: FloatArray, start: Starts, by: Settings
 ) -> ConjugatePoints:
     """Match points, px, (k, 2), whose templates are rotated, scaled and sheared in the right photograph."""
-    found = match_ncc_warped(
+    correlated = match_ncc_warped(
         left,
         right,
         xy_left,
@@ -155,7 +155,7 @@ def match_warped(
         template_px=by.template_px,
         min_correlation=by.start_correlation,
     )
-    return _refined(left, right, xy_left, found, start.linear, by)
+    return _refined(left, right, xy_left, correlated, start.linear, by)
 
 
 def flag_unconfirmed(
@@ -209,31 +209,34 @@ def flag_unconfirmed(
 
 
 def _refined(
-    left: AnyArray, right: AnyArray, a: FloatArray, found: NccMatches, linear: FloatArray, by: Settings
+    left: AnyArray, right: AnyArray, a: FloatArray, correlated: NccMatches, linear: FloatArray, by: Settings
 ) -> ConjugatePoints:
     """Return the positions found by correlation, or refine them by least squares matching."""
     # A peak at the border of the search window is a valid start: least squares matching may leave the window.
-    started = found.good | (found.flag == int(NccFlag.AT_BORDER))
+    started = correlated.good | (correlated.flag == int(NccFlag.AT_BORDER))
     pixels = independent_pixels(grey_of(left), a, by.template_px)
-    doubt = started & ambiguous(found.correlation, found.second, pixels)
-    flag = np.where(doubt, int(NccFlag.AMBIGUOUS), found.flag)
+    doubt = started & ambiguous(correlated.correlation, correlated.second, pixels)
+    flag = np.where(doubt, int(NccFlag.AMBIGUOUS), correlated.flag)
     outside = _what_is_outside(left, a, by.template_px // 2)
     ncc_reason = tuple(
         where or "outside: the search window in the right photograph"
-        if one == int(NccFlag.OUTSIDE)
-        else in_words(NccFlag, one)
-        for one, where in zip(flag.tolist(), outside, strict=True)
+        if bits == int(NccFlag.OUTSIDE)
+        else in_words(NccFlag, bits)
+        for bits, where in zip(flag.tolist(), outside, strict=True)
     )
     if by.method == "ncc":
         warp = np.tile(np.eye(3), (len(a), 1, 1))
-        warp[:, :2, :2], warp[:, :2, 2] = linear, found.xy
+        warp[:, :2, :2], warp[:, :2, 2] = linear, correlated.xy
         return ConjugatePoints(
-            by.method, a, found.xy, found.covariance, warp, found.correlation,
-            found.second, found.gain, found.offset, np.zeros(len(a), dtype=np.int64), ncc_reason,
+            by.method, a, correlated.xy, correlated.covariance, warp, correlated.correlation,
+            correlated.second, correlated.gain, correlated.offset, np.zeros(len(a), dtype=np.int64),
+            ncc_reason,
         )  # fmt: skip
     started &= ~doubt
     seen = (equalise_histogram(left), equalise_histogram(right)) if by.equalise else (left, right)
-    start = np.where(started[:, None], np.where(found.good[:, None], found.xy, found.peak), -1.0)
+    start = np.where(
+        started[:, None], np.where(correlated.good[:, None], correlated.xy, correlated.peak), -1.0
+    )
     lsm = match_lsm(
         *seen,
         a,
@@ -247,9 +250,9 @@ def _refined(
     outside = _what_is_outside(left, a, by.template_px // 2, kernel=True)
     lsm_reason = tuple(
         where or "outside: the patch in the right photograph"
-        if one == int(LsmFlag.OUTSIDE)
-        else in_words(LsmFlag, one)
-        for one, where in zip(lsm.flag.tolist(), outside, strict=True)
+        if bits == int(LsmFlag.OUTSIDE)
+        else in_words(LsmFlag, bits)
+        for bits, where in zip(lsm.flag.tolist(), outside, strict=True)
     )
     bias = np.zeros((len(a), 2))
     if by.method != "shift":
@@ -257,12 +260,12 @@ def _refined(
     covariance = lsm.covariance + bias[:, :, None] * bias[:, None, :]
     bent = np.linalg.norm(bias, axis=1) > MAX_BIAS_PX
     reason = tuple(
-        ncc if not ok else one or (NOT_PLANE if curved else "")
-        for ok, one, ncc, curved in zip(started, lsm_reason, ncc_reason, bent, strict=True)
+        ncc if not ok else refused or (NOT_PLANE if curved else "")
+        for ok, refused, ncc, curved in zip(started, lsm_reason, ncc_reason, bent, strict=True)
     )
-    correlation = np.where(started & np.isfinite(lsm.correlation), lsm.correlation, found.correlation)
+    correlation = np.where(started & np.isfinite(lsm.correlation), lsm.correlation, correlated.correlation)
     return ConjugatePoints(
-        by.method, a, lsm.xy, covariance, lsm.warp, correlation, found.second, lsm.gain, lsm.offset,
+        by.method, a, lsm.xy, covariance, lsm.warp, correlation, correlated.second, lsm.gain, lsm.offset,
         np.where(started, lsm.steps, 0), reason,
     )  # fmt: skip
 

@@ -243,7 +243,7 @@ def read_peak(
     template: AnyArray,
     window: AnyArray,
     surface: AnyArray,
-    whole: AnyArray,
+    around: AnyArray,
     least: tuple[float, float],
     min_r: float,
     max_second: float,
@@ -255,7 +255,7 @@ def read_peak(
         template: intensities, float32, (s, s). All arrays are contiguous: only one form is compiled.
         window: intensities of the search window, float32, (H, W).
         surface: r where a match is allowed, else -1, float32, (H - s + 1, W - s + 1).
-        whole: r everywhere, for the parabola; same shape.
+        around: r everywhere, for the parabola; same shape.
         least: standard deviations below which a template, and a window, are flat.
         min_r: smallest r of a match.
         max_second: largest ratio of the second-best r to the best.
@@ -319,7 +319,7 @@ def read_peak(
     gx, gy, hxx, hyy, hxy = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
-            s = whole[bi + i, bj + j]
+            s = around[bi + i, bj + j]
             gx += j * s / 6.0
             gy += i * s / 6.0
             hxy += i * j * s / 4.0
@@ -339,12 +339,12 @@ def read_peak(
     mean = 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
-            mean += whole[bi + i, bj + j] / 9.0
+            mean += around[bi + i, bj + j] / 9.0
     misfit = 0.0
     for i in range(-1, 2):
         for j in range(-1, 2):
             bend = hxx * (j * j - 2.0 / 3.0) / 2.0 + hyy * (i * i - 2.0 / 3.0) / 2.0 + hxy * i * j
-            misfit += (whole[bi + i, bj + j] - mean - gx * j - gy * i - bend) ** 2
+            misfit += (around[bi + i, bj + j] - mean - gx * j - gy * i - bend) ** 2
     m = misfit / 3.0 / 6.0 / (det * det)
     out[CXX] = -hyy * c + m * (hyy * hyy + hxy * hxy)
     out[CXY] = hxy * c - m * hxy * (hxx + hyy)
@@ -468,5 +468,5 @@ class LsmFlag(IntFlag):
 def in_words(kind: type[LsmFlag] | type[NccFlag], flag: int) -> str:
     """Return the names of the flags that are set, in words; empty if none is."""
     return ", ".join(
-        str(one.name).lower().replace("_", " ") for one in kind if one.value and flag & one.value
+        str(member.name).lower().replace("_", " ") for member in kind if member.value and flag & member.value
     )

@@ -102,8 +102,8 @@ def shrink_photograph(photograph: AnyArray, shrink: int) -> AnyArray:
     if shrink == 1:
         return photograph
     height, width = (side // shrink for side in photograph.shape[:2])
-    whole = photograph[: height * shrink, : width * shrink]
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA))
+    blocks = photograph[: height * shrink, : width * shrink]
+    return np.asarray(cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def odd_window(what: str, side_px: int) -> int:
@@ -278,4 +278,4 @@ class GreyPhotographs:
 
 
 def _bytes(kept: dict[int, AnyArray]) -> int:
-    return sum(one.nbytes for one in kept.values())
+    return sum(photograph.nbytes for photograph in kept.values())

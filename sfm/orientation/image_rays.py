@@ -28,8 +28,8 @@ def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera
         cameras: interior orientations.
     """
     uv = np.full((len(seen), 2), np.nan)
-    for one, of_camera in zip(cameras, rows_of(camera[seen.image], len(cameras)), strict=True):
-        uv[of_camera] = tangents_from_pixel(one, seen.xy[of_camera])
+    for k, rows in enumerate(rows_of(camera[seen.image], len(cameras))):
+        uv[rows] = tangents_from_pixel(cameras[k], seen.xy[rows])
     return uv
 
 
@@ -50,7 +50,7 @@ def intersect_image_points(
     """
     uv, image = image_tangents(seen, camera, estimate.cameras), seen.image
     position, rotation = estimate.position, estimate.rotation
-    wide = np.array([one.wide_angle for one in estimate.cameras])[camera[image]]
+    wide = np.array([of_estimate.wide_angle for of_estimate in estimate.cameras])[camera[image]]
     if wide.any():
         position = np.concatenate([position, position[image[wide]]])
         rotation = np.concatenate([rotation, _rotations_along_rays(rotation[image[wide]], uv[wide])])
@@ -64,17 +64,17 @@ def intersect_image_points(
         position,
         rotation,
         n_points=n_points,
-        tolerance=tolerance_px / min(one.c_px for one in estimate.cameras),
+        tolerance=tolerance_px / min(of_estimate.c_px for of_estimate in estimate.cameras),
     )
 
 
 def _rotations_along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
     """Return rotations with axis -z along the rays with tangents (u, v) under given rotations, (k, 3, 3)."""
     u, v = uv.T
-    one = np.ones(len(uv))
-    z = np.column_stack([-u, -v, one])
+    ones = np.ones(len(uv))
+    z = np.column_stack([-u, -v, ones])
     z /= np.linalg.norm(z, axis=1, keepdims=True)
-    x = np.column_stack([one, 0 * one, u])
+    x = np.column_stack([ones, 0 * ones, u])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.asarray(rotation @ np.stack([x, np.cross(z, x), z], axis=2))
 
@@ -99,10 +99,10 @@ def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatAr
     angle = np.full(len(network.points), np.nan)
     for r in np.unique(count[count >= 2]):
         points = np.flatnonzero(count == r)
-        for some in np.array_split(points, 1 + len(points) * r * r // MAX_PAIRS):
-            u = ray[first[some][:, None] + np.arange(r)]
+        for part in np.array_split(points, 1 + len(points) * r * r // MAX_PAIRS):
+            u = ray[first[part][:, None] + np.arange(r)]
             sine = np.sqrt(np.maximum(1 - np.einsum("nia,nja->nij", u, u) ** 2, 0))
-            angle[some] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))
+            angle[part] = np.degrees(np.arcsin(np.minimum(sine.max(axis=(1, 2)), 1)))
     return angle
 
 

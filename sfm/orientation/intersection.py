@@ -144,12 +144,12 @@ def _intersect_all(
             _direction(rays, of_point[i], direction[i])
         for i in range(m):
             used[of_point[i]] = True
-        found = _nearest_to_rays(rays, of_point, direction, used, N, b, X)
+        nearest = _nearest_to_rays(rays, of_point, direction, used, N, b, X)
         if np.isinf(limit) or m == 2:
-            if not found:
+            if not nearest:
                 _drop(of_point, used)
                 continue
-        elif not found or _sum_of_squares(rays, of_point, X) > limit:
+        elif not nearest or _sum_of_squares(rays, of_point, X) > limit:
             score = _best_pair(rays, of_point, direction, limit, used, N, b, X, best_X)
             if np.isinf(score):
                 continue

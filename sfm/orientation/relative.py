@@ -243,10 +243,14 @@ def _nearest_to_coplanar(
     With shallow relief and a wide tolerance, both orientations of a plane fit the rays, and random samples
     select either. An adjustment from the wrong one ends in another minimum, with larger residuals.
     """
-    found = [spatial]
-    found += [_adjust_spatial(one.base, one.rotation, uv1, uv2, one.inliers, tolerance) for one in planar]
-    squares = [float(np.sum(np.minimum(one.residuals, tolerance) ** 2)) for one in found]
-    return found[int(np.argmin(squares))]
+    orientations = [spatial]
+    orientations += [
+        _adjust_spatial(start.base, start.rotation, uv1, uv2, start.inliers, tolerance) for start in planar
+    ]
+    squares = [
+        float(np.sum(np.minimum(orientation.residuals, tolerance) ** 2)) for orientation in orientations
+    ]
+    return orientations[int(np.argmin(squares))]
 
 
 def _adjust_spatial(

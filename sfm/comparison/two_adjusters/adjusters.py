@@ -172,10 +172,10 @@ def compare_adjusters(
             ours = _adjusted(network, start, adjustment.sigma_px)
         report_step(f"adjusting with {program_name(name)}")
         theirs = backend(network, start)
-        found = compare(
+        comparison = compare(
             ours.estimate, theirs.estimate, network, covariance=ours.covariance, names=("kolinear", name)
         )
-        if not ours.converged or (found.agree and theirs.converged):
+        if not ours.converged or (comparison.agree and theirs.converged):
             stopped_early = False
             break
         further = _adjusted(network, theirs.estimate, adjustment.sigma_px)
@@ -198,7 +198,7 @@ def compare_adjusters(
         ours,
         theirs.iterations,
         theirs.converged,
-        found,
+        comparison,
         None if conditional is None else (ours.sigma0 * ours.sigma_px) ** 2 * conditional,
         unshared,
         better_fit(adjustment, network, ours),
@@ -258,8 +258,8 @@ def common_problem(
     estimate = adjustment.estimate
     cameras = estimate.cameras
     if model is None:
-        one = {camera.model for camera in cameras}
-        model = one.pop() if len(one) == 1 and not cameras[0].in_mm else "full_opencv"
+        models = {camera.model for camera in cameras}
+        model = models.pop() if len(models) == 1 and not cameras[0].in_mm else "full_opencv"
     conversions = tuple(convert_camera(camera, model) for camera in cameras)
     converted = tuple(conversion.camera for conversion in conversions)
     grouped = grouped_free(converted)
@@ -326,12 +326,12 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     if not freer.converged or freed <= 0 or compared.redundancy <= 0:
         return None
     F = (freer.vPv - compared.vPv) / freed / compared.sigma0**2 if compared.sigma0 > 0 else np.inf
-    found = BetterFit(freer.rms_px, compared.rms_px, more)
-    if f_isf(LEVEL, freed, compared.redundancy) > F or found.times < MIN_RMS_RATIO:
+    fit = BetterFit(freer.rms_px, compared.rms_px, more)
+    if f_isf(LEVEL, freed, compared.redundancy) > F or fit.times < MIN_RMS_RATIO:
         return None
     tested = contradicted_parameters(adjusted(freer.estimate, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
-    return replace(found, free=clear or more)
+    return replace(fit, free=clear or more)
 
 
 def _parameters_to_free(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:

@@ -151,11 +151,13 @@ class Reference:
 
     def differences(self, kinds: Sequence[Kind], placing: Similarity) -> tuple[GivenModel, IntArray]:
         """Return the differences as a model of given values, and the kind of each value; see `compare`."""
-        found = self.compare(kinds, placing)
-        network = np.asarray((found.J @ (found.J @ self.C).T).T)
+        comparison = self.compare(kinds, placing)
+        network = np.asarray((comparison.J @ (comparison.J @ self.C).T).T)
         redundancy = self.marginal.adjustment.redundancy
-        model = GivenModel(found.v, network, found.stated, found.A, found.item, redundancy)
-        return model, found.kind
+        model = GivenModel(
+            comparison.v, network, comparison.stated, comparison.A, comparison.item, redundancy
+        )
+        return model, comparison.kind
 
     def _by_free(self, block: Block, by: FloatArray, placing: Similarity) -> tuple[IntArray, FloatArray]:
         """Return the columns of a block, (n, u), and its derivatives by the free unknowns, (n, d, u)."""

@@ -85,7 +85,7 @@ class Task:
     def level(self) -> float:
         """Probability of reporting one kind of correct given values as wrong."""
         kinds = (self.network.scale_bars, self.network.control, self.network.exterior)
-        return self.settings.level / max(sum(len(one) > 0 for one in kinds), 1)
+        return self.settings.level / max(sum(len(kind) > 0 for kind in kinds), 1)
 
 
 def in_free(kind: K, of_point: IntArray, of_image: IntArray) -> tuple[IntArray, K]:
@@ -231,12 +231,12 @@ def remarks_on_unchecked(
         level: level of the test of a value.
     """
     reach, rank = model.external(without, level=level), model.kept(without).decreases()[1]
-    for kind, some in (
+    for kind, concerned in (
         ("given_unchecked", np.isinf(reach) & (rank == 0)),
         ("given_partly_checked", np.isinf(reach) & (rank > 0)),
     ):
-        if some.any():
-            yield remark(kind, given=[names[k] for k in np.flatnonzero(some).tolist()], of=of)
+        if concerned.any():
+            yield remark(kind, given=[names[k] for k in np.flatnonzero(concerned).tolist()], of=of)
     weak = np.flatnonzero((reach > WRONG_SIGMAS) & np.isfinite(reach)).tolist()
     if weak:
         largest = float(reach[weak].max())

@@ -128,8 +128,8 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     settings, network, mounts = task.settings, given.network, given.mounts
     in_control = given.datum.kind == "control"
     of_datum = (network.control, network.exterior) if in_control else (ObjectPoints(), ExteriorObservations())
-    found = [(k, *task.in_free(kind)) for k, kind in enumerate(network.observations)]
-    tables = [Table(kind, k, parts) for k, parts, kind in found if len(kind)]
+    in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.observations)]
+    tables = [Table(kind, k, parts) for k, parts, kind in in_free if len(kind)]
     part = replace(
         task.free.adjustment.network,
         control=task.in_free(of_datum[0])[1],
@@ -145,7 +145,11 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
         place = partial(_unchanged, given.placing)
     wrong = judge_tables(tables, part, reference, place, settings.level)
     there, bars = task.in_free(network.scale_bars)
-    if not in_control and bars.is_one_scale and len({one.kind for one in wrong if one.whole}) > 1:
+    if (
+        not in_control
+        and bars.is_one_scale
+        and len({contradiction.kind for contradiction in wrong if contradiction.whole}) > 1
+    ):
         # several kinds contradict the one scale that the bars have: which of them is wrong is open
         distances = Distances(bars.start, bars.end, bars.values, bars.sigma[:, None])
         table = Table(distances, len(network.observations), there)
@@ -165,7 +169,7 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     names = [kind.parts(network, estimate) for kind in kinds]
     every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.observations)]
     observations = tuple(table.kind for table in as_judged(every, wrong))
-    remarks = (*(one.remark(names) for one in wrong), *of_mounts)
+    remarks = (*(contradiction.remark(names) for contradiction in wrong), *of_mounts)
     return replace(
         given,
         network=replace(network, observations=observations),
@@ -184,10 +188,10 @@ def _judged(task: Task) -> JudgedGiven:
     """Judge the given points, then the scales of bars and points."""
     network, datum = task.network, task.settings.datum
     seen = network.exterior if task.in_control else ExteriorObservations()
-    both = _group(task, "control", network.control), _group(task, "centres", seen.of_positions)
-    groups = [one for one in both if one is not None]
-    scales = judge_scales(task, [one for one in groups if one.dependable])
-    used = [one for one in groups if not one.placed.mirrored and one.of not in scales.left_out]
+    of_kinds = _group(task, "control", network.control), _group(task, "centres", seen.of_positions)
+    groups = [group for group in of_kinds if group is not None]
+    scales = judge_scales(task, [group for group in groups if group.dependable])
+    used = [group for group in groups if not group.placed.mirrored and group.of not in scales.left_out]
     contradiction = contradiction_of(task, used)
     if contradiction is not None:
         used = []
@@ -202,13 +206,13 @@ def _judged(task: Task) -> JudgedGiven:
         network,
         datum,
         (
-            *(found for one in groups for found in _remarks_on(task, one)),
+            *(said for group in groups for said in _remarks_on(task, group)),
             *scales.remarks,
             *(() if contradiction is None else (contradiction,)),
         ),
-        tuple(one.test for one in groups) + scales.tests,
-        next((one.placed.placing for one in used), None),
-        any(one.checks_handedness for one in groups),
+        tuple(group.test for group in groups) + scales.tests,
+        next((group.placed.placing for group in used), None),
+        any(group.checks_handedness for group in groups),
     )
 
 
@@ -231,12 +235,12 @@ def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     group = Group(of, rows[there], tuple(names[k] for k in there.tolist()), placed)
     if fixed and in_datum and not (task.of_plate or placed.judgement.fits):
         group = _scattering(group, points, start, task)
-    found = group.found
-    if found.factor == 1.0:
+    judgement = group.found
+    if judgement.factor == 1.0:
         return group
     stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
-    fitting = judge_points(points.with_stated(found.factor**2 * stated), task.level, start=start)
-    return group if fitting is None else replace(group, placed=replace(fitting, judgement=found))
+    fitting = judge_points(points.with_stated(judgement.factor**2 * stated), task.level, start=start)
+    return group if fitting is None else replace(group, placed=replace(fitting, judgement=judgement))
 
 
 def _scattering(group: Group, points: GivenPoints, start: Similarity | None, task: Task) -> Group:
@@ -267,23 +271,23 @@ def _scattering(group: Group, points: GivenPoints, start: Similarity | None, tas
 
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     """Yield the remarks on given points that do not fit, and on those that nothing checks."""
-    found, of = group.found, group.of
+    judgement, of = group.found, group.of
     exchanged = [group.names[k] for k in group.placed.exchangeable] or None
     if group.placed.mirrored:
         yield remark(
             "given_mirrored",
             of=of,
             chi2=group.placed.unmirrored,
-            mirrored=group.placed.model.kept(found.wrong).chi2,
-            given=[group.names[k] for k in found.wrong] or None,
+            mirrored=group.placed.model.kept(judgement.wrong).chi2,
+            given=[group.names[k] for k in judgement.wrong] or None,
             exchanged=exchanged,
         )
         return
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
-    if found.wrong:
+    if judgement.wrong:
         yield _left_out(group, task.settings.unit)
-    if found.doubtful:
+    if judgement.doubtful:
         yield _doubtful(task, group)
     if group.scatter:
         sigma, shift = (group.scatter, task.settings.unit), shift_of_fixed(group.placed.model, group.scatter)
@@ -293,23 +297,23 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
         else:
             yield remark("given_not_exact", of=of, sigma=sigma, shift=shift)
     if task.in_control:
-        yield from remarks_on_unchecked(of, group.names, group.placed.model, found.wrong, task.level)
-    if found.factor == 1.0 or group.scatter or group.placed.model.estimated:
+        yield from remarks_on_unchecked(of, group.names, group.placed.model, judgement.wrong, task.level)
+    if judgement.factor == 1.0 or group.scatter or group.placed.model.estimated:
         return
     covariance = (task.network.control if of == "control" else task.network.exterior).covariance
     of_points = covariance[group.rows, :3, :3]
     if not of_points[np.isfinite(of_points)].any():
-        shift = shift_of_fixed(group.placed.model, found.factor)
-        yield remark("given_not_exact", of=of, sigma=(found.factor, task.settings.unit), shift=shift)
+        shift = shift_of_fixed(group.placed.model, judgement.factor)
+        yield remark("given_not_exact", of=of, sigma=(judgement.factor, task.settings.unit), shift=shift)
     else:
-        used_factor = found.factor if task.settings.rescale else None
-        yield remark("given_sigmas", of=of, factor=found.factor, used=used_factor)
+        used_factor = judgement.factor if task.settings.rescale else None
+        yield remark("given_sigmas", of=of, factor=judgement.factor, used=used_factor)
 
 
 def _left_out(group: Group, unit: str) -> Remark:
     model, out = group.placed.model, group.out
     others = (model.kept(tuple(j for j in out if j != k)).difference(k) for k in out)
-    d, covariance = max(others, key=lambda one: float(np.linalg.norm(one[0])))
+    d, covariance = max(others, key=lambda difference: float(np.linalg.norm(difference[0])))
     distance = float(np.linalg.norm(d))
     return remark(
         "given_left_out",
@@ -321,29 +325,29 @@ def _left_out(group: Group, unit: str) -> Remark:
 
 
 def _doubtful(task: Task, group: Group) -> Remark:
-    found, model, strain = group.found, group.placed.model, group.placed.strain
+    judgement, model, strain = group.found, group.placed.model, group.placed.strain
     if strain is not None:
         return remark(
             "given_strained",
             of=group.of,
             axis=strain.axis,
             elongation=(100 * strain.elongation, "%"),
-            chi2=found.statistic,
+            chi2=judgement.statistic,
             fitting=strain.chi2,
         )
     shift = np.inf
-    if found.one_wrong:
-        shift = float(_shifts(model)[list(found.doubtful)].max())
+    if judgement.one_wrong:
+        shift = float(_shifts(model)[list(judgement.doubtful)].max())
         # they take part with standard deviations from their differences, if these may be replaced
         if task.settings.rescale and group.placed.points.stated.any() and model.at_worst.fits(task.level):
             shift /= model.factor()[0]
     return remark(
         "given_contradicted",
         of=group.of,
-        given=[group.names[k] for k in found.doubtful],
+        given=[group.names[k] for k in judgement.doubtful],
         exchanged=[group.names[k] for k in group.placed.exchangeable] or None,
-        chi2=found.statistic,
-        dof=found.dof,
+        chi2=judgement.statistic,
+        dof=judgement.dof,
         shift=shift if np.isfinite(shift) else None,
     )
 
@@ -351,8 +355,8 @@ def _doubtful(task: Task, group: Group) -> Remark:
 def _shifts(model: GivenModel) -> FloatArray:
     """Return the largest effect of each given value on the parameters, in their standard deviations."""
     reach = model.external()
-    found = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / non_centrality()
-    return np.where(np.isfinite(reach), found, np.inf)
+    shift = np.sqrt(model.kept().decreases()[0]) * np.where(np.isfinite(reach), reach, 0.0) / non_centrality()
+    return np.where(np.isfinite(reach), shift, np.inf)
 
 
 def shift_of_fixed(model: GivenModel, sigma: float) -> float:

@@ -37,12 +37,12 @@ def explanations(
         judge: judges corrected observations; None or False if the correction explains nothing.
         corrected: corrected observations of each kind by the name of the mistake; `Kind.mistakes` if empty.
     """
-    corrected, found = corrected or [kind.mistakes() for kind in kinds], dict[str, T]()
+    corrected, explaining = corrected or [kind.mistakes() for kind in kinds], dict[str, T]()
     for mistake in dict.fromkeys(mistake for mistakes in corrected for mistake in mistakes):
         judged = judge([by.get(mistake, kind) for by, kind in zip(corrected, kinds, strict=True)])
         if judged:
-            found[mistake] = judged
-    return found
+            explaining[mistake] = judged
+    return explaining
 
 
 def assignments(
@@ -75,21 +75,21 @@ def assignments(
         placings += _placings(X, Y)
     if not placings:
         return
-    placed = np.concatenate([one.apply(X) for one in placings])
+    placed = np.concatenate([placing.apply(X) for placing in placings])
     distance2 = cdist(placed, Y, "sqeuclidean").reshape(len(placings), len(X), len(Y))
-    scale2 = np.array([one.scale**2 for one in placings])[:, None, None]
+    scale2 = np.array([placing.scale**2 for placing in placings])[:, None, None]
     expected = np.maximum(3 * (scale2 * of_x[:, None] + of_y), np.finfo(float).tiny)
     misfit = 3 * np.log(np.maximum(distance2 / expected, 1.0))
-    found: dict[tuple[int, ...], float] = {}
-    for one in misfit:
-        other = linear_sum_assignment(one)[1]
+    costs: dict[tuple[int, ...], float] = {}
+    for of_placing in misfit:
+        other = linear_sum_assignment(of_placing)[1]
         order = np.arange(len(free))
         order[at] = at[other]
         key = tuple(order.tolist())
-        cost = float(one[np.arange(len(at)), other].sum()) + cost_of_choice(key)
-        found[key] = min(cost, found.get(key, np.inf))
-    found.pop(tuple(range(len(free))), None)
-    yield from sorted(found, key=lambda one: found[one])[:MAX_ASSIGNMENTS]
+        cost = float(of_placing[np.arange(len(at)), other].sum()) + cost_of_choice(key)
+        costs[key] = min(cost, costs.get(key, np.inf))
+    costs.pop(tuple(range(len(free))), None)
+    yield from sorted(costs, key=lambda order: costs[order])[:MAX_ASSIGNMENTS]
 
 
 def cost_of_choice(order: tuple[int, ...]) -> float:
@@ -106,7 +106,7 @@ def cost_of_choice(order: tuple[int, ...]) -> float:
 
 def find_renamed(order: tuple[int, ...]) -> tuple[int, ...]:
     """Return the points that get the coordinates of another point."""
-    return tuple(k for k, one in enumerate(order) if one != k)
+    return tuple(k for k, other in enumerate(order) if other != k)
 
 
 def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
@@ -114,14 +114,14 @@ def _placings(X: FloatArray, Y: FloatArray) -> list[Similarity]:
     rng, n = np.random.default_rng(len(X)), len(X)
     of_y: IntArray = np.array(list(permutations(range(n), 3)))
     shape = _shape(Y[of_y])
-    found = []
+    placings = []
     for _ in range(TRIANGLES):
-        some = rng.choice(n, 3, replace=False)
-        apart = np.abs(shape - _shape(X[some])).sum(axis=1)
+        corners = rng.choice(n, 3, replace=False)
+        apart = np.abs(shape - _shape(X[corners])).sum(axis=1)
         nearest = np.argpartition(apart, min(MAX_SIMILAR, len(apart)) - 1)[:MAX_SIMILAR]
-        fitted = fit_similarities(np.broadcast_to(X[some], (len(nearest), 3, 3)), Y[of_y[nearest]])
-        found += [one for one in fitted if one is not None]
-    return found
+        fitted = fit_similarities(np.broadcast_to(X[corners], (len(nearest), 3, 3)), Y[of_y[nearest]])
+        placings += [similarity for similarity in fitted if similarity is not None]
+    return placings
 
 
 def _shape(corners: FloatArray) -> FloatArray:

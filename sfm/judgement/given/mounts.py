@@ -47,21 +47,21 @@ def judge_mounts(
     level, kept, remarks = level / len(given), np.ones(len(given), dtype=bool), []
     rest = free.adjustment.redundancy
     for k, camera in enumerate(given.camera.tolist()):
-        one = given.select(np.array([k]))
-        model = _shape(one, reference, mounts.position)
+        mount = given.select(np.array([k]))
+        model = _shape(mount, reference, mounts.position)
         if model.fits(level):
             continue
         kept[k] = False
-        turn = rotation_from_angles(*one.angles[0]).T @ mounts.rotation[camera]
+        turn = rotation_from_angles(*mount.angles[0]).T @ mounts.rotation[camera]
         mistakes = explanations(
-            [one], lambda mended: _shape(mended[0], reference, mounts.position).fits(level)
+            [mount], lambda mended: _shape(mended[0], reference, mounts.position).fits(level)
         )
         remarks.append(
             remark(
                 "mount_contradicted",
                 camera=free.adjustment.estimate.cameras[camera].name,
                 angle=(_degrees((np.trace(turn) - 1) / 2), "deg"),
-                direction=(_degrees(_cosine(one.position[0], mounts.position[camera])), "deg"),
+                direction=(_degrees(_cosine(mount.position[0], mounts.position[camera])), "deg"),
                 sigmas=float(np.sqrt(model.kept().chi2)),
                 mistake=next(iter(mistakes), None),
                 rest=rest if rest > model.kept().dof else None,
@@ -70,11 +70,11 @@ def judge_mounts(
     return given.select(kept), tuple(remarks)
 
 
-def _shape(one: MountObservations, reference: Reference, positions: FloatArray) -> GivenModel:
+def _shape(mount: MountObservations, reference: Reference, positions: FloatArray) -> GivenModel:
     """Return the differences of one mount from that of the photographs; the length of the base is free."""
-    P, X = one.position[0], positions[one.camera[0]]
+    P, X = mount.position[0], positions[mount.camera[0]]
     scale = float(np.linalg.norm(P)) / max(float(np.linalg.norm(X)), TINY) or 1.0
-    model, _ = reference.differences([one], Similarity(scale, np.eye(3), np.zeros(3)))
+    model, _ = reference.differences([mount], Similarity(scale, np.eye(3), np.zeros(3)))
     return model if P @ X > 0 else replace(model, A=np.zeros((6, 0)))  # no positive scale reverses a base
 
 

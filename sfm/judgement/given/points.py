@@ -109,9 +109,9 @@ class GivenPoints:
         """Points with all three coordinates known."""
         return np.flatnonzero(np.isfinite(self.given).all(axis=1))
 
-    def select(self, some: IntArray) -> GivenPoints:
+    def select(self, rows: IntArray) -> GivenPoints:
         """Return the points of the given indices."""
-        return replace(self, kind=self.kind.select(np.asarray(some)))
+        return replace(self, kind=self.kind.select(np.asarray(rows)))
 
     @property
     def variances(self) -> tuple[FloatArray, FloatArray]:
@@ -238,32 +238,32 @@ def judge_points(
     Returns:
         The judged points; None if they do not determine a similarity.
     """
-    found = _placed(points, level, start, estimated)
-    if found is None or found.judgement.fits:
-        return found
-    others = list(_corrected(points, level, found, estimated))
-    strained = _strained(points, level, found, estimated)
+    as_given = _placed(points, level, start, estimated)
+    if as_given is None or as_given.judgement.fits:
+        return as_given
+    others = list(_corrected(points, level, as_given, estimated))
+    strained = _strained(points, level, as_given, estimated)
     if strained is not None:
         others.append(strained)
-    if not others or min(one.cost for one in others) >= found.misfit:
-        if strained is not None and strained.cost < found.misfit + MARGIN:
-            return _contradiction(found, [strained])
-        return found
-    best = min(others, key=lambda one: one.cost)
-    like = [one for one in others if one.cost < best.cost + MARGIN]
-    if best.cost >= found.misfit - MARGIN:
-        return _contradiction(found, [found, *like])
-    either = next((one for one in like if one.mirrored), None)
+    if not others or min(other.cost for other in others) >= as_given.misfit:
+        if strained is not None and strained.cost < as_given.misfit + MARGIN:
+            return _contradiction(as_given, [strained])
+        return as_given
+    best = min(others, key=lambda other: other.cost)
+    like = [other for other in others if other.cost < best.cost + MARGIN]
+    if best.cost >= as_given.misfit - MARGIN:
+        return _contradiction(as_given, [as_given, *like])
+    either = next((other for other in like if other.mirrored), None)
     if either is not None:
         # names of left and right may be exchanged as a whole, which is not a choice among all orders
-        like = [one for one in others if one.misfit < either.misfit + MARGIN]
+        like = [other for other in others if other.misfit < either.misfit + MARGIN]
         return replace(either, exchangeable=_points_of(like))
     if len(like) > 1:
-        return _contradiction(found, like)
-    return replace(_contradiction(found, like), strain=best.strain) if best.strain else best
+        return _contradiction(as_given, like)
+    return replace(_contradiction(as_given, like), strain=best.strain) if best.strain else best
 
 
-def excludes_mirror(found: PlacedPoints) -> bool:
+def excludes_mirror(placed: PlacedPoints) -> bool:
     """Return whether points, without the wrong ones, fit the network but not the mirrored network.
 
     With n differences the mirror image is less likely by n ln of the ratio of both chi-squares, in -2 ln
@@ -271,23 +271,23 @@ def excludes_mirror(found: PlacedPoints) -> bool:
     points that contradict one another.
 
     Args:
-        found: judged points that are not mirrored.
+        placed: judged points that are not mirrored.
 
     Source: Seber and Wild (1989), Nonlinear Regression, sec. 2.2.
     """
-    kept = np.setdiff1d(np.arange(len(found.points.given)), found.judgement.wrong)
-    mirrored = found.points.select(kept).mirrored()
+    kept = np.setdiff1d(np.arange(len(placed.points.given)), placed.judgement.wrong)
+    mirrored = placed.points.select(kept).mirrored()
     start = next(_starts(mirrored, None), None)
     if start is None:
         return False
-    like = found.model.part(np.isin(found.model.item, kept)).all_kept
+    like = placed.model.part(np.isin(placed.model.item, kept)).all_kept
     unlike = mirrored.model(start, estimated=False).all_kept
     n = like.dof
     return n > 0 and n * float(np.log(max(unlike.chi2, n) / max(like.chi2, n))) > MARGIN
 
 
 def _corrected(
-    points: GivenPoints, level: float, found: PlacedPoints, estimated: bool
+    points: GivenPoints, level: float, as_given: PlacedPoints, estimated: bool
 ) -> Iterator[PlacedPoints]:
     """Yield the points with other names, and mirrored, that explain the differences."""
 
@@ -297,40 +297,50 @@ def _corrected(
 
     orders = {
         f"names {order}": order
-        for order in assignments(points.free, points.given, points.variances, found.agreeing)
+        for order in assignments(points.free, points.given, points.variances, as_given.agreeing)
     }
     renamed = {name: points.kind.reordered(np.array(order)) for name, order in orders.items()}
     corrected = {**renamed, **points.kind.mistakes()}
     for mistake, placed in explanations([points.kind], judge, [corrected]).items():
-        unmirrored = found.judgement.statistic if mistake == "mirrored" else None
+        unmirrored = as_given.judgement.statistic if mistake == "mirrored" else None
         yield replace(placed, order=orders.get(mistake, ()), unmirrored=unmirrored)
 
 
 def _points_of(explanations: list[PlacedPoints]) -> tuple[int, ...]:
     """Return the points whose names are exchanged in any of the explanations."""
-    return tuple(sorted({k for one in explanations for k in one.renamed}))
+    return tuple(sorted({k for explanation in explanations for k in explanation.renamed}))
 
 
-def _contradiction(found: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
+def _contradiction(as_given: PlacedPoints, like: list[PlacedPoints]) -> PlacedPoints:
     """Return points as given, marked as doubtful because several explanations are possible."""
-    some = {
-        k for one in like for k in (*find_renamed(one.order), *one.judgement.wrong, *one.judgement.doubtful)
+    suspected = {
+        k
+        for explanation in like
+        for k in (
+            *find_renamed(explanation.order),
+            *explanation.judgement.wrong,
+            *explanation.judgement.doubtful,
+        )
     }
-    if not some or any(one.mirrored or one.strain for one in like):
-        some = set(range(found.model.items))
+    if not suspected or any(explanation.mirrored or explanation.strain for explanation in like):
+        suspected = set(range(as_given.model.items))
     return replace(
-        found, judgement=found.judgement.contradicted(tuple(sorted(some))), exchangeable=_points_of(like)
+        as_given,
+        judgement=as_given.judgement.contradicted(tuple(sorted(suspected))),
+        exchangeable=_points_of(like),
     )
 
 
-def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated: bool) -> PlacedPoints | None:
+def _strained(
+    points: GivenPoints, level: float, as_given: PlacedPoints, estimated: bool
+) -> PlacedPoints | None:
     """Return points that fit with the most likely strain, along one axis or more; None if no strain fits.
 
     Which axes are right, and whether the scale is, cannot be decided.
     """
     fitting: list[tuple[PlacedPoints, Strain]] = []
     for derivatives in _determined_strains(points.given[points.complete]):
-        strain, placing = Strain(derivatives, np.eye(3)), found.placing
+        strain, placing = Strain(derivatives, np.eye(3)), as_given.placing
         model: GivenModel | None = None
         for _ in range(MAX_STEPS):
             try:
@@ -346,13 +356,18 @@ def _strained(points: GivenPoints, level: float, found: PlacedPoints, estimated:
             strain = replace(strain, F=F)
         if model is not None and model.fits(level) and model.confirms_rest(()):
             judgement = judge_values(model, level)
-            q, fall = found.judgement.dof - judgement.dof, found.judgement.statistic - judgement.statistic
+            q, fall = (
+                as_given.judgement.dof - judgement.dof,
+                as_given.judgement.statistic - judgement.statistic,
+            )
             cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
             fitting.append((PlacedPoints(judgement, placing, model, points, cost_of_strain=cost), strain))
     if not fitting:
         return None
-    best, strain = min(fitting, key=lambda one: one[0].cost)
-    like = [other for one, other in fitting if one.cost < best.cost + MARGIN and len(other.derivatives) == 1]
+    best, strain = min(fitting, key=lambda fit: fit[0].cost)
+    like = [
+        other for placed, other in fitting if placed.cost < best.cost + MARGIN and len(other.derivatives) == 1
+    ]
     axis = "XYZ"[int(strain.derivatives[0].diagonal().argmax())] if like == [strain] else None
     return replace(best, strain=replace(strain, axis=axis, chi2=best.judgement.statistic))
 
@@ -385,11 +400,11 @@ def _placed(
     for k, placing in enumerate(_starts(points, start)):
         # with the similarity on which most agree, the others are left out before they can change it
         at_start = judge_values(points.model(placing, estimated=estimated), level) if k else None
-        found = _judged(points, placing, () if at_start is None else at_start.wrong, level, estimated)
-        if found.judgement.fits:
-            return found
-        if best is None or found.judgement.misfit < best.judgement.misfit:
-            best = found
+        judged = _judged(points, placing, () if at_start is None else at_start.wrong, level, estimated)
+        if judged.judgement.fits:
+            return judged
+        if best is None or judged.judgement.misfit < best.judgement.misfit:
+            best = judged
     return best
 
 
@@ -452,12 +467,12 @@ def _starts(points: GivenPoints, start: Similarity | None) -> Iterator[Similarit
     best, least, h = None, np.inf, len(at) // 2 + 1
     if len(at) > 3:
         triples = _triples(len(at), MAX_TRIPLES)
-        for one in fit_similarities(X[triples], given[triples]):
-            if one is None:
+        for similarity in fit_similarities(X[triples], given[triples]):
+            if similarity is None:
                 continue
-            distance = float(np.partition(np.linalg.norm(one.apply(X) - given, axis=1), h - 1)[h - 1])
+            distance = float(np.partition(np.linalg.norm(similarity.apply(X) - given, axis=1), h - 1)[h - 1])
             if distance < least:
-                best, least = one, distance
+                best, least = similarity, distance
     if best is not None:
         yield best
 

@@ -183,10 +183,12 @@ def scales_of(
         placing: object frame from the frame of the free network.
         by_values: derivatives of the logarithms of scales by the given values, (k, m).
     """
-    found, W = reference.compare(kinds, placing), csr_matrix(by_values)
-    left = 1 - W @ found.v  # length in the free network, over the given one
-    variance = np.asarray(W.multiply(W @ found.stated).sum(axis=1)).ravel()
-    return Scales(np.log(placing.scale) - np.log(left), -csr_matrix(diags(1 / left) @ W @ found.J), variance)
+    comparison, W = reference.compare(kinds, placing), csr_matrix(by_values)
+    left = 1 - W @ comparison.v  # length in the free network, over the given one
+    variance = np.asarray(W.multiply(W @ comparison.stated).sum(axis=1)).ravel()
+    return Scales(
+        np.log(placing.scale) - np.log(left), -csr_matrix(diags(1 / left) @ W @ comparison.J), variance
+    )
 
 
 def scales_of_lengths(bars: ScaleBars, reference: Reference) -> Scales:
@@ -424,12 +426,12 @@ def numbers_of_scale(log: float, sigma: float, level: float) -> dict[str, Any]:
         level: probability that a unit factor is not recognised.
     """
     unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(level, 1))) * sigma)
-    found: dict[str, Any] = {"sigmas": abs(log) / sigma}
+    numbers: dict[str, Any] = {"sigmas": abs(log) / sigma}
     if abs(log) > np.log(MAX_PERCENT):
-        found["times"] = float(np.exp(log))
+        numbers["times"] = float(np.exp(log))
     else:
-        found["off"] = (100 * float(np.expm1(log)), "%")
+        numbers["off"] = (100 * float(np.expm1(log)), "%")
     if unit is not None:
         finer, coarser = unit.units
-        found |= {"unit_factor": unit.factor, "finer": finer, "coarser": coarser}
-    return found
+        numbers |= {"unit_factor": unit.factor, "finer": finer, "coarser": coarser}
+    return numbers

@@ -80,28 +80,34 @@ def judge_tables(
     """
     judge = _Judge(network, reference, place, level)
     given = [table.select(thinned(len(table.parts))) for table in tables]
-    kept, found = given, list[Contradiction]()
+    kept, contradictions = given, list[Contradiction]()
     while kept and not judge.fit([table.kind for table in kept]):
         wrong = list(judge.explained(kept)) or judge.contradicting(kept)
         kept = as_judged(kept, wrong)
-        found += wrong
-    unexplained = (not one.mistakes and one.factor == 1.0 for one in found)
+        contradictions += wrong
+    unexplained = (
+        not contradiction.mistakes and contradiction.factor == 1.0 for contradiction in contradictions
+    )
     return tuple(
-        replace(one, mistakes=judge.mistakes_of(one, given, kept)) if open_ else one
-        for one, open_ in zip(found, unexplained, strict=True)
+        replace(contradiction, mistakes=judge.mistakes_of(contradiction, given, kept))
+        if open_
+        else contradiction
+        for contradiction, open_ in zip(contradictions, unexplained, strict=True)
     )
 
 
 def as_judged(tables: Sequence[Table], wrong: Sequence[Contradiction]) -> list[Table]:
     """Return the tables without observations that contradict others, with standard deviations that fit."""
-    whole = {one.kind for one in wrong if one.whole}
-    parts = {part for one in wrong for part in one.parts}
+    whole_kinds = {contradiction.kind for contradiction in wrong if contradiction.whole}
+    parts = {part for contradiction in wrong for part in contradiction.parts}
     kept = []
-    for table in (table for table in tables if table.kind.name not in whole):
+    for table in (table for table in tables if table.kind.name not in whole_kinds):
         table = table.select(
             [k for k, p in enumerate(table.parts.tolist()) if (table.number, p) not in parts]
         )
-        factor = prod(one.factor for one in wrong if one.kind == table.kind.name)
+        factor = prod(
+            contradiction.factor for contradiction in wrong if contradiction.kind == table.kind.name
+        )
         if factor != 1.0 and isinstance(table.kind, TableKind):
             table = table._replace(kind=table.kind.with_sigma(factor * table.kind.sigma))
         kept.append(table)
@@ -140,9 +146,9 @@ class _Judge:
             others = [table.kind for table in tables if table.number not in of_source]
             name, mistakes = source[0].kind.name, self._mistakes([table.kind for table in source], others)
             if mistakes and name not in explained:
-                whole = not any(kind.name == name for kind in others)
+                of_all = not any(kind.name == name for kind in others)
                 explained.add(name)
-                yield Contradiction(name, _parts_of(source), whole, mistakes)
+                yield Contradiction(name, _parts_of(source), of_all, mistakes)
 
     def contradicting(self, tables: Sequence[Table]) -> list[Contradiction]:
         """Return single observations that are wrong, imprecise kinds, or kinds that the others contradict."""
@@ -178,7 +184,7 @@ class _Judge:
         right = [kind for kind in confirmed(self.network) if len(kind)]
         kinds = [*right, *(table.kind for table in tables)]
         model, kind = self.reference.differences(kinds, placing)
-        of_kind = np.array([one.name == name for one in kinds])[kind][model.item]
+        of_kind = np.array([member.name == name for member in kinds])[kind][model.item]
         rest = model.part(~of_kind).kept().dof if (~of_kind).any() else 0
         confirming = rest
         at_scale = replace(model, A=np.delete(model.A, 6, axis=1)).part(of_kind)
@@ -190,21 +196,31 @@ class _Judge:
         """Return the kind whose standard deviations are too small, or all kinds if no single one is."""
         names = dict.fromkeys(table.kind.name for table in tables)
         kinds = [Contradiction(name, factor=factor) for name in names]
-        alone = (one for one in kinds if self.fit([table.kind for table in as_judged(tables, [one])]))
+        alone = (
+            contradiction
+            for contradiction in kinds
+            if self.fit([table.kind for table in as_judged(tables, [contradiction])])
+        )
         imprecise = next(alone, None)
         return kinds if imprecise is None else [imprecise]
 
     def mistakes_of(
-        self, found: Contradiction, given: Sequence[Table], kept: Sequence[Table]
+        self, contradiction: Contradiction, given: Sequence[Table], kept: Sequence[Table]
     ) -> tuple[str, ...]:
         """Return the mistakes whose correction makes observations agree that were left out."""
         out, others = list[Kind](), [table.kind for table in kept]
         for table in given:
-            on = [k for k, part in enumerate(table.parts.tolist()) if (table.number, part) in found.parts]
+            on = [
+                k
+                for k, part in enumerate(table.parts.tolist())
+                if (table.number, part) in contradiction.parts
+            ]
             kind = table.kind
             if isinstance(kind, Group) and on:  # its rows share parameters
                 out.append(kind)
-                others = [one for one in others if not (type(one) is type(kind) and one.group == kind.group)]
+                others = [
+                    other for other in others if not (type(other) is type(kind) and other.group == kind.group)
+                ]
             elif on:
                 out.append(table.select(on).kind)
         return self._mistakes(out, others)

@@ -56,15 +56,15 @@ class Kept:
     chi2: float
     dof: int
 
-    def without(self, one: int) -> Kept:
+    def without(self, item: int) -> Kept:
         """Leave out one more value, by updating the partitioned inverse.
 
         Args:
-            one: index of the value.
+            item: index of the value.
 
         Source: Foerstner and Wrobel (2016), sec. 4.6.2.
         """
-        rows = np.flatnonzero(self.model.item == one)
+        rows = np.flatnonzero(self.model.item == item)
         s = self.model.size[rows]
         d, U = np.linalg.eigh(self.precision[rows[:, None], rows] * s[:, None] * s)
         on = d > MIN_REDUNDANCY
@@ -83,13 +83,13 @@ class Kept:
         w2 = np.einsum("kab,ka->kb", U, self.u[at] * s) ** 2
         return np.where(on, w2 / np.where(on, d, 1.0), 0.0).sum(axis=1), on.sum(axis=1)
 
-    def difference(self, one: int) -> tuple[FloatArray, FloatArray]:
+    def difference(self, item: int) -> tuple[FloatArray, FloatArray]:
         """Return the difference of a value from the prediction by the others, (k,), and its covariance.
 
         Args:
-            one: index of the value.
+            item: index of the value.
         """
-        rows = np.flatnonzero(self.model.item == one)
+        rows = np.flatnonzero(self.model.item == item)
         covariance = np.linalg.pinv(self.precision[np.ix_(rows, rows)], rcond=RANK, hermitian=True)
         return covariance @ self.u[rows], np.asarray(covariance, dtype=np.float64)
 
@@ -231,8 +231,8 @@ class GivenModel:
     def kept(self, without: tuple[int, ...] = ()) -> Kept:
         """Return the differences without some values."""
         out = self.all_kept
-        for one in without:
-            out = out.without(one)
+        for item in without:
+            out = out.without(item)
         return out
 
     @cached_property
@@ -308,29 +308,29 @@ class GivenModel:
             confirmed=len(np.unique(self.item[c])),
         )
 
-    def external(self, some: tuple[int, ...] = (), *, level: float = LEVEL) -> FloatArray:
+    def external(self, without: tuple[int, ...] = (), *, level: float = LEVEL) -> FloatArray:
         """Return the external reliability of each given value, infinite if nothing checks it, (items,).
 
         It is the largest shift that a just detectable error of the value causes in the parameters that only
         given values determine, in standard deviations of the parameters.
 
         Args:
-            some: values left out.
+            without: values left out.
             level: level of the test of a value.
         """
         out, delta0 = np.full(self.items, np.nan), non_centrality(level)
-        part = self.part(~np.isin(self.item, some))
+        part = self.part(~np.isin(self.item, without))
         S, N = part.network + part.stated, part._left
         M, P = part.precision, np.linalg.pinv(S, rcond=RANK, hermitian=True)
         if self.estimated or not self.stated.any():  # only the geometry is known
             M, P = N @ N.T, np.eye(len(S))
-        for one in np.unique(part.item):
-            rows = np.flatnonzero(part.item == one)
+        for item in np.unique(part.item):
+            rows = np.flatnonzero(part.item == item)
             M_rows, W = M[np.ix_(rows, rows)], P[np.ix_(rows, rows)]
             L = np.linalg.cholesky(W + RANK * np.trace(W) * np.eye(len(rows)))
             checked = np.linalg.eigvalsh(np.linalg.solve(L, np.linalg.solve(L, M_rows).T)).min()
             r = float(np.clip(checked, 0.0, 1.0))
-            out[one] = delta0 * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
+            out[item] = delta0 * np.sqrt((1 - r) / r) if r > MIN_REDUNDANCY else np.inf
         return out
 
     def factor(self) -> tuple[float, float]:
@@ -391,9 +391,9 @@ class Judgement:
         """Whether errors of some values, or of all standard deviations, explain the differences."""
         return not self.doubtful or self.score < 0
 
-    def contradicted(self, some: tuple[int, ...]) -> Judgement:
+    def contradicted(self, doubtful: tuple[int, ...]) -> Judgement:
         """Return the judgement that an unknown subset of some values is wrong."""
-        return replace(self, wrong=(), factor=1.0, score=0.0, doubtful=some, one_wrong=False)
+        return replace(self, wrong=(), factor=1.0, score=0.0, doubtful=doubtful, one_wrong=False)
 
     @property
     def misfit(self) -> float:
@@ -409,9 +409,9 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         level: probability that correct values are reported as wrong.
     """
     every = model.kept()
-    found = Judgement(every.chi2, every.dof, every.probability())
+    judgement = Judgement(every.chi2, every.dof, every.probability())
     if every.dof < 1 or model.fits(level):
-        return found
+        return judgement
     cost = cost_of_parameter(len(model.v))
     removed = _wrong_values(model, level, cost)
     factor, gain = (1.0, 0.0) if model.estimated else model.factor()
@@ -422,25 +422,25 @@ def judge_values(model: GivenModel, level: float) -> Judgement:
         kept = model.kept(removed.values)
         of_wrong = _score(model, removed.values, kept, scatter=not model.stated.any())
     if min(of_wrong, of_factor) >= 0:
-        some = _suspects(model, level)
-        return replace(found, doubtful=some, one_wrong=_one_is_wrong(model, some))
+        suspects = _suspects(model, level)
+        return replace(judgement, doubtful=suspects, one_wrong=_one_is_wrong(model, suspects))
     if removed is None or of_factor < of_wrong:
         sets = _sets(model, cost)
         # with few values, one wrong value would look like standard deviations that are too small, unless each
         # single error is too small for its test to find
         unseen = float(np.sqrt(every.decreases()[0].max())) < non_centrality(level)
-        if sets and (unseen or of_factor + 2 * MIN_LEAD < min(one.score for one in sets)):
-            return replace(found, factor=factor, score=of_factor)
-        return replace(found, doubtful=tuple(range(model.items)), score=of_factor)
-    found = replace(found, score=removed.score)
+        if sets and (unseen or of_factor + 2 * MIN_LEAD < min(wrong_values.score for wrong_values in sets)):
+            return replace(judgement, factor=factor, score=of_factor)
+        return replace(judgement, doubtful=tuple(range(model.items)), score=of_factor)
+    judgement = replace(judgement, score=removed.score)
     if removed.rivals or not model.confirms_rest(removed.values):
-        some = tuple(sorted({*removed.values, *removed.rivals}))
-        one_wrong = len(removed.values) == 1 and _one_is_wrong(model, some)
-        return replace(found, doubtful=some, one_wrong=one_wrong)
-    return replace(found, wrong=removed.values)
+        suspects = tuple(sorted({*removed.values, *removed.rivals}))
+        one_wrong = len(removed.values) == 1 and _one_is_wrong(model, suspects)
+        return replace(judgement, doubtful=suspects, one_wrong=one_wrong)
+    return replace(judgement, wrong=removed.values)
 
 
-def misfit_of(model: GivenModel, found: Judgement) -> float:
+def misfit_of(model: GivenModel, judgement: Judgement) -> float:
     """Return chi-square after accounting for the errors found, plus their cost.
 
     Unknown standard deviations take their largest plausible values. With wrong values, chi-square is computed
@@ -448,13 +448,13 @@ def misfit_of(model: GivenModel, found: Judgement) -> float:
 
     Args:
         model: differences of the values from the free network.
-        found: errors found.
+        judgement: errors found.
     """
-    if not found.wrong:
-        return model.at_worst.kept().chi2 if model.estimated else found.misfit
+    if not judgement.wrong:
+        return model.at_worst.kept().chi2 if model.estimated else judgement.misfit
     model = model.at_worst if model.estimated else model
-    others = model.part(~np.isin(model.item, found.wrong)).kept().chi2
-    return others + _cost_of(model, found.wrong, model.kept(found.wrong))
+    others = model.part(~np.isin(model.item, judgement.wrong)).kept().chi2
+    return others + _cost_of(model, judgement.wrong, model.kept(judgement.wrong))
 
 
 @dataclass(frozen=True)
@@ -473,7 +473,7 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
     """
     kept = model.kept()
     out: tuple[int, ...] = ()
-    found: list[WrongValues] = []
+    sets: list[WrongValues] = []
     for k in range(1, (model.items + 1) // 2 + 1):
         fall, rank = kept.decreases()
         gain = np.where(np.isin(np.arange(model.items), out), -np.inf, fall - cost * rank)
@@ -481,12 +481,12 @@ def _sets(model: GivenModel, cost: float) -> tuple[WrongValues, ...]:
         out, kept = tuple(sorted((*out, more))), kept.without(more)
         if comb(model.items, k) <= MAX_SETS:
             misfit = dict(_misfits_like(model, out))
-            out = min(misfit, key=lambda some: misfit[some], default=out)
+            out = min(misfit, key=lambda values: misfit[values], default=out)
             kept = model.kept(out)
         if kept.dof < 1:
             break
-        found.append(WrongValues(out, _score(model, out, kept)))
-    return tuple(found)
+        sets.append(WrongValues(out, _score(model, out, kept)))
+    return tuple(sets)
 
 
 def _score(model: GivenModel, out: tuple[int, ...], kept: Kept, *, scatter: bool = True) -> float:
@@ -547,8 +547,8 @@ def _wrong_values(model: GivenModel, level: float, cost: float) -> WrongValues |
         if kept.dof < 1:
             return None
     misfit = dict(_misfits_like(model, out))
-    out = min(misfit, key=lambda some: misfit[some])
-    like = {one for some, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for one in some}
+    out = min(misfit, key=lambda values: misfit[values])
+    like = {value for values, chi2 in misfit.items() if chi2 < misfit[out] + MARGIN for value in values}
     # the others may be wrong and these right; errors with one cause do not scatter
     rest, others = model.kept(out), model.part(np.isin(model.item, out)).kept()
     if others.dof > 0 and others.chi2 - rest.chi2 < cost * (others.dof - rest.dof) + MARGIN:
@@ -569,26 +569,26 @@ def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tup
         left_out = _each_but_one(model.kept(), (), tuple(sorted(out)))
     for others, kept in left_out:
         fall, rank = kept.decreases()
-        for one in items:
-            if one not in others and rank[one] < kept.dof:
-                yield tuple(sorted((*others, one))), kept.chi2 - float(fall[one])
+        for item in items:
+            if item not in others and rank[item] < kept.dof:
+                yield tuple(sorted((*others, item))), kept.chi2 - float(fall[item])
 
 
 def _each_but_one(
-    kept: Kept, without: tuple[int, ...], some: tuple[int, ...]
+    kept: Kept, without: tuple[int, ...], values: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], Kept]]:
     """Yield the differences without all but one of some values, for each of them, in n ln n updates.
 
     Args:
         kept: the differences without the values `without`.
         without: values left out already.
-        some: further values, one or more.
+        values: further values, one or more.
     """
-    if len(some) == 1:
+    if len(values) == 1:
         yield without, kept
         return
-    half = len(some) // 2
-    for stay, go in ((some[half:], some[:half]), (some[:half], some[half:])):
+    half = len(values) // 2
+    for stay, go in ((values[half:], values[:half]), (values[:half], values[half:])):
         rest = kept
         for value in go:
             rest = rest.without(value)
@@ -600,14 +600,14 @@ def _suspects(model: GivenModel, level: float) -> tuple[int, ...]:
     every = model.kept()
     fall, rank = every.decreases()
     alone = [
-        one
-        for one in range(model.items)
-        if rank[one] < every.dof and every.may_fit(level, float(fall[one]), int(rank[one]))
-        if model.fits(level, (one,))
+        item
+        for item in range(model.items)
+        if rank[item] < every.dof and every.may_fit(level, float(fall[item]), int(rank[item]))
+        if model.fits(level, (item,))
     ]
     return tuple(alone) if len(alone) > 1 else tuple(range(model.items))
 
 
-def _one_is_wrong(model: GivenModel, some: tuple[int, ...]) -> bool:
+def _one_is_wrong(model: GivenModel, suspects: tuple[int, ...]) -> bool:
     """Return whether exactly one of the suspected values is wrong, which the other values must confirm."""
-    return len(some) < model.items and all(model.confirms_rest((one,)) for one in some)
+    return len(suspects) < model.items and all(model.confirms_rest((item,)) for item in suspects)

@@ -72,11 +72,11 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
         reduced: its normal equations.
         columns: its derivatives.
     """
-    found = list(_by_photographs(a, reduced, columns))
+    alternatives = list(_by_photographs(a, reduced, columns))
     in_all = Alternative(STRAIN if a.datum == "control" else FORMAT, "all", np.ones(reduced.photographs))
-    found += _in_all(reduced, in_all, reduced.whiten(in_all.columns(a, columns)))
+    alternatives += _in_all(reduced, in_all, reduced.whiten(in_all.columns(a, columns)))
     if a.datum != "control":
-        found += [
+        alternatives += [
             *interiors(a, reduced, HELD),
             *interiors(a, reduced, GIVEN),
             *moved_points(a, reduced),
@@ -84,14 +84,14 @@ def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[
 
     needed = np.log(1 / a.levels.family)
 
-    def tested(one: Alternative) -> Alternative:
-        priced = one.priced(reduced)
+    def tested(alternative: Alternative) -> Alternative:
+        priced = alternative.priced(reduced)
         if reduced.correlation is None or not priced.evidence_beside_spread > needed:
             return priced  # not significant in any case
-        effect = reduced.design_effect(reduced.whiten(one.columns(a, columns)))
+        effect = reduced.design_effect(reduced.whiten(alternative.columns(a, columns)))
         return replace(priced, design_effect=effect)
 
-    return tuple(sorted(map(tested, found), key=lambda one: -one.evidence))
+    return tuple(sorted(map(tested, alternatives), key=lambda alternative: -alternative.evidence))
 
 
 def count_alternatives(a: Adjustment) -> int:
@@ -103,8 +103,8 @@ def count_alternatives(a: Adjustment) -> int:
     Args:
         a: adjustment.
     """
-    owners = [one for family in (HELD, GIVEN) for one in interior_parameters(a, family)]
-    held = sum(len(one) + (len(one) > 1) for one in owners)
+    owners = [owner for family in (HELD, GIVEN) for owner in interior_parameters(a, family)]
+    held = sum(len(owner) + (len(owner) > 1) for owner in owners)
     if len(a.network.images) < MIN_GROUP:
         return held + 1
     camera = cameras_of_photographs(a)
@@ -115,15 +115,15 @@ def count_alternatives(a: Adjustment) -> int:
     return held + patterns + len(OF_EACH) + len((FORMAT, MOVED, BODY))
 
 
-def is_significant(one: Alternative, rows: int, level: float) -> bool:
+def is_significant(alternative: Alternative, rows: int, level: float) -> bool:
     """Return whether chance would produce such a gain in a smaller share of all surveys than the level.
 
     Args:
-        one: alternative.
+        alternative: alternative with its gain.
         rows: number of alternatives tested together.
         level: probability of naming any alternative if none is true, `Levels.family`.
     """
-    return bool(one.log_p < np.log(level / rows) - one.search)
+    return bool(alternative.log_p < np.log(level / rows) - alternative.search)
 
 
 def needed_gain(rank: int, touched: int, search: float, rows: int, level: float) -> float:
@@ -153,15 +153,15 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
     for index, camera in enumerate(a.estimate.cameras):
         if not (network.camera == index).any():
             continue
-        some = ~camera.free
+        listed = ~camera.free
         if family.of_given:
             weighted = given.parameter[(given.camera == index) & (given.sigma > 0)]
-            some = camera.free & np.isin(np.arange(len(camera.free)), weighted)
+            listed = camera.free & np.isin(np.arange(len(camera.free)), weighted)
         # the denominator of a fraction describes the same effect as its numerator
-        for s in np.flatnonzero(some & ~camera.plays(Role.DENOMINATOR)).tolist():
+        for s in np.flatnonzero(listed & ~camera.plays(Role.DENOMINATOR)).tolist():
             owner = owners.setdefault(camera.owner_of(s), {})
             owner.setdefault(camera.names[s], []).append((index, s))
-    return [[tuple(one) for one in owner.values()] for owner in owners.values()]
+    return [[tuple(places) for places in owner.values()] for owner in owners.values()]
 
 
 def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
@@ -174,19 +174,19 @@ def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterat
     """
     everywhere = np.ones(reduced.photographs)
     for sets in interior_parameters(a, family):
-        whole = tuple(pair for one in sets for pair in one)
-        D = reduced.whiten(interior_columns(a, whole)[0])
+        of_camera = tuple(pair for places in sets for pair in places)
+        D = reduced.whiten(interior_columns(a, of_camera)[0])
         every = gain_of(*reduced.project(D))
-        tested = [(one, [k]) for k, one in enumerate(sets)]
+        tested = [(places, [k]) for k, places in enumerate(sets)]
         if len(sets) > 1:
-            tested.append((whole, list(range(len(sets)))))
-        for parameters, some in tested:
-            one = Alternative(family, "all", everywhere, parameters=parameters)
-            yield from _in_all(reduced, one, D[:, :, some], D @ every.beta)
+            tested.append((of_camera, list(range(len(sets)))))
+        for parameters, columns in tested:
+            alternative = Alternative(family, "all", everywhere, parameters=parameters)
+            yield from _in_all(reduced, alternative, D[:, :, columns], D @ every.beta)
 
 
 def _in_all(
-    reduced: Reduced, one: Alternative, D: FloatArray, further: FloatArray | None = None
+    reduced: Reduced, alternative: Alternative, D: FloatArray, further: FloatArray | None = None
 ) -> Iterator[Alternative]:
     """Yield an alternative of whitened columns (k, 2, q) that all photographs share, if it has a gain.
 
@@ -199,7 +199,7 @@ def _in_all(
         spreads = [
             _spread_along(reduced, step, after, variance) for after in (step, further) if after is not None
         ]
-        yield replace(one, gain=gain, spread=min(spreads, key=lambda spread: spread.factor))
+        yield replace(alternative, gain=gain, spread=min(spreads, key=lambda spread: spread.factor))
 
 
 def _spread_along(reduced: Reduced, direction: FloatArray, step: FloatArray, variance: float) -> Spread:
@@ -219,13 +219,13 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
     """
     camera = cameras_of_photographs(a)
     run = runs_of(camera)
-    whole = Part(*reduced.project_by_run(reduced.whiten(columns.freedoms), run))
-    if len(whole.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
-        yield from _of_each(reduced, whole, run, a.levels.family)
+    every_run = Part(*reduced.project_by_run(reduced.whiten(columns.freedoms), run))
+    if len(every_run.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
+        yield from _of_each(reduced, every_run, run, a.levels.family)
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
-            part = whole.of(runs, np.array(family.places))
+            part = every_run.of(runs, np.array(family.places))
             for pattern, factors in patterns_of(family, len(runs)):
                 if pattern == "group":
                     factors = part.groups()
@@ -234,7 +234,7 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                 gains = [part.gain(factor) for factor in factors]
                 best = max(range(len(gains)), key=lambda k: gains[k].value)
                 gain, spread = gains[best], part.spread(factors[best], gains[best])
-                every = np.zeros(len(whole.g))
+                every = np.zeros(len(every_run.g))
                 every[runs] = factors[best]
                 factor = every[run]
                 if pattern == "single":
@@ -245,35 +245,35 @@ def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterat
                 yield Alternative(family, pattern, factor, gain, spread, search, among=among)
 
 
-def _variance_of(reduced: Reduced, some: BoolArray, gain: Gain) -> float:
+def _variance_of(reduced: Reduced, chosen: BoolArray, gain: Gain) -> float:
     """Return the variance that remains in some photographs, (m,), relative to that of all photographs."""
-    rows = some[reduced.image]
+    rows = chosen[reduced.image]
     v = reduced.v[rows]
     expected = 2 * float(reduced.share[rows].sum()) * reduced.redundancy / reduced.count
     return float(max((v**2).sum() - gain.value, 0.0) / max(expected - gain.rank, 1.0))
 
 
-def _of_each(reduced: Reduced, whole: Part, run: IntArray, level: float) -> Iterator[Alternative]:
+def _of_each(reduced: Reduced, part: Part, run: IntArray, level: float) -> Iterator[Alternative]:
     """Yield the alternatives of a per-photograph camera.
 
     Such a camera must exceed, by an F test, the effect of all other freedoms of the photographs once it is
     included. Errors common to the image points of a photograph need not come from the camera.
     """
-    m, f = whole.g.shape
+    m, f = part.g.shape
     for family in OF_EACH:
-        some = np.array(family.places)
-        rest = np.setdiff1d(np.arange(f), some)
-        q, p = m * len(some), m * len(rest)
-        H = whole.H[:, some][:, :, :, some].reshape(q, q)
-        squares = whole.squares[:, some].ravel()
-        gain = gain_of(H, whole.g[:, some].ravel(), squares)
+        places = np.array(family.places)
+        rest = np.setdiff1d(np.arange(f), places)
+        q, p = m * len(places), m * len(rest)
+        H = part.H[:, places][:, :, :, places].reshape(q, q)
+        squares = part.squares[:, places].ravel()
+        gain = gain_of(H, part.g[:, places].ravel(), squares)
         if not log_probability(gain.value, gain.rank, reduced.redundancy) < np.log(level):
             continue
-        cross = whole.H[:, rest][:, :, :, some].reshape(p, q)
+        cross = part.H[:, rest][:, :, :, places].reshape(p, q)
         others = gain_of(
-            whole.H[:, rest][:, :, :, rest].reshape(p, p) - cross @ determined_inverse(H, squares) @ cross.T,
-            whole.g[:, rest].ravel() + cross @ gain.beta,
-            whole.squares[:, rest].ravel(),
+            part.H[:, rest][:, :, :, rest].reshape(p, p) - cross @ determined_inverse(H, squares) @ cross.T,
+            part.g[:, rest].ravel() + cross @ gain.beta,
+            part.squares[:, rest].ravel(),
         )
         spread = Spread(others.value / others.rank, others.rank, among=False) if others.rank else NONE
         yield Alternative(family, "each", run.astype(float), gain, spread)
@@ -345,7 +345,7 @@ class Part:
         """Return groups of photographs in no order, grown by two-means, as factors 0 and 1, (p, m)."""
         m = len(self.g)
         single, _ = gains_of(np.einsum("iaib->iab", self.H), self.g, self.squares)
-        found = []
+        groups = []
         for first in np.argsort(-single)[:STARTS]:
             factor = (np.arange(m) == first).astype(float)
             for _ in range(ROUNDS):
@@ -359,8 +359,8 @@ class Part:
                     break
                 factor = again
             if MIN_GROUP <= factor.sum() <= m - MIN_GROUP:
-                found.append(factor)
-        return np.array(found).reshape(-1, m)
+                groups.append(factor)
+        return np.array(groups).reshape(-1, m)
 
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:
         """Return the spread of the photographs in the family beyond what a pattern explains.
@@ -371,9 +371,9 @@ class Part:
         """
         m = len(self.g)
         left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
-        some = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
-        blocks = np.einsum("iaib->iab", self.H)[some]
-        values, ranks = gains_of(blocks, left[some], self.squares[some])
+        others = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
+        blocks = np.einsum("iaib->iab", self.H)[others]
+        values, ranks = gains_of(blocks, left[others], self.squares[others])
         redundancy = int(ranks.sum()) - gain.rank
         return NONE if redundancy < 1 else Spread(float(values.sum()) / redundancy, redundancy)
 
@@ -418,10 +418,10 @@ def moved_points(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     best: dict[str, Alternative] = {}
     for k in splits:
         moves = _moves(reduced, (np.arange(m) >= k).astype(float))
-        for one in (*_each_by_itself(reduced, moves), *_as_one_body(a, reduced, moves)):
-            tested = replace(one, search=one.search + float(np.log(len(splits)))).priced(reduced)
-            if one.family.name not in best or tested.evidence > best[one.family.name].evidence:
-                best[one.family.name] = tested
+        for moved in (*_each_by_itself(reduced, moves), *_as_one_body(a, reduced, moves)):
+            tested = replace(moved, search=moved.search + float(np.log(len(splits)))).priced(reduced)
+            if moved.family.name not in best or tested.evidence > best[moved.family.name].evidence:
+                best[moved.family.name] = tested
     yield from best.values()
 
 
@@ -447,7 +447,7 @@ class _Moves:
 def _moves(reduced: Reduced, factor: FloatArray) -> _Moves:
     """Return the normal equations of motions before the photographs with factor 1."""
     n, on = len(reduced.L), factor[reduced.image] > 0
-    before, after = (np.bincount(reduced.point[some], minlength=n) for some in (~on, on))
+    before, after = (np.bincount(reduced.point[rows], minlength=n) for rows in (~on, on))
     points = np.flatnonzero((before >= MIN_GROUP) & (after >= MIN_GROUP))
     # the columns of a motion are those of the point in the photographs afterwards
     point, B = reduced.point[on], reduced.B[on]
@@ -479,9 +479,9 @@ def _each_by_itself(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
         gain = gain_of(H[part, part], moves.g[tried].ravel()[part], squares[tried].ravel()[part])
         spread = Spread(float(others.mean()) / 3, 3 * len(others)) if len(others) else NONE
         search, points = moves.log_sets(count), moves.points[tried[:count]]
-        one = Alternative(MOVED, "split", moves.factor, gain, spread, search, points).priced(reduced)
-        if best is None or one.evidence > best.evidence:
-            best = one
+        moved = Alternative(MOVED, "split", moves.factor, gain, spread, search, points).priced(reduced)
+        if best is None or moved.evidence > best.evidence:
+            best = moved
         elif count > 2 * len(best.points) + 4:
             break
     if best is not None:

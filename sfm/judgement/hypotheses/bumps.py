@@ -70,8 +70,8 @@ def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...
     critical = level_of_single(a.levels.question, max(len(tested) + len(freed), 1))
     with own_threads():
         every = [*_of_freed(a, freed, stated), *_of_mounted(a, tested, critical)]
-    found = [bump for bump in every if bump.probability < critical]
-    return tuple(sorted(found, key=lambda bump: -bump.sigmas))
+    significant = [bump for bump in every if bump.probability < critical]
+    return tuple(sorted(significant, key=lambda bump: -bump.sigmas))
 
 
 def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tuple[Remark, ...]:
@@ -82,21 +82,21 @@ def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tu
         unit: unit of its coordinates.
         stated: moment of each photograph as the survey states it, see `find_bumps`, (m,).
     """
-    found = find_bumps(a, stated)
-    if not found:
+    bumps = find_bumps(a, stated)
+    if not bumps:
         return ()
-    cameras = {bump.camera for bump in found}
+    cameras = {bump.camera for bump in bumps}
     theirs = [k for k, camera in enumerate(a.estimate.cameras) if camera.name in cameras]
     return (
         remark(
             "rig_contradicted",
-            share=len(found) / int(np.isin(a.network.camera, theirs).sum()),
-            photographs=[bump.photograph for bump in found],
-            cameras=list(dict.fromkeys(bump.camera for bump in found)),
-            distance=(max(bump.shift for bump in found), unit),
-            angle=(float(np.degrees(max(bump.turn for bump in found))), "deg"),
-            shift=max(bump.sigmas for bump in found),
-            bound=float(np.mean([not bump.free for bump in found])),
+            share=len(bumps) / int(np.isin(a.network.camera, theirs).sum()),
+            photographs=[bump.photograph for bump in bumps],
+            cameras=list(dict.fromkeys(bump.camera for bump in bumps)),
+            distance=(max(bump.shift for bump in bumps), unit),
+            angle=(float(np.degrees(max(bump.turn for bump in bumps))), "deg"),
+            shift=max(bump.sigmas for bump in bumps),
+            bound=float(np.mean([not bump.free for bump in bumps])),
         ),
     )
 

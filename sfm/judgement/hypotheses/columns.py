@@ -76,12 +76,12 @@ def columns_of(a: Adjustment) -> Columns:
     exterior = np.concatenate([-point, by_axes @ turned], axis=2)
     by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
     usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
-    found = Columns(
+    columns = Columns(
         exterior, point, np.concatenate([by_c[:, :, None], _camera(flat), by_object], axis=2), usable
     )
-    for part in (found.exterior, found.point, found.freedoms):
+    for part in (columns.exterior, columns.point, columns.freedoms):
         part[~usable] = 0.0
-    return found
+    return columns
 
 
 def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
@@ -110,9 +110,9 @@ def _camera(flat: FloatArray) -> FloatArray:
         flat: tangents divided by that of half the longer side, y up, (k, 2).
     """
     x, y = flat.T
-    r2, one, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
-    across = [one, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
-    down = [zero, one, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
+    r2, ones, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
+    across = [ones, zero, x * r2, x * r2**2, r2 + 2 * x**2, 2 * x * y, x, y]
+    down = [zero, ones, y * r2, y * r2**2, 2 * x * y, r2 + 2 * y**2, zero, zero]
     return np.stack([np.stack(across, -1), -np.stack(down, -1)], axis=1)
 
 

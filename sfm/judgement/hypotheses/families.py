@@ -143,25 +143,25 @@ class Family(ABC):
         """Return the kind of remark for an alternative of this family."""
 
     @abstractmethod
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points of an adjustment, px, (k, 2, q)."""
 
     @abstractmethod
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the parts of the remark on an alternative.
 
         Args:
-            one: the alternative.
+            alternative: alternative of this family.
             a: adjustment with the alternative.
             beta: parameters of the alternative, (q,).
             unit: object unit.
         """
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause; of alternatives with the same cause only the best is adjusted."""
         return (self.name,)
 
-    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+    def displaced(self, alternative: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return the displacement of object points in the photographs that differ most, (n, 3)."""
         return np.zeros_like(points)
 
@@ -177,13 +177,13 @@ class OfPhotographs(Family):
     places: tuple[int, ...]  # indices in the freedoms
     of_camera: ClassVar[bool]  # whether the freedoms belong to a camera rather than the object
 
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        factor = one.factor[a.network.image_points.image]
+        factor = alternative.factor[a.network.image_points.image]
         freedoms = columns.freedoms[:, :, list(self.places)]
-        if one.pattern != "each":
+        if alternative.pattern != "each":
             return np.asarray(factor[:, None, None] * freedoms)
-        D = np.zeros((len(freedoms), 2, int(one.factor.max()) + 1, len(self.places)))
+        D = np.zeros((len(freedoms), 2, int(alternative.factor.max()) + 1, len(self.places)))
         D[np.arange(len(freedoms)), :, factor.astype(np.int64)] = freedoms
         return D.reshape(len(freedoms), 2, -1)
 
@@ -199,30 +199,31 @@ class CameraFamily(OfPhotographs):
         """Return the kind of remark for an alternative of this family."""
         return {"linear": "camera_drift", "each": "camera_varies"}.get(pattern, "other_camera")
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: photographs of a camera."""
-        if one.pattern == "each":
+        if alternative.pattern == "each":
             return ("camera", "each")
-        return ("camera", *one.photographs.tolist())  # one key for any number of parameters
+        return ("camera", *alternative.photographs.tolist())  # one key for any number of parameters
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the photographs and the differences of c and of the principal point."""
-        camera = a.estimate.cameras[a.network.camera[one.photographs[0]]]
+        camera = a.estimate.cameras[a.network.camera[alternative.photographs[0]]]
         half = max(camera.size_px) / 2
-        if one.pattern == "each":
+        if alternative.pattern == "each":
             varying = camera.plays(*(CAMERA_ROLES[place] for place in self.places))
             varying = varying & camera.free if (varying & camera.free).any() else varying
             of_each = self._of_each(beta.reshape(-1, len(self.places)), half)
             return {**of_each, "parameters": tuple(np.array(camera.names)[varying])}
-        linear = one.pattern == "linear"
-        grows = linear or one.factor[one.photographs[0]] > 0  # where the factor is 1, or in the others
+        linear = alternative.pattern == "linear"
+        # the photographs of the remark are those where the factor is 1, or the others
+        grows = linear or alternative.factor[alternative.photographs[0]] > 0
         # a column of 1 moves an image point at the edge by 1 px
-        largest = float(np.ptp(one.factor))  # from the first photograph to the last of a drift
-        parts: Parts = {"photographs": tuple(a.network.images[i] for i in one.photographs)}
+        largest = float(np.ptp(alternative.factor))  # from the first photograph to the last of a drift
+        parts: Parts = {"photographs": tuple(a.network.images[i] for i in alternative.photographs)}
         if abs(largest * float(beta[0])) > SEEN_PX:
             change = 100 * largest * float(beta[0]) / half
             parts["change"] = (change if grows else -change, "%")
-        if one.among is not None and not one.among.all():
+        if alternative.among is not None and not alternative.among.all():
             parts["camera"] = camera.shared_name
         if len(beta) > 2 and not linear and np.hypot(beta[1], beta[2]) > SEEN_PX:
             parts["away"] = (float(np.hypot(beta[1], beta[2])), "px")
@@ -258,16 +259,16 @@ class RowsFamily(CameraFamily):
         """Return the kind of remark for an alternative of this family."""
         return "rolling_shutter"
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: rows."""
         return ("rows",)
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the photographs that are displaced most, half as much or more, and by how much."""
         # from the first row to the last; a column of 1 moves an image point at the edge by 1 px
         sizes = np.array([camera.size_px for camera in a.estimate.cameras])[a.network.camera]
         stretch, _, shear = beta.reshape(-1, len(self.places)).T
-        speed = np.hypot(stretch - stretch.mean(), shear)[one.factor.astype(np.int64)]
+        speed = np.hypot(stretch - stretch.mean(), shear)[alternative.factor.astype(np.int64)]
         skew = 2 * speed * sizes[:, 1] / sizes.max(axis=1)
         most = np.flatnonzero(2 * skew >= skew.max())
         return {
@@ -287,26 +288,27 @@ class ObjectFamily(OfPhotographs):
         """Return the kind of remark for an alternative of this family."""
         return "shape_of_control" if pattern == "all" else "object_deformed"
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
-        return ("object", one.pattern)
+        return ("object", alternative.pattern)
 
-    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+    def displaced(self, alternative: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return the displacement of points in the photographs that differ most, (n, 3)."""
-        largest = float(np.abs(one.factor - one.factor.mean()).max())
+        largest = float(np.abs(alternative.factor - alternative.factor.mean()).max())
         return largest * without_motions(points, (self._field(points)[0] @ beta)[:, :, None])[:, :, 0]
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the largest displacement of a point; over the size of the object if it changes."""
         field_, size = self._field(a.estimate.points)
-        if one.pattern == "all":
+        if alternative.pattern == "all":
             return _parts_of_shape(field_ @ beta, unit)
         away = np.linalg.norm(field_ @ beta, axis=1) / size
-        steadily = one.pattern == "linear"
+        deformation = 1000 * float(np.ptp(alternative.factor)) * float(np.nanmax(away))
+        steadily = alternative.pattern == "linear"
         return {
-            "photographs": None if steadily else tuple(a.network.images[i] for i in one.photographs),
+            "photographs": None if steadily else tuple(a.network.images[i] for i in alternative.photographs),
             "how": ("steadily",) if steadily else None,
-            "deformation": (1000 * float(np.ptp(one.factor)) * float(np.nanmax(away)), "‰ of the object"),
+            "deformation": (deformation, "‰ of the object"),
         }
 
     def _field(self, points: FloatArray) -> tuple[FloatArray, float]:
@@ -322,40 +324,42 @@ class PointFamily(Family):
         """Return the kind of remark for an alternative of this family."""
         return "shape_of_control" if pattern == "all" else "points_moved"
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
-        return ("object", one.pattern)
+        return ("object", alternative.pattern)
 
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         seen, place = a.network.image_points, np.full(len(a.network.points), -1)
-        place[one.points] = np.arange(len(one.points))
+        place[alternative.points] = np.arange(len(alternative.points))
         rows = np.flatnonzero(place[seen.point] >= 0)
-        D = np.zeros((len(seen), 2, len(one.points), 3))
+        D = np.zeros((len(seen), 2, len(alternative.points), 3))
         D[rows, :, place[seen.point[rows]]] = (
-            one.factor[seen.image[rows]][:, None, None] * columns.point[rows]
+            alternative.factor[seen.image[rows]][:, None, None] * columns.point[rows]
         )
         return D.reshape(len(seen), 2, -1)
 
-    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+    def displaced(self, alternative: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return the displacement of points in the photographs that differ most, (n, 3)."""
         away = np.zeros_like(points)
-        away[one.points] = beta.reshape(-1, 3)
+        away[alternative.points] = beta.reshape(-1, 3)
         return away
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the points and their largest displacement.
 
         Of points that moved also the first photograph afterwards; of given ones the standard deviation of
         coordinates that covers all displacements.
         """
-        shape = _parts_of_shape(self.displaced(one, a.estimate.points, beta)[one.points], unit)
-        if one.pattern == "all":
+        shape = _parts_of_shape(
+            self.displaced(alternative, a.estimate.points, beta)[alternative.points], unit
+        )
+        if alternative.pattern == "all":
             return shape
         return {
-            "photographs": tuple(a.network.images[i] for i in one.photographs),
-            "points": tuple(a.network.points[j] for j in one.points),
-            "from": (a.network.images[int(np.flatnonzero(one.factor > 0)[0])],),
+            "photographs": tuple(a.network.images[i] for i in alternative.photographs),
+            "points": tuple(a.network.points[j] for j in alternative.points),
+            "from": (a.network.images[int(np.flatnonzero(alternative.factor > 0)[0])],),
             "distance": shape["distance"],
         }
 
@@ -364,20 +368,20 @@ class PointFamily(Family):
 class BodyFamily(PointFamily):
     """Object points that moved as a rigid body, by a vector and a small rotation."""
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a body."""
         return ("body",)
 
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
         seen, motions = a.network.image_points, np.zeros((len(a.network.points), 3, 6))
-        motions[one.points] = rigid_motions(a.estimate.points, one.points)[one.points]
-        return one.factor[seen.image][:, None, None] * (columns.point @ motions[seen.point])
+        motions[alternative.points] = rigid_motions(a.estimate.points, alternative.points)[alternative.points]
+        return alternative.factor[seen.image][:, None, None] * (columns.point @ motions[seen.point])
 
-    def displaced(self, one: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
+    def displaced(self, alternative: Alternative, points: FloatArray, beta: FloatArray) -> FloatArray:
         """Return the displacement of points in the photographs that differ most, (n, 3)."""
         away = np.zeros_like(points)
-        away[one.points] = rigid_motions(points, one.points)[one.points] @ beta
+        away[alternative.points] = rigid_motions(points, alternative.points)[alternative.points] @ beta
         return away
 
 
@@ -395,28 +399,28 @@ class InteriorFamily(Family):
         """Return the kind of remark for an alternative of this family."""
         return "given_parameter" if self.of_given else "held_parameter"
 
-    def cause(self, one: Alternative) -> tuple[object, ...]:
+    def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: single parameters, or all of a camera."""
-        return (self.name, len({s for _, s in one.parameters}) > 1)
+        return (self.name, len({s for _, s in alternative.parameters}) > 1)
 
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q)."""
-        return interior_columns(a, one.parameters)[0]
+        return interior_columns(a, alternative.parameters)[0]
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the parameters and, for a single one, the value that fits the image points."""
-        index, s = one.parameters[0]
+        index, s = alternative.parameters[0]
         camera = a.estimate.cameras[index]
         measure = "" if camera.units[s] == "1" else camera.units[s]
         value = float(camera.parameters[s])
-        names = tuple(dict.fromkeys(a.estimate.cameras[i].names[p] for i, p in one.parameters))
+        names = tuple(dict.fromkeys(a.estimate.cameras[i].names[p] for i, p in alternative.parameters))
         parts: Parts = {"camera": camera.owner_of(s), "parameters": names}
         if len(names) == 1:
-            found = value + float(beta[0]) * interior_columns(a, one.parameters)[2][0]
+            fitting = value + float(beta[0]) * interior_columns(a, alternative.parameters)[2][0]
             given = a.network.interior
             at = np.flatnonzero((given.camera == index) & (given.parameter == s))
             stated = float(given.value[at[0]]) if self.of_given else value
-            parts |= {"value": Quantity(stated, measure), "instead_of": Quantity(found, measure)}
+            parts |= {"value": Quantity(stated, measure), "instead_of": Quantity(fitting, measure)}
         return parts
 
 
@@ -428,7 +432,7 @@ class FormatFamily(Family):
         """Return the kind of remark for an alternative of this family."""
         return "distortion_not_described"
 
-    def columns(self, one: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
+    def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q).
 
         Photographs of all sizes have the same cells.
@@ -440,7 +444,7 @@ class FormatFamily(Family):
         D[np.arange(len(seen)), :, CELLS * row + column] = np.eye(2)
         return D.reshape(len(seen), 2, 2 * CELLS**2)
 
-    def parts(self, one: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
+    def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the largest displacement of a cell."""
         return {"largest": (float(np.linalg.norm(beta.reshape(-1, 2), axis=1).max()), "px")}
 

@@ -88,7 +88,7 @@ class Cause:
         That of a camera for each photograph is not known: what its many parameters leave open is much larger
         than what they shift.
         """
-        known = [found.shift for one, found in self.as_well if one.pattern != "each"]
+        known = [refitted.shift for alternative, refitted in self.as_well if alternative.pattern != "each"]
         return max((shift for shift in known if np.isfinite(shift)), default=None)
 
     @property
@@ -127,19 +127,23 @@ def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumption
     calibration = _is_calibration(final)
     without = "control" if calibration or not final.unknown_counts[2] else None
     free = free_network(final)
-    found = _judge_free(free, unit, without)
+    judged = _judge_free(free, unit, without)
     if not calibration:
-        return found
+        return judged
     try:
         cause = cause_in_calibration(final, free)
     except np.linalg.LinAlgError:
-        return found
+        return judged
     if cause is not None:
-        found = replace(found, causes=(remark_of(final, cause, unit),))
+        judged = replace(judged, causes=(remark_of(final, cause, unit),))
     few = () if cause is not None else _calibrated_from_few(final)
-    unchecked = (one for one in found.unchecked if one.kind not in OF_FREE_POINTS)
-    tested = remark("assumptions_tested", photographs=photographs, causes=len(found.causes))
-    return replace(found, unchecked=(tested, *few, *unchecked))
+    unchecked = (
+        unchecked_remark
+        for unchecked_remark in judged.unchecked
+        if unchecked_remark.kind not in OF_FREE_POINTS
+    )
+    tested = remark("assumptions_tested", photographs=photographs, causes=len(judged.causes))
+    return replace(judged, unchecked=(tested, *few, *unchecked))
 
 
 def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> JudgedAssumptions:
@@ -157,7 +161,7 @@ def _judge_free(plain: Adjustment | None, unit: str, without: str | None) -> Jud
     if len(photographs) < 2 * MIN_GROUP:
         few = remark("photographs_untested", photographs=photographs, needed=2 * MIN_GROUP)
         unchecked = (few, *unchecked)
-    return JudgedAssumptions(tuple(remark_of(plain, one, unit, without) for one in causes), unchecked)
+    return JudgedAssumptions(tuple(remark_of(plain, cause, unit, without) for cause in causes), unchecked)
 
 
 def _is_calibration(final: Adjustment) -> bool:
@@ -178,11 +182,11 @@ def _calibrated_from_few(final: Adjustment) -> tuple[Remark, ...]:
     return tuple(
         remark(
             "calibrated_from_few",
-            camera=final.estimate.cameras[final.network.camera[some[0]]].shared_name,
-            photographs=names[some].tolist(),
+            camera=final.estimate.cameras[final.network.camera[rows[0]]].shared_name,
+            photographs=names[rows].tolist(),
         )
-        for some in (np.flatnonzero(number == k) for k in range(int(number.max()) + 1))
-        if len(some) <= MIN_GROUP
+        for rows in (np.flatnonzero(number == k) for k in range(int(number.max()) + 1))
+        if len(rows) <= MIN_GROUP
     )
 
 
@@ -222,20 +226,22 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
         unit: object unit.
         without: name of what fixes all coordinates of the result, so that only those of `plain` shift.
     """
-    one, found = cause.alternative, cause.refit
+    alternative, refitted = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other, _ in cause.as_well))
-    parts = one.family.parts(one, found.adjustment, found.beta, unit)
+    parts = alternative.family.parts(alternative, refitted.adjustment, refitted.beta, unit)
     of = "coordinates" if without is None else f"coordinates without {without}"
     if plain.datum == "control":
         of = "cameras"
-    wrong, factor = found.shift, None
+    wrong, factor = refitted.shift, None
     if (
-        one.kind == "camera_varies"
+        alternative.kind == "camera_varies"
     ):  # a random error of each photograph biases nothing, but widens the scatter
         wrong = factor = precision_factor(plain)
-    rms = None if of == "cameras" else found.rms
-    size = {"shift": found.shift, "wrong": wrong, "rms": rms, "factor": factor}
-    return remark(one.kind, of=of, **size, instead=instead or None, otherwise=cause.otherwise, **parts)
+    rms = None if of == "cameras" else refitted.rms
+    size = {"shift": refitted.shift, "wrong": wrong, "rms": rms, "factor": factor}
+    return remark(
+        alternative.kind, of=of, **size, instead=instead or None, otherwise=cause.otherwise, **parts
+    )
 
 
 def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
@@ -246,11 +252,11 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
     """
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
-        found = _best(plain, causes)
-        if found is None:
+        cause = _best(plain, causes)
+        if cause is None:
             break
-        causes = _still_needed(plain, causes, found)
-    return tuple(one for one in _with_joint_shifts(plain, causes) if one.matters)
+        causes = _still_needed(plain, causes, cause)
+    return tuple(cause for cause in _with_joint_shifts(plain, causes) if cause.matters)
 
 
 def _best(
@@ -265,47 +271,60 @@ def _best(
     favours the alternative with most parameters. Those of `beside` are adjusted already.
     """
     current = causes[-1].refit.adjustment if causes else plain
-    before = [(one.alternative, one.refit.beta) for one in causes]
+    before = [(cause.alternative, cause.refit.beta) for cause in causes]
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
     every, level = alternatives_of(current, reduced, columns), plain.levels.family
     once: dict[tuple[object, ...], Alternative] = {}
-    for one in every:
-        if is_significant(one, len(every), level) and one.evidence > np.log(1 / level):
-            once.setdefault(one.family.cause(one), one)
+    for alternative in every:
+        if is_significant(alternative, len(every), level) and alternative.evidence > np.log(1 / level):
+            once.setdefault(alternative.family.cause(alternative), alternative)
     if once:  # if one parameter of all photographs explains the errors, no other cause is needed
-        for one in every:
-            if isinstance(one.family, InteriorFamily) and one.evidence_beside_spread > np.log(1 / level):
-                once.setdefault(one.family.cause(one), one)
+        for alternative in every:
+            if isinstance(alternative.family, InteriorFamily) and alternative.evidence_beside_spread > np.log(
+                1 / level
+            ):
+                once.setdefault(alternative.family.cause(alternative), alternative)
     of_kind: Counter[object] = Counter()
     to_try = []
-    for cause, one in once.items():
+    for cause, alternative in once.items():
         of_kind[cause[0]] += 1
         if of_kind[cause[0]] <= MAX_TRIED:
-            to_try.append(one)
+            to_try.append(alternative)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
 
-    def adjusted(some: Iterable[Alternative]) -> list[tuple[float, Alternative, Refit]]:
-        found = [(one, refit(plain, one, current, before, most=int(MAX_WORK / work))) for one in some]
-        return [(evidence(one, new), one, new) for one, new in found if new is not None]
+    def adjusted(alternatives: Iterable[Alternative]) -> list[tuple[float, Alternative, Refit]]:
+        refits = [
+            (alternative, refit(plain, alternative, current, before, most=int(MAX_WORK / work)))
+            for alternative in alternatives
+        ]
+        return [
+            (evidence(alternative, new), alternative, new) for alternative, new in refits if new is not None
+        ]
 
-    def evidence(one: Alternative, found: Refit) -> float:
-        beyond = _beyond_spread(one, found, reduced.redundancy, before) if causes else np.inf
-        return min(one.deflated(found.gain, reduced.redundancy), beyond) - one.price
+    def evidence(alternative: Alternative, refitted: Refit) -> float:
+        beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before) if causes else np.inf
+        return min(alternative.deflated(refitted.gain, reduced.redundancy), beyond) - alternative.price
 
     holding = adjusted(reported("alternatives adjusted", to_try, len(to_try)))
-    holding += [(evidence(one, found), one, found) for one, found in beside]
-    most, best, new = max(holding, key=lambda one: one[0], default=(-np.inf, None, None))
+    holding += [(evidence(alternative, refitted), alternative, refitted) for alternative, refitted in beside]
+    most, best, new = max(
+        holding, key=lambda adjusted_alternative: adjusted_alternative[0], default=(-np.inf, None, None)
+    )
     if best is None or new is None or not most > np.log(1 / level):
         return None
     if not new.finished:
         new = refit(plain, best, current, before) or new
     # a large error makes photographs differ, whatever caused it: that separates it from no other explanation
-    near, kinds = best.evidence_beside_spread - MIN_LEAD, {one.kind for _, one, _ in holding}
-    rivals = {one.kind: one for one in reversed(every) if one.evidence_beside_spread > near}
-    holding += adjusted([one for kind, one in rivals.items() if kind not in kinds])
+    near, kinds = best.evidence_beside_spread - MIN_LEAD, {alternative.kind for _, alternative, _ in holding}
+    rivals = {
+        alternative.kind: alternative
+        for alternative in reversed(every)
+        if alternative.evidence_beside_spread > near
+    }
+    holding += adjusted([rival for kind, rival in rivals.items() if kind not in kinds])
     as_well = [each for each in holding if each[1].kind != best.kind and most - each[0] < MIN_LEAD]
-    return Cause(best, new, tuple((one, found) for _, one, found in as_well))
+    return Cause(best, new, tuple((alternative, refitted) for _, alternative, refitted in as_well))
 
 
 def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternative, Refit]]:
@@ -329,7 +348,7 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
     gain = log_likelihood_of(free, q) - log_likelihood_of(held)
     seen = np.isin(held.network.image_points.point, given.point)
     price = price_of(q, int(seen.sum()) // len(given))  # each moves its image points only
-    one = Alternative(
+    free_shape = Alternative(
         MOVED,
         "all",
         np.ones(len(held.network.images)),
@@ -338,41 +357,44 @@ def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternati
         price=price,
         redundancy=held.redundancy,
     )
-    return [(one, Refit(free, beta, gain, *shifts_of(held, held, free, one, beta)))]
+    return [(free_shape, Refit(free, beta, gain, *shifts_of(held, held, free, free_shape, beta)))]
 
 
 def _beyond_spread(
-    one: Alternative, found: Refit, redundancy: int, before: Sequence[tuple[Alternative, FloatArray]]
+    alternative: Alternative,
+    refitted: Refit,
+    redundancy: int,
+    before: Sequence[tuple[Alternative, FloatArray]],
 ) -> float:
     """Return the gain of ln likelihood by another cause beyond the usual differences between photographs.
 
     It is not known for the first cause, because its large error itself makes photographs differ.
     """
-    if isinstance(one.family, InteriorFamily):
-        return found.gain
-    squares = squares_gained(found.gain, redundancy)
-    beyond = one.spread.evidence(squares, one.gain.rank, redundancy)
-    if not isinstance(one.family, PointFamily):
+    if isinstance(alternative.family, InteriorFamily):
+        return refitted.gain
+    squares = squares_gained(refitted.gain, redundancy)
+    beyond = alternative.spread.evidence(squares, alternative.gain.rank, redundancy)
+    if not isinstance(alternative.family, PointFamily):
         return beyond
-    among = spread_of_photographs(found, one, [other for other, _ in before])
+    among = spread_of_photographs(refitted, alternative, [other for other, _ in before])
     return min(beyond, log_likelihood_gain(squares / max(among, 1.0), redundancy))
 
 
-def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], found: Cause) -> tuple[Cause, ...]:
+def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], latest: Cause) -> tuple[Cause, ...]:
     """Return the causes with a new one, without those that the others explain too."""
     for cause in causes:
-        joint = zip(causes, found.refit.before, strict=True)
-        before = [(one, beta) for one, beta in joint if one is not cause]
-        new = replace(found.alternative, gain=replace(found.alternative.gain, beta=found.refit.beta))
-        others = [(one.alternative, beta) for one, beta in before]
-        alone = refit(plain, new, found.refit.adjustment, others)
+        joint = zip(causes, latest.refit.before, strict=True)
+        before = [(known, beta) for known, beta in joint if known is not cause]
+        new = replace(latest.alternative, gain=replace(latest.alternative.gain, beta=latest.refit.beta))
+        others = [(known.alternative, beta) for known, beta in before]
+        alone = refit(plain, new, latest.refit.adjustment, others)
         if alone is None:
             continue
         gain = cause.alternative.deflated(-alone.gain, plain.redundancy)
         if gain - cause.alternative.price < np.log(1 / plain.levels.family):
-            causes, found = tuple(one for one, _ in before), replace(found, refit=alone)
-    joint = zip(causes, found.refit.before, strict=True)
-    return (*(replace(one, refit=replace(one.refit, beta=beta)) for one, beta in joint), found)
+            causes, latest = tuple(known for known, _ in before), replace(latest, refit=alone)
+    joint = zip(causes, latest.refit.before, strict=True)
+    return (*(replace(known, refit=replace(known.refit, beta=beta)) for known, beta in joint), latest)
 
 
 def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
@@ -382,12 +404,12 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
     last, shifted = causes[-1].refit.adjustment, []
     columns, seen = columns_of(last), last.network.image_points
     for cause in causes:
-        one, beta = cause.alternative, cause.refit.beta
-        with_effect = replace(seen, xy=seen.xy + one.columns(last, columns) @ beta)
+        alternative, beta = cause.alternative, cause.refit.beta
+        with_effect = replace(seen, xy=seen.xy + alternative.columns(last, columns) @ beta)
         left = readjusted(plain, replace(plain.network, image_points=with_effect), last)
         shift = rms = float("nan")
         if left is not None:
-            shift, rms = shifts_of(plain, left, last, one, beta)
+            shift, rms = shifts_of(plain, left, last, alternative, beta)
         shifted.append(replace(cause, refit=replace(cause.refit, shift=shift, rms=rms)))
     return tuple(shifted)
 
@@ -409,13 +431,13 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
         reduced = reduce_adjustment(plain, columns_of(plain))
     except np.linalg.LinAlgError:
         return ()
-    single = [one for one in interiors(plain, reduced, HELD) if len(one.gain.beta) == 1]
-    every, level = [one.priced(reduced) for one in single], plain.levels.family
-    significant = [one for one in every if is_significant(one, len(every), level)]
-    found = sorted(significant, key=lambda one: -one.gain.value)
+    single = [interior for interior in interiors(plain, reduced, HELD) if len(interior.gain.beta) == 1]
+    every, level = [interior.priced(reduced) for interior in single], plain.levels.family
+    significant = [interior for interior in every if is_significant(interior, len(every), level)]
+    contradicted = sorted(significant, key=lambda interior: -interior.gain.value)
     names = []
-    for one in found:
-        index, s = one.parameters[0]
+    for interior in contradicted:
+        index, s = interior.parameters[0]
         camera = plain.estimate.cameras[index]
         names.append((camera.owner_of(s), camera.names[s]))
     return tuple(names)
@@ -492,7 +514,7 @@ def best_explanation(plain: Adjustment) -> Cause | None:
         return None
 
 
-def _sample(network: Network, whole: Estimate) -> tuple[Network, Estimate, BoolArray]:
+def _sample(network: Network, of_network: Estimate) -> tuple[Network, Estimate, BoolArray]:
     """Return a network of about MAX_IMAGE_POINTS image points, its estimate, and which these are.
 
     Points with many rays are preferred, and each photograph gets its share.
@@ -503,11 +525,11 @@ def _sample(network: Network, whole: Estimate) -> tuple[Network, Estimate, BoolA
         points[:] = False
         images = [seen.image[rows] for rows in rows_of(seen.point, len(points))]
         count = np.zeros(m, dtype=np.int64)
-        for j in np.argsort([-len(some) for some in images], kind="stable"):
+        for j in np.argsort([-len(of_point) for of_point in images], kind="stable"):
             if (count[images[j]] < MAX_IMAGE_POINTS / m).any():
                 points[j] = True
                 np.add.at(count, images[j], 1)
     rows = points[seen.point]
     every = np.ones(m, dtype=bool)
-    part, estimate = reduce_network(network, whole, every, points, np.ones_like(rows))
+    part, estimate = reduce_network(network, of_network, every, points, np.ones_like(rows))
     return part, estimate, rows

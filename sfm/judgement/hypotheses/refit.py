@@ -79,7 +79,7 @@ class Refit:
 
 def refit(
     plain: Adjustment,
-    one: Alternative,
+    alternative: Alternative,
     start: Adjustment,
     before: Sequence[tuple[Alternative, FloatArray]] = (),
     *,
@@ -89,22 +89,22 @@ def refit(
 
     Args:
         plain: adjustment that states coordinates and standard deviations.
-        one: the alternative.
+        alternative: what is adjusted in addition.
         start: adjustment to start from, of image points without the effect of earlier alternatives.
         before: earlier alternatives with their parameters, which are adjusted jointly.
         most: number of adjustments after which no further round begins.
     """
-    every = (*(other for other, _ in before), one)
-    ends = np.cumsum([0, *(len(beta) for _, beta in before), len(one.gain.beta)])
-    beta = np.concatenate([*(beta for _, beta in before), one.gain.beta])
-    current, step = start, np.concatenate([np.zeros(int(ends[-2])), one.gain.beta])
+    every = (*(other for other, _ in before), alternative)
+    ends = np.cumsum([0, *(len(beta) for _, beta in before), len(alternative.gain.beta)])
+    beta = np.concatenate([*(beta for _, beta in before), alternative.gain.beta])
+    current, step = start, np.concatenate([np.zeros(int(ends[-2])), alternative.gain.beta])
     D = _side_by_side(every, current, columns_of(current))
     taken, finished = 0, True
     for number in range(ROUNDS):
-        found = _stepped(plain, D, current, beta - step, step)
-        if found is None:
+        stepped = _stepped(plain, D, current, beta - step, step)
+        if stepped is None:
             return None
-        current, beta, adjustments = found
+        current, beta, adjustments = stepped
         taken += adjustments
         columns = columns_of(current)
         D = _side_by_side(every, current, columns)
@@ -120,7 +120,7 @@ def refit(
         beta = beta + step
     gained = log_likelihood_of(current) - log_likelihood_of(start)
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
-    shift, rms = shifts_of(plain, start, current, one, parts[-1])
+    shift, rms = shifts_of(plain, start, current, alternative, parts[-1])
     return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
 
 
@@ -131,11 +131,11 @@ def _stepped(
     xy, best = plain.network.image_points.xy, None
     for taken in range(1, HALVINGS + 1):
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
-        found = readjusted(plain, replace(plain.network, image_points=points), start)
-        if found is not None:
-            if log_likelihood_of(found) > log_likelihood_of(start) - LAST_GAIN:
-                return found, beta + step, taken
-            best = best or (found, beta + step)
+        adjusted = readjusted(plain, replace(plain.network, image_points=points), start)
+        if adjusted is not None:
+            if log_likelihood_of(adjusted) > log_likelihood_of(start) - LAST_GAIN:
+                return adjusted, beta + step, taken
+            best = best or (adjusted, beta + step)
         step = step / 2
     return None if best is None else (*best, HALVINGS)
 
@@ -149,7 +149,7 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
         start: start values, and which image points are rejected at first.
     """
     try:
-        found = adjust(
+        adjusted = adjust(
             network,
             start.estimate,
             datum=Datum("control" if plain.datum == "control" else "free"),
@@ -162,14 +162,14 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
         )
     except GeometryError:
         return None
-    if not found.converged or found.redundancy < 1:  # it may reject all but what it needs
+    if not adjusted.converged or adjusted.redundancy < 1:  # it may reject all but what it needs
         return None
-    return replace(found, error_correlation=plain.error_correlation)  # the best known one
+    return replace(adjusted, error_correlation=plain.error_correlation)  # the best known one
 
 
 def _side_by_side(every: Sequence[Alternative], a: Adjustment, columns: Columns) -> FloatArray:
     """Return the columns of alternatives, (k, 2, q)."""
-    return np.concatenate([one.columns(a, columns) for one in every], axis=2)
+    return np.concatenate([alternative.columns(a, columns) for alternative in every], axis=2)
 
 
 def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:
@@ -189,7 +189,7 @@ def log_likelihood_of(a: Adjustment, freed: int = 0) -> float:
 
 
 def shifts_of(
-    plain: Adjustment, before: Adjustment, other: Adjustment, one: Alternative, beta: FloatArray
+    plain: Adjustment, before: Adjustment, other: Adjustment, alternative: Alternative, beta: FloatArray
 ) -> tuple[float, float]:
     """Return the largest and the RMS change of the result of a survey, in standard deviations.
 
@@ -200,7 +200,7 @@ def shifts_of(
         plain: adjustment that states the standard deviations.
         before: adjustment without the alternative.
         other: adjustment with the alternative.
-        one: the alternative.
+        alternative: what the other adjustment takes into account.
         beta: parameters of the alternative, (q,).
     """
     if plain.datum == "control":
@@ -208,14 +208,14 @@ def shifts_of(
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
-    stays[one.points] = False
+    stays[alternative.points] = False
     known = np.isfinite(X).all(axis=1) & np.isfinite(Y).all(axis=1) & (sigma > 0).all(axis=1)
     try:
         moved = fit_similarity(Y[known & stays], X[known & stays]).apply(Y) - X
     except GeometryError:
         return float("nan"), float("nan")
     change = moved[known] / sigma[known]
-    away = one.family.displaced(one, plain.estimate.points, beta)[known] / sigma[known]
+    away = alternative.family.displaced(alternative, plain.estimate.points, beta)[known] / sigma[known]
     largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
     return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
 
@@ -223,23 +223,23 @@ def shifts_of(
 def _shift_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> float:
     """Return the largest change of determined interior parameters, in standard deviations."""
     largest = 0.0
-    for k, (one, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
+    for k, (camera, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
         sigma = plain.interior_sigma(k)
         known = np.isfinite(sigma) & (sigma > 0)
-        change = np.abs((changed.parameters - one.parameters)[known] / sigma[known])
+        change = np.abs((changed.parameters - camera.parameters)[known] / sigma[known])
         largest = max(largest, float(change.max(initial=0.0)))
     return largest
 
 
-def spread_of_photographs(found: Refit, one: Alternative, others: Sequence[Alternative]) -> float:
+def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Sequence[Alternative]) -> float:
     """Return the variance of what photographs say of an alternative, relative to that expected by chance.
 
     Errors that image points of a photograph have in common resemble a movement of many points. They differ
     among the photographs of one state of the object, where a true movement is the same.
 
     Args:
-        found: adjustment with the alternative and the others.
-        one: the alternative.
+        refitted: adjustment with the alternative and the others.
+        alternative: the tested alternative.
         others: alternatives that were adjusted with it.
 
     Raises:
@@ -247,10 +247,10 @@ def spread_of_photographs(found: Refit, one: Alternative, others: Sequence[Alter
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
-    a = found.adjustment
+    a = refitted.adjustment
     columns = columns_of(a)
     reduced = reduce_adjustment(a, columns)
-    effect = reduced.whiten(one.columns(a, columns)) @ found.beta
+    effect = reduced.whiten(alternative.columns(a, columns)) @ refitted.beta
     left = reduced.absorb(effect[:, :, None])[2].ravel()
     if others:
         taken = reduced.absorb(reduced.whiten(_side_by_side(others, a, columns)))[2]
@@ -307,33 +307,35 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
     untested: tuple[Remark, ...] = ()
     if too_many_cameras(number):
         untested = (remark("cameras_untested", cameras=int(number.max()) + 1),)
-    found: dict[str, float] = {}
+    constancy: dict[str, float] = {}
     held: dict[str, dict[str, float]] = defaultdict(dict)
-    for one in _typical(a, reduced):
-        reach = reach_of(one, a, reduced, columns, rows=rows)
+    for alternative in _typical(a, reduced):
+        reach = reach_of(alternative, a, reduced, columns, rows=rows)
         if not reach > WRONG_SIGMAS:
             continue
-        if isinstance(one.family, InteriorFamily):
-            index, s = one.parameters[0]
+        if isinstance(alternative.family, InteriorFamily):
+            index, s = alternative.parameters[0]
             camera = a.estimate.cameras[index]
             held[camera.owner_of(s)][camera.names[s]] = reach
         else:
-            found[one.family.constant] = max(reach, found.get(one.family.constant, 0.0))
+            constancy[alternative.family.constant] = max(
+                reach, constancy.get(alternative.family.constant, 0.0)
+            )
     return (
         *untested,
         *(
             remark(
                 "held_weakly_tested",
                 camera=camera,
-                parameters=tuple(some),
-                sigmas=max(some.values()),
+                parameters=tuple(parameters),
+                sigmas=max(parameters.values()),
                 without=without,
             )
-            for camera, some in held.items()
+            for camera, parameters in held.items()
         ),
         *(
             remark("constancy_weakly_tested", of=constant, sigmas=reach, without=without)
-            for constant, reach in found.items()
+            for constant, reach in constancy.items()
         ),
     )
 
@@ -345,8 +347,8 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     its 18 directions is not the shape of any real object.
     """
     for owner in interior_parameters(a, HELD):
-        for some in owner:
-            yield Alternative(HELD, "all", np.ones(reduced.photographs), parameters=some)
+        for parameters in owner:
+            yield Alternative(HELD, "all", np.ones(reduced.photographs), parameters=parameters)
     camera = cameras_of_photographs(a)
     for family in (*CAMERA_FAMILIES, STRAIN):
         for among in photographs_among(family, camera):
@@ -360,29 +362,31 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
                 yield Alternative(family, pattern, after, search=float(np.log(tried)), among=among)
 
 
-def reach_of(one: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int) -> float:
+def reach_of(
+    alternative: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int
+) -> float:
     """Return the largest shift of coordinates before an alternative is detected, in standard deviations.
 
     Args:
-        one: the alternative.
+        alternative: assumption that is violated.
         a: the adjustment.
         reduced: its normal equations.
         columns: its derivatives.
         rows: number of alternatives tested together, which share the level.
     """
-    D = reduced.whiten(one.columns(a, columns))
+    D = reduced.whiten(alternative.columns(a, columns))
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)
     touched = int((D != 0).any(axis=(1, 2)).sum())
-    needed = needed_gain(rank, touched, one.search, rows, a.levels.family)
+    needed = needed_gain(rank, touched, alternative.search, rows, a.levels.family)
     least = chndtrinc(needed, rank, 1 - POWER) * reduced.design_effect(D)  # detected noncentrality
     longest = scale[:, None] * vectors * np.sqrt(least / np.maximum(values, MIN_DETERMINED_SHARE))
     X = a.estimate.points
     sigma = np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     known = np.isfinite(X).all(axis=1) & (sigma > 0).all(axis=1)
     shifted = without_motions(X, reduced.absorb(D)[0] @ longest)
-    away = np.stack([one.family.displaced(one, X, b) for b in longest.T], axis=2)
+    away = np.stack([alternative.family.displaced(alternative, X, b) for b in longest.T], axis=2)
     return max(
         float((np.linalg.norm(part[known], axis=2) / sigma[known]).max(initial=0.0))
         for part in (shifted, away)

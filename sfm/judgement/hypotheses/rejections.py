@@ -73,7 +73,7 @@ def _other_points(a: Adjustment) -> dict[int, int]:
     network, estimate, seen = a.network, a.estimate, a.network.image_points
     rejected = np.flatnonzero(a.rejected)
     tolerance = float(np.sqrt(MAX_PREDICTION_RATIO * chi2_isf(a.levels.family, 2))) * a.sigma0_px
-    found: dict[int, int] = {}
+    nearest: dict[int, int] = {}
     for i, rows in enumerate(rows_of(seen.image[rejected], len(network.images))):
         if not len(rows):
             continue
@@ -84,8 +84,8 @@ def _other_points(a: Adjustment) -> dict[int, int]:
             away[seen.point[row]] = np.inf
             q = int(np.nanargmin(away)) if np.isfinite(away).any() else -1
             if q >= 0 and away[q] < tolerance:
-                found[row] = q
-    return found
+                nearest[row] = q
+    return nearest
 
 
 def _key(a: Adjustment, row: int, q: int) -> tuple[int, int]:
@@ -101,8 +101,8 @@ def _exchanged(a: Adjustment, misnamed: dict[int, int]) -> tuple[dict[tuple[int,
         where[_key(a, row, q)][int(seen.image[row])].append(row)
     pairs, rest = {}, []
     for key, images in where.items():
-        both = [i for i, rows in images.items() if len(rows) == 2]
-        if len(both) >= MIN_EXCHANGED:
+        with_both = [i for i, rows in images.items() if len(rows) == 2]
+        if len(with_both) >= MIN_EXCHANGED:
             pairs[key] = sorted(images)
         else:
             rest += [row for rows in images.values() for row in rows]
@@ -135,31 +135,31 @@ def _of_places(a: Adjustment, places: list[SecondPlace], unit: str) -> list[Rema
     names, seen = a.network.images, a.network.image_points
     together: dict[int, list[SecondPlace]] = defaultdict(list)
     alone = []
-    for one in places:
-        others = seen.image[(seen.point == one.point) & ~a.rejected]
-        if one.images.min() > others.max() or one.images.max() < others.min():
-            together[int(max(one.images.min(), others.min()))].append(one)
+    for place in places:
+        others = seen.image[(seen.point == place.point) & ~a.rejected]
+        if place.images.min() > others.max() or place.images.max() < others.min():
+            together[int(max(place.images.min(), others.min()))].append(place)
         else:
-            alone.append(one)
+            alone.append(place)
     moved = [
         remark(
             "points_moved",
-            points=tuple(a.network.points[one.point] for one in some),
-            distance=(max(one.distance for one in some), unit),
-            shift=max(one.over_sigma for one in some),
+            points=tuple(a.network.points[place.point] for place in moved_together),
+            distance=(max(place.distance for place in moved_together), unit),
+            shift=max(place.over_sigma for place in moved_together),
             wrong=0.0,  # rejected image points do not shift the others
             **{"from": names[start]},
         )
-        for start, some in sorted(together.items())
+        for start, moved_together in sorted(together.items())
     ]
     elsewhere = [
         remark(
             "two_places",
-            point=a.network.points[one.point],
-            distance=(one.distance, unit),
-            sigmas=one.over_sigma,
-            photographs=tuple(names[i] for i in one.images),
+            point=a.network.points[place.point],
+            distance=(place.distance, unit),
+            sigmas=place.over_sigma,
+            photographs=tuple(names[i] for i in place.images),
         )
-        for one in alone
+        for place in alone
     ]
     return moved + elsewhere

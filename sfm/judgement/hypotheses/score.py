@@ -254,11 +254,11 @@ def points_by_cameras(by: FloatArray, point: IntArray, image: IntArray, n: int, 
         n: number of points.
         m: number of photographs.
     """
-    found = np.zeros((n, 3, 6 * m + by.shape[2] - 6))
+    products = np.zeros((n, 3, 6 * m + by.shape[2] - 6))
     every = sum_rows(point * m + image, by[:, :, :6], n * m).reshape(n, m, 3, 6)
-    found[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
-    found[:, :, 6 * m :] = sum_rows(point, by[:, :, 6:], n)
-    return found
+    products[:, :, : 6 * m] = np.moveaxis(every, 1, 2).reshape(n, 3, 6 * m)
+    products[:, :, 6 * m :] = sum_rows(point, by[:, :, 6:], n)
+    return products
 
 
 def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -275,7 +275,7 @@ def _free_interior(a: Adjustment) -> tuple[FloatArray, FloatArray, FloatArray]:
         key = (camera.owner_of(s), camera.names[s])
         if key in keys and given.sigma[row] > 0:
             rows.append(row)
-            per_unit.append(np.where([one == key for one in keys], units, 0.0))
+            per_unit.append(np.where([other == key for other in keys], units, 0.0))
             off.append(float(camera.parameters[s] - given.value[row]))
     if not rows:
         return columns, np.zeros((len(keys), len(keys))), np.zeros(len(keys))
@@ -293,11 +293,11 @@ def _camera_normals(
     N, b = At @ A, np.einsum("kab,kb->ka", At, v)
     for i, rows in enumerate(rows_of(image, m)):
         pose = slice(6 * i, 6 * i + 6)
-        whole = N[rows].sum(axis=0)
-        S[pose, pose] = whole[:6, :6]
-        S[pose, 6 * m :] = whole[:6, 6:]
-        S[6 * m :, pose] = whole[6:, :6]
-        S[6 * m :, 6 * m :] += whole[6:, 6:]
+        of_photograph = N[rows].sum(axis=0)
+        S[pose, pose] = of_photograph[:6, :6]
+        S[pose, 6 * m :] = of_photograph[:6, 6:]
+        S[6 * m :, pose] = of_photograph[6:, :6]
+        S[6 * m :, 6 * m :] += of_photograph[6:, 6:]
         t[pose] = b[rows].sum(axis=0)[:6]
         t[6 * m :] += b[rows].sum(axis=0)[6:]
     return S, t

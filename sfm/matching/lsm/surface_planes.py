@@ -161,21 +161,24 @@ def match_where_plane(
     """
     rows = np.flatnonzero(matches.good)
     start, linear = matches.xy[rows].copy(), linear_part(matches.warp[rows])
-    sides, found = [window_px], [_rows(matches, rows)]
+    sides, by_size = [window_px], [_rows(matches, rows)]
     while len(rows) and (side := int(SIDE_RATIO * sides[-1]) | 1) >= MIN_WINDOW_PX:
-        one = match_lsm(
+        smaller = match_lsm(
             left, right, xy_left[rows], start, window_px=side, interpolation=interpolation, start=linear
         )
-        start[one.good], linear[one.good] = one.xy[one.good], linear_part(one.warp[one.good])
+        start[smaller.good], linear[smaller.good] = (
+            smaller.xy[smaller.good],
+            linear_part(smaller.warp[smaller.good]),
+        )
         sides.append(side)
-        found.append(one)
-    chosen, off = _largest_that_agrees(found), np.zeros((len(matches), 2))
+        by_size.append(smaller)
+    chosen, off = _largest_that_agrees(by_size), np.zeros((len(matches), 2))
     columns = {field.name: getattr(matches, field.name).copy() for field in fields(matches)}
     for number in range(1, len(sides)):
         of_size = np.flatnonzero(chosen == number)
         for name, column in columns.items():
-            column[rows[of_size]] = getattr(found[number], name)[of_size]
-        moved = found[number].xy[of_size] - found[0].xy[of_size]
+            column[rows[of_size]] = getattr(by_size[number], name)[of_size]
+        moved = by_size[number].xy[of_size] - by_size[0].xy[of_size]
         off[rows[of_size]] = moved * sides[number] ** 2 / (sides[0] ** 2 - sides[number] ** 2)
     return LsmMatches(**columns), off
 
@@ -185,19 +188,19 @@ def _rows(matches: LsmMatches, rows: IntArray) -> LsmMatches:
     return LsmMatches(**{field.name: getattr(matches, field.name)[rows] for field in fields(matches)})
 
 
-def _largest_that_agrees(found: list[LsmMatches]) -> IntArray:
+def _largest_that_agrees(by_size: list[LsmMatches]) -> IntArray:
     """Return the number of the first window of each point that no smaller window contradicts, (k,).
 
     Args:
-        found: matches of the same points with smaller and smaller windows; all of the first are good.
+        by_size: matches of the same points with smaller and smaller windows; all of the first are good.
     """
-    chosen = np.full(len(found[0]), -1, dtype=np.int64)
-    for number in reversed(range(len(found))):
-        agrees = found[number].good
-        for smaller in found[number + 1 :]:
-            both = np.flatnonzero(agrees & smaller.good)
-            d, C = smaller.xy[both] - found[number].xy[both], smaller.covariance[both]
-            agrees[both] = squares_over_covariance(d, C) <= MAX_SQUARED_RATIO
+    chosen = np.full(len(by_size[0]), -1, dtype=np.int64)
+    for number in reversed(range(len(by_size))):
+        agrees = by_size[number].good
+        for smaller in by_size[number + 1 :]:
+            good = np.flatnonzero(agrees & smaller.good)
+            d, C = smaller.xy[good] - by_size[number].xy[good], smaller.covariance[good]
+            agrees[good] = squares_over_covariance(d, C) <= MAX_SQUARED_RATIO
         chosen[agrees] = number
     return chosen
 

@@ -108,13 +108,13 @@ def match_targets(
             raise GeometryError(
                 f"matching: {len(given)} {what} for {counted(m, 'photograph')}, needed one for each"
             )
-    for i, one in enumerate(targets):
-        if one.size and one.shape != (len(one), 2):
-            raise GeometryError(f"matching: targets of photograph {i} of shape {one.shape}, needed (k, 2)")
+    for i, xy in enumerate(targets):
+        if xy.size and xy.shape != (len(xy), 2):
+            raise GeometryError(f"matching: targets of photograph {i} of shape {xy.shape}, needed (k, 2)")
         for numbers in (kinds, diameters_px):
-            if numbers is not None and len(numbers[i]) != len(one):
+            if numbers is not None and len(numbers[i]) != len(xy):
                 raise GeometryError(
-                    f"matching: {len(numbers[i])} kinds or diameters for {counted(len(one), 'target')} of "
+                    f"matching: {len(numbers[i])} kinds or diameters for {counted(len(xy), 'target')} of "
                     f"photograph {i}, needed one for each"
                 )
     check_indices("match_targets: camera", camera, len(estimate.cameras))
@@ -247,7 +247,7 @@ def _scene(
     uv, kind, size = np.zeros((total, 2)), np.zeros(total, dtype=np.int64), np.zeros(total)
     unusable = np.ones(total, dtype=bool)
     c = np.array([estimate.cameras[k].c_px for k in camera])
-    windows = [_window(one) for one in estimate.cameras]
+    windows = [_window(used) for used in estimate.cameras]
     area, corner, cell = np.ones(m), np.zeros((m, 2)), np.ones(m)
     columns, cells = np.ones((m, 2), dtype=np.int64), np.zeros(m + 1, dtype=np.int64)
     cell_of = np.zeros(total, dtype=np.int64)

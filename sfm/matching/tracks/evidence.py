@@ -210,9 +210,9 @@ def object_size(scene: Scene, target: int, image: int, X: FloatArray) -> float:
 
 
 @compiled
-def similar(one: float, other: float, ratio: float) -> bool:
+def similar(size: float, other: float, ratio: float) -> bool:
     """Return whether two sizes agree; an unknown size (0) agrees with any."""
-    return one == 0.0 or other == 0.0 or (one < ratio * other and other < ratio * one)
+    return size == 0.0 or other == 0.0 or (size < ratio * other and other < ratio * size)
 
 
 @compiled
@@ -308,14 +308,14 @@ def prune(scene: Scene, X: FloatArray, track: IntArray, residual: FloatArray) ->
 
 @compiled
 def same_target(
-    scene: Scene, one: IntArray, X: FloatArray, other: IntArray, Y: FloatArray, reach_px: float
+    scene: Scene, targets: IntArray, X: FloatArray, other: IntArray, Y: FloatArray, reach_px: float
 ) -> bool:
     """Return whether two points are one target: never in the same photograph, and mostly close together."""
     near = far = 0
     for i in range(len(scene.c)):
         if not scene.oriented[i]:
             continue
-        if one[i] >= 0 and other[i] >= 0:
+        if targets[i] >= 0 and other[i] >= 0:
             return False
         u, v, depth = tangents(scene, i, X)
         p, q, depth_of_other = tangents(scene, i, Y)

@@ -169,8 +169,13 @@ def link_features(
         neighbours: photographs taken near each photograph, see `overlapping_pairs`.
     """
     known = {} if known is None else known
-    first = np.concatenate([[0], np.cumsum([len(one) for one in features])]).astype(np.int64)
-    score = common_features([one.descriptor for one in features], [one.scale for one in features])
+    first = np.concatenate([[0], np.cumsum([len(of_photograph) for of_photograph in features])]).astype(
+        np.int64
+    )
+    score = common_features(
+        [of_photograph.descriptor for of_photograph in features],
+        [of_photograph.scale for of_photograph in features],
+    )
     pairs = overlapping_pairs(score, neighbours=neighbours)
 
     def match(of: IntArray) -> _MatchedFeatures:
@@ -219,23 +224,25 @@ def _matched_features(matches: Matches, features: Sequence[Features], first: Int
         features: features of m photographs.
         first: number of the first feature of each photograph, and the number of all, (m + 1,).
     """
-    m, xy = len(features), np.concatenate([one.xy for one in features])
+    m, xy = len(features), np.concatenate([of_photograph.xy for of_photograph in features])
     pairs = np.array(list(matches), dtype=np.int64).reshape(-1, 2)
-    camera = connected_parts(pairs[[one.motions is not None for one in matches.values()]], m)
+    camera = connected_parts(pairs[[match.motions is not None for match in matches.values()]], m)
     sizes = np.bincount(camera)
     standing = (camera == np.argmax(sizes)) & (2 * sizes.max() > m)
     inside = standing[pairs].all(axis=1)
     used = [
-        one.motions if within and one.motions is not None else one
-        for one, within in zip(matches.values(), inside.tolist(), strict=True)
+        match.motions if within and match.motions is not None else match
+        for match, within in zip(matches.values(), inside.tolist(), strict=True)
     ]
     none = np.zeros((0, 2), dtype=np.int64)
-    edge = np.concatenate([none, *(one.rows + first[row] for one, row in zip(used, pairs, strict=True))])
-    distinct = np.concatenate([np.zeros(0), *(one.distinct for one in used)])
-    pair = np.repeat(np.arange(len(used)), [len(one.rows) for one in used])
+    edge = np.concatenate([none, *(match.rows + first[row] for match, row in zip(used, pairs, strict=True))])
+    distinct = np.concatenate([np.zeros(0), *(match.distinct for match in used)])
+    pair = np.repeat(np.arange(len(used)), [len(match.rows) for match in used])
     moves = np.linalg.norm(xy[edge[:, 0]] - xy[edge[:, 1]], axis=1) > EPIPOLAR_PX
     beside = [
-        one.still + first[row] for one, row in zip(used, pairs, strict=True) if isinstance(one, TwoMotions)
+        match.still + first[row]
+        for match, row in zip(used, pairs, strict=True)
+        if isinstance(match, TwoMotions)
     ]
     stands = np.concatenate([none, *beside, edge[inside[pair] & ~moves]])
     still, moving, seen = (
@@ -267,20 +274,20 @@ def joined_features(edge: IntArray, image: IntArray, m: int) -> IntArray:
         a, b = group[edge[e, 0]], group[edge[e, 1]]
         if a == b:
             continue
-        one = a
-        while one >= 0:
-            stamp[image[one]] = e
-            one = following[one]
-        free, one = True, b
-        while one >= 0 and free:
-            free = stamp[image[one]] != e
-            one = following[one]
+        member = a
+        while member >= 0:
+            stamp[image[member]] = e
+            member = following[member]
+        free, member = True, b
+        while member >= 0 and free:
+            free = stamp[image[member]] != e
+            member = following[member]
         if not free:
             continue
-        one = b
-        while one >= 0:
-            group[one] = a
-            one = following[one]
+        member = b
+        while member >= 0:
+            group[member] = a
+            member = following[member]
         following[last[a]] = b
         last[a] = last[b]
     return group
@@ -313,15 +320,15 @@ def measure_tracks(
         min_correlation: smallest coefficient r of a match.
         threads: number of pairs of photographs matched at the same time.
     """
-    xy = _values_of_tracks([one.xy for one in natural], tracks)
-    scale = _values_of_tracks([one.scale for one in natural], tracks)
-    angle = _values_of_tracks([one.angle for one in natural], tracks)
+    xy = _values_of_tracks([points.xy for points in natural], tracks)
+    scale = _values_of_tracks([points.scale for points in natural], tracks)
+    angle = _values_of_tracks([points.angle for points in natural], tracks)
     n = int(tracks.point.max(initial=-1)) + 1
     reference = _middle_scale(tracks.point, scale, n)
     position = xy[reference].copy()
-    for i, one in enumerate(natural):
+    for i, points in enumerate(natural):
         of_reference = np.flatnonzero(tracks.image[reference] == i)
-        position[of_reference] = _snapped(position[of_reference], one.corners)
+        position[of_reference] = _snapped(position[of_reference], points.corners)
     position = np.rint(position)  # a template of whole pixels needs no resampling
     ref = reference[tracks.point]
     offset = (position - xy[reference])[tracks.point]
@@ -338,10 +345,10 @@ def measure_tracks(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
     )
 
-    def match(one: int) -> None:
-        i, j = pairs[one].tolist()
-        rows = others[of_pair[one]]
-        found = match_lsm(
+    def match(number: int) -> None:
+        i, j = pairs[number].tolist()
+        rows = others[of_pair[number]]
+        matched = match_lsm(
             grey[i],
             grey[j],
             position[tracks.point[rows]],
@@ -350,9 +357,9 @@ def measure_tracks(
             start=A[rows],
             min_correlation=min_correlation,
         )
-        measured[rows], covariance[rows] = found.xy, found.covariance / 2
-        back = np.linalg.inv(found.warp[:, :2, :2])
-        at_reference[rows] = back @ (found.covariance / 2) @ back.transpose(0, 2, 1)
+        measured[rows], covariance[rows] = matched.xy, matched.covariance / 2
+        back = np.linalg.inv(matched.warp[:, :2, :2])
+        at_reference[rows] = back @ (matched.covariance / 2) @ back.transpose(0, 2, 1)
 
     of_pair = rows_of(pair.ravel(), len(pairs))
     matches = in_threads(match, range(len(pairs)), threads)
@@ -382,7 +389,7 @@ def measure_tracks(
 
 def _values_of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArray:
     """Return the values of the features of tracks, from the values of m photographs, (k, ...)."""
-    first = np.cumsum([0, *(len(one) for one in values)])
+    first = np.cumsum([0, *(len(of_photograph) for of_photograph in values)])
     return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])
 
 

@@ -98,8 +98,8 @@ def sift_features(
         sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=contrast, enable_precise_upscale=True)
         height, width = (max(1, side // shrink) for side in eight_bit.shape)
         # whole blocks of pixels: a remainder at the border belongs to none
-        whole = eight_bit[: height * shrink, : width * shrink]
-        picture = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+        blocks = eight_bit[: height * shrink, : width * shrink]
+        picture = cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA)
         points = sift.detect(picture, None)
         if hidden is not None:
             at = shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5
@@ -221,19 +221,19 @@ def matched_features(a: Features, b: Features, *, seed: int) -> PairMatches:
     rows = np.flatnonzero(mutual & (1 - nearest.best < RATIO**2 * (1 - nearest.second)))
     forth, best, second = nearest.forth, nearest.best[rows], nearest.second[rows]
     distinct = 1 - np.sqrt(np.maximum(1 - best, 0.0) / np.maximum(1 - second, 1e-12))
-    found = np.column_stack([rows, forth[rows]])
-    none = none._replace(candidates=len(found))
-    if len(found) < MIN_PAIR_MATCHES:
+    pairs = np.column_stack([rows, forth[rows]])
+    none = none._replace(candidates=len(pairs))
+    if len(pairs) < MIN_PAIR_MATCHES:
         return none
-    first, other = a.xy[found[:, 0]], b.xy[found[:, 1]]
+    first, other = a.xy[pairs[:, 0]], b.xy[pairs[:, 1]]
     motions = None
     fits, still = _two_motions(first, other, seed)
     if still.any():
-        motions = TwoMotions(found[fits], distinct[fits], found[still])
+        motions = TwoMotions(pairs[fits], distinct[fits], pairs[still])
     kept = _epipolar_geometry(first, other, seed)
     if kept.sum() < MIN_PAIR_MATCHES:
         return none._replace(motions=motions)
-    return PairMatches(found[kept], distinct[kept], len(found), motions)
+    return PairMatches(pairs[kept], distinct[kept], len(pairs), motions)
 
 
 def _two_motions(first: FloatArray, other: FloatArray, seed: int) -> tuple[BoolArray, BoolArray]:
@@ -290,18 +290,18 @@ def _nearest_descriptors(first: AnyArray, second: AnyArray) -> _Nearest:
     The products are computed block by block, so that they are still in the cache when they are read.
     """
     k, size = len(first), len(second)
-    found = _Nearest(
+    nearest = _Nearest(
         np.empty(k, np.int64), np.empty(k, np.float32), np.empty(k, np.float32), np.empty(size, np.int64)
     )
     of_back = np.full(size, -np.inf, np.float32)
     transposed = np.ascontiguousarray(second.T)
     for begin in range(0, k, BLOCK):
-        _update_nearest(first[begin : begin + BLOCK] @ transposed, begin, found, of_back)
-    return found
+        _update_nearest(first[begin : begin + BLOCK] @ transposed, begin, nearest, of_back)
+    return nearest
 
 
 @compiled
-def _update_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: AnyArray) -> None:
+def _update_nearest(similarity: AnyArray, begin: int, nearest: _Nearest, of_back: AnyArray) -> None:
     """Update the largest of some rows, and the largest of all columns so far."""
     for i in range(similarity.shape[0]):
         best, second, at = np.float32(-np.inf), np.float32(-np.inf), 0
@@ -312,8 +312,8 @@ def _update_nearest(similarity: AnyArray, begin: int, found: _Nearest, of_back: 
             elif value > second:
                 second = value
             if value > of_back[j]:
-                of_back[j], found.back[j] = value, begin + i
-        found.forth[begin + i], found.best[begin + i], found.second[begin + i] = at, best, second
+                of_back[j], nearest.back[j] = value, begin + i
+        nearest.forth[begin + i], nearest.best[begin + i], nearest.second[begin + i] = at, best, second
 
 
 def overlapping_pairs(
@@ -333,9 +333,9 @@ def overlapping_pairs(
     m = len(score)
     if m <= partners + 1:
         return np.column_stack(np.triu_indices(m, 1))
-    both = score + score.T
-    lost = (both >= MIN_MUTUAL_FEATURES).sum(axis=1) < partners / 2
-    wanted = _best_partners(both, np.where(lost, MANY_PARTNERS, partners))
+    mutual = score + score.T
+    lost = (mutual >= MIN_MUTUAL_FEATURES).sum(axis=1) < partners / 2
+    wanted = _best_partners(mutual, np.where(lost, MANY_PARTNERS, partners))
     for near in neighbours:
         used = (near >= 0) & (lost[:, None] | (np.arange(near.shape[1]) < NEIGHBOURS))
         wanted[np.nonzero(used)[0], near[used]] = True
@@ -369,7 +369,7 @@ def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray
     """Return how many of the coarsest features choose each other, for photographs i < j, (m, m)."""
     m = len(descriptors)
     coarse = [d[np.argsort(-s, kind="stable")[:FEATURES]] for d, s in zip(descriptors, scales, strict=True)]
-    first = np.cumsum([0, *(len(one) for one in coarse)])
+    first = np.cumsum([0, *(len(descriptor) for descriptor in coarse)])
     every = np.concatenate(coarse)
     score = np.zeros((m, m), dtype=np.int64)
     for i in range(m):
@@ -381,15 +381,15 @@ def common_features(descriptors: Sequence[AnyArray], scales: Sequence[FloatArray
         best = similarity[rows, forth]
         # the best feature of each photograph for every feature of this one
         starts = first[i + 1 : -1] - first[i + 1]
-        some = np.flatnonzero(np.diff(first[i + 1 :]))
-        if not len(some):
+        with_features = np.flatnonzero(np.diff(first[i + 1 :]))
+        if not len(with_features):
             continue
-        back = np.maximum.reduceat(similarity, starts[some], axis=0)
-        of = np.repeat(np.arange(len(some)), np.diff(first[i + 1 :])[some])
+        back = np.maximum.reduceat(similarity, starts[with_features], axis=0)
+        of = np.repeat(np.arange(len(with_features)), np.diff(first[i + 1 :])[with_features])
         mutual = best >= back[of, forth]
         similarity[rows, forth] = -1.0
         clear = 1 - best < RATIO**2 * (1 - similarity.max(axis=1))
-        score[i, i + 1 + some] = np.bincount(of[mutual & clear], minlength=len(some))
+        score[i, i + 1 + with_features] = np.bincount(of[mutual & clear], minlength=len(with_features))
     return score
 
 

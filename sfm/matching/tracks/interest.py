@@ -172,13 +172,13 @@ def _weight(grey: AnyArray, side: int) -> AnyArray:
 
 def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
     """Return the first free positions (x, y), line by line, with disjoint squares; `free` is changed."""
-    found = []
+    corners = []
     for y in range(len(free)):
         for x in np.flatnonzero(free[y]).tolist():
             if free[y, x]:
-                found.append((x, y))
+                corners.append((x, y))
                 free[y : y + side, max(0, x - side + 1) : x + side] = False
-    return found
+    return corners
 
 
 @compiled
@@ -280,11 +280,11 @@ def natural_points(
     """
     if detector not in DETECTORS:
         raise GeometryError(f"tie points: detector '{detector}', expected one of {', '.join(DETECTORS)}")
-    found = sift_features(photograph, max_features=max_features, noise=noise, hidden=hidden)
+    features = sift_features(photograph, max_features=max_features, noise=noise, hidden=hidden)
     corners = np.zeros((0, 2))
     if detector == "foerstner":
         shown = shown_part(hidden, photograph.shape)
         corners = np.array([shown[1].start, shown[0].start]) + foerstner_points(photograph[shown]).xy
     if hidden is not None:
         corners = corners[is_shown(hidden, corners)]
-    return NaturalPoints(found.xy, found.scale, found.angle, found.descriptor, corners)
+    return NaturalPoints(features.xy, features.scale, features.angle, features.descriptor, corners)

@@ -324,29 +324,29 @@ class Growth:
         limit = self.tolerance_px[self.network.camera[seen.image]]
         tolerance = self.tolerance()
         while self.estimate.oriented.any():
-            found = photograph_support(self.network, self.estimate, self.residuals_px(), limit, self.fixed)
+            support = photograph_support(self.network, self.estimate, self.residuals_px(), limit, self.fixed)
             needed = np.array(
                 [
                     fewest_fitting(int(n), tolerance[i], self.field[i], minimum=self.min_points)
-                    for i, n in enumerate(found.known)
+                    for i, n in enumerate(support.known)
                 ]
             )
-            few = found.fitting < needed
-            weak = np.flatnonzero(self.estimate.oriented & (few | found.doubtful))
+            few = support.fitting < needed
+            weak = np.flatnonzero(self.estimate.oriented & (few | support.doubtful))
             if not len(weak):
                 break
-            share = found.fitting / np.maximum(found.fitting + found.against, 1)
+            share = support.fitting / np.maximum(support.fitting + support.against, 1)
             worst = weak[np.argsort(share[weak], kind="stable")][: max(1, len(weak) // WEAK_PER_ROUND)]
             for i in worst.tolist():
                 if few[i]:
-                    fitting = int(found.fitting[i])
-                    self.reasons[i] = _too_few(fitting, int(found.known[i]), int(needed[i]))
+                    fitting = int(support.fitting[i])
+                    self.reasons[i] = _too_few(fitting, int(support.known[i]), int(needed[i]))
                 else:
                     self.reasons[i] = remark(
                         "photograph_contradicting",
-                        confirmed=int(found.confirmed[i]),
-                        against=int(found.against[i]),
-                        points=int(found.fitting[i] + found.against[i]),
+                        confirmed=int(support.confirmed[i]),
+                        against=int(support.against[i]),
+                        points=int(support.fitting[i] + support.against[i]),
                     )
             self.dropped[worst] = True
             self.release(worst)
@@ -491,11 +491,11 @@ def photograph_support(
 def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
     """Return the surplus conditions, beyond a relative orientation, in the pairs of each photograph, (m,)."""
     m = len(network.images)
-    both = np.zeros(m)
+    total = np.zeros(m)
     for first, second, count in network.common_points(two_rays):
         surplus = np.maximum(count - RELATIVE_UNKNOWNS, 0)
-        both += np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
-    return both.astype(np.int64)
+        total += np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
+    return total.astype(np.int64)
 
 
 def _inside_network(network: Network, estimate: Estimate) -> BoolArray:

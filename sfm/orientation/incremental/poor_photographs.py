@@ -128,12 +128,12 @@ def _fit_resected(growth: Growth, i: int, *, turned_over: bool = False) -> _Rese
     xy = seen.xy[rows]
     uv = tangents_from_pixel(camera, (camera.size_px[0] - 1, 0) + xy * (-1, 1) if turned_over else xy)
     known = np.isfinite(uv).all(axis=1)
-    found = growth.resection(i, rows[known], uv[known])
-    if not found.found:
+    resected = growth.resection(i, rows[known], uv[known])
+    if not resected.found:
         return _ResectionFit(np.inf, 0)
-    lengths = np.linalg.norm(found.residuals, axis=1) * camera.c_px
+    lengths = np.linalg.norm(resected.residuals, axis=1) * camera.c_px
     median = float(np.median(np.where(np.isnan(lengths), np.inf, lengths)))
-    return _ResectionFit(median, int(found.inliers.sum()))
+    return _ResectionFit(median, int(resected.inliers.sum()))
 
 
 def _medians_px(growth: Growth) -> FloatArray:
@@ -156,10 +156,14 @@ def bounded_costs(residuals_px: Sequence[FloatArray], image: IntArray) -> FloatA
         image: photograph of each image point, (k,).
     """
     of_photograph = [rows for rows in rows_of(image, int(image.max(initial=-1)) + 1) if len(rows)]
-    medians = np.array([[float(np.median(one[rows])) for rows in of_photograph] for one in residuals_px])
+    medians = np.array(
+        [[float(np.median(solution_px[rows])) for rows in of_photograph] for solution_px in residuals_px]
+    )
     known = np.where(np.isfinite(medians), medians, np.nan)
     most = np.isfinite(medians).mean(axis=1)
-    typical = [float(np.nanmedian(one)) for one, share in zip(known, most, strict=True) if share > 0.5]
+    typical = [
+        float(np.nanmedian(medians_px)) for medians_px, share in zip(known, most, strict=True) if share > 0.5
+    ]
     least = max(min(typical, default=1.0), float(np.finfo(float).tiny))
     return np.asarray(np.log(np.clip(medians / least, 1 / BOUND, BOUND)).mean(axis=1))
 
@@ -204,7 +208,7 @@ def casts_doubt(first_px: FloatArray, reversed_px: FloatArray) -> bool:
         first_px: lengths of the image residuals, inf where undetermined, px, (k,).
         reversed_px: lengths of the residuals of the adjusted reversal, px, (k,).
     """
-    both = np.isfinite(first_px) & np.isfinite(reversed_px)
-    if not both.any():
+    known = np.isfinite(first_px) & np.isfinite(reversed_px)
+    if not known.any():
         return False
-    return bool(np.median(reversed_px[both]) < DOUBTFUL * np.median(first_px[both]))
+    return bool(np.median(reversed_px[known]) < DOUBTFUL * np.median(first_px[known]))

@@ -201,19 +201,19 @@ def orient(
 
 def _as_cameras(cameras: Sequence[Camera], count: int) -> tuple[Camera, ...]:
     """Return the cameras of a network; GeometryError for anything else."""
-    found = tuple(cameras) if isinstance(cameras, Sequence) else ()
-    if len(found) < count or not all(isinstance(one, Camera) for one in found):
+    listed = tuple(cameras) if isinstance(cameras, Sequence) else ()
+    if len(listed) < count or not all(isinstance(given, Camera) for given in listed):
         raise GeometryError(
             f"orient: {type(cameras).__name__}, expected an Estimate or {counted(count, 'camera')}"
         )
-    return found
+    return listed
 
 
-def _holds_control(network: Network, found: Orientation) -> bool:
+def _holds_control(network: Network, orientation: Orientation) -> bool:
     """Return whether every measured control point fits in at least one photograph."""
     control, seen = network.control.complete, network.image_points
-    measured = np.isin(control.point, seen.point[found.estimate.oriented[seen.image]])
-    return bool(np.isin(control.point[measured], seen.point[found.fits]).all())
+    measured = np.isin(control.point, seen.point[orientation.estimate.oriented[seen.image]])
+    return bool(np.isin(control.point[measured], seen.point[orientation.fits]).all())
 
 
 def _best_of_rivals(
@@ -243,7 +243,7 @@ def _best_of_rivals(
     if oriented.sum() < MIN_RIVALS:
         return growth, start
     image = growth.network.image_points.image
-    found, first = [(growth, start)], growth.residuals_px()
+    solutions, first = [(growth, start)], growth.residuals_px()
     none_dropped = np.zeros(len(oriented), dtype=bool)
     other_side = reversed_growth(growth, begin(values, 1.0), refine, none_dropped)
     split = growth.dropped.any() and oriented.mean() < MOST
@@ -256,14 +256,16 @@ def _best_of_rivals(
         rivals.append(reversed_growth(growth, begin(values, 1.0), refine, worst))
     for rival in rivals:
         _settle(rival, refine, final_tolerance_px)
-        found.append((rival, start))
+        solutions.append((rival, start))
     for share in SMALLER_TOLERANCES:
         rival = begin(values, share)
         try:
-            found.append((rival, _grow(rival, refine, final_tolerance_px, judge)))
+            solutions.append((rival, _grow(rival, refine, final_tolerance_px, judge)))
         except GeometryError:
             continue
-    return found[int(np.argmin(bounded_costs([one.residuals_px() for one, _ in found], image)))]
+    return solutions[
+        int(np.argmin(bounded_costs([solution.residuals_px() for solution, _ in solutions], image)))
+    ]
 
 
 def _grow(growth: Growth, refine: Refine | None, final_tolerance_px: float, judge: Judge | None) -> Start:
@@ -470,13 +472,15 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     points, parallel = estimate.points.copy(), np.zeros(n, dtype=bool)
     tolerance = float(growth.tolerance().max())
     for limit in (tolerance, np.inf) if contradicting else (tolerance,):
-        found = intersect(
+        intersection = intersect(
             uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=limit
         )
         # beyond the precision of the rays and the tolerance of the orientation; False where NaN
-        clear = found.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)
-        parallel |= np.isfinite(found.angle) & ~clear
-        points = np.where((missing & clear & ~np.isfinite(points[:, 0]))[:, None], found.points, points)
+        clear = intersection.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)
+        parallel |= np.isfinite(intersection.angle) & ~clear
+        points = np.where(
+            (missing & clear & ~np.isfinite(points[:, 0]))[:, None], intersection.points, points
+        )
     growth.estimate = replace(estimate, points=points)
     return _reasons(growth, rays, parallel)
 

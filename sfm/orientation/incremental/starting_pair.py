@@ -96,7 +96,7 @@ def best_start(
             f"orientation: no two of the {len(network.images)} photographs have {PLANAR_POINTS} points in "
             f"common: {_list_common(network, of_photograph)}"
         )
-    found: list[_Candidate] = []  # candidates of the best pair
+    candidates: list[_Candidate] = []  # candidates of the best pair
     fits = False  # whether most points of any pair fit an orientation
     widest, least_angle = 0.0, MIN_MEDIAN_ANGLE_DEG if len(network.images) > 2 else MIN_ANGLE_OF_TWO_DEG
     for tried, (i, j) in enumerate(pairs):
@@ -122,14 +122,14 @@ def best_start(
                 continue
             score, resected = _support(network, tangents, tolerance, of_photograph, start, seed)
             of_pair.append(_Candidate(start, score, resected, solution.kind == solutions[0].kind))
-        if of_pair and (not found or _best_of(of_pair).score > _best_of(found).score):
-            found = of_pair
-    if not found:
+        if of_pair and (not candidates or _best_of(of_pair).score > _best_of(candidates).score):
+            candidates = of_pair
+    if not candidates:
         seen = f": {widest:.1f} degrees at most (median), {least_angle:g} are needed" if widest > 0 else ""
         raise GeometryError(
             f"orientation: no pair of photographs has a base, or rays that intersect well{seen}"
         )
-    return _choose(found, judge)
+    return _choose(candidates, judge)
 
 
 def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float) -> tuple[Estimate, ...]:
@@ -155,7 +155,7 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
     for within in (tolerance, AS_A_PLANE):
         with suppress(GeometryError):
             solutions += relative_orientations(first, second, tolerance=within, max_trials=PAIR_TRIALS)
-    found = []
+    placed = []
     for solution in solutions:
         if solution.kind == "infinite":
             continue
@@ -165,28 +165,28 @@ def pair_solutions(network: Network, estimate: Estimate, *, tolerance_px: float)
         with suppress(GeometryError):  # points on a line do not determine it
             placing = fit_similarity(start.points, estimate.points)
             model = replace(estimate, position=start.position, rotation=start.rotation, points=start.points)
-            found.append(placing.apply_estimate(model))
-    return tuple(found)
+            placed.append(placing.apply_estimate(model))
+    return tuple(placed)
 
 
-def _choose(found: list[_Candidate], judge: Judge | None) -> Start:
+def _choose(candidates: list[_Candidate], judge: Judge | None) -> Start:
     """Return the start with the best score; the judge decides between two without another photograph."""
-    best = _best_of(found)
+    best = _best_of(candidates)
     if best.resected:
         return best.start
-    rivals = [one for one in found if one.favoured]
+    rivals = [candidate for candidate in candidates if candidate.favoured]
     if len(rivals) < 2 or rivals[0].start.kind != "planar":
         return _best_of(rivals or [best]).start
     if judge is None:
         return replace(_best_of(rivals).start, twofold=True)
-    misfit = [judge(one.start) for one in rivals]
+    misfit = [judge(candidate.start) for candidate in rivals]
     least, other = np.sort(misfit)[:2]
     chosen = rivals[int(np.argmin(misfit))].start
     return replace(chosen, twofold=not TWOFOLD * least < other)
 
 
-def _best_of(found: list[_Candidate]) -> _Candidate:
-    return max(found, key=lambda one: one.score)
+def _best_of(candidates: list[_Candidate]) -> _Candidate:
+    return max(candidates, key=lambda candidate: candidate.score)
 
 
 def _sorted_rows(network: Network, tangents: FloatArray) -> list[IntArray]:
@@ -202,11 +202,13 @@ def _list_common(network: Network, of_photograph: list[IntArray]) -> str:
     usable[np.concatenate(of_photograph)] = True
     most, partner = np.zeros(len(of_photograph), dtype=np.int64), np.zeros(len(of_photograph), dtype=np.int64)
     for first, second, count in network.common_points(usable):
-        for one, other in ((first, second), (second, first)):
-            order = np.lexsort((-other, count, one))  # the last entry of each photograph is its largest
-            last = order[np.flatnonzero(np.diff(one[order], append=-1))]
-            better = last[count[last] > most[one[last]]]
-            most[one[better]], partner[one[better]] = count[better], other[better]
+        for photograph, other in ((first, second), (second, first)):
+            order = np.lexsort(
+                (-other, count, photograph)
+            )  # the last entry of each photograph is its largest
+            last = order[np.flatnonzero(np.diff(photograph[order], append=-1))]
+            better = last[count[last] > most[photograph[last]]]
+            most[photograph[better]], partner[photograph[better]] = count[better], other[better]
     words = []
     for i, name in enumerate(network.images):
         if not len(of_photograph[i]):
@@ -259,8 +261,8 @@ def _common(
     seen = network.image_points
     points, rows_a, rows_b = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
     if len(points) > PAIR_POINTS:
-        some = np.linspace(0, len(points) - 1, PAIR_POINTS).astype(np.int64)
-        points, rows_a, rows_b = points[some], rows_a[some], rows_b[some]
+        spread = np.linspace(0, len(points) - 1, PAIR_POINTS).astype(np.int64)
+        points, rows_a, rows_b = points[spread], rows_a[spread], rows_b[spread]
     return points, tangents[a[rows_a]], tangents[b[rows_b]]
 
 
@@ -306,7 +308,7 @@ def _support(
     """
     seen = network.image_points
     determined = np.asarray(np.isfinite(start.points).all(axis=1))
-    rows = [one[determined[seen.point[one]]][:SCREEN_POINTS] for one in of_photograph]
+    rows = [of_one[determined[seen.point[of_one]]][:SCREEN_POINTS] for of_one in of_photograph]
     sharing = sorted(range(len(of_photograph)), key=lambda i: (-len(rows[i]), i))
     position, rotation = start.position.copy(), start.rotation.copy()
     for i in [i for i in sharing if i not in (start.pair or ())][:SCREEN_PHOTOGRAPHS]:
@@ -319,18 +321,18 @@ def _support(
         )
         if result.found:
             position[i], rotation[i] = result.position, result.rotation
-    some = np.concatenate(rows)
+    usable = np.concatenate(rows)
     oriented = np.asarray(np.isfinite(position).all(axis=1))
-    some = some[oriented[seen.image[some]]]
+    usable = usable[oriented[seen.image[usable]]]
     again = intersect(
-        tangents[some],
-        seen.image[some],
-        seen.point[some],
+        tangents[usable],
+        seen.image[usable],
+        seen.point[usable],
         position,
         rotation,
         n_points=len(network.points),
         tolerance=float(tolerance.max()),
     )
-    squares = np.sum(again.residuals**2, axis=1) / tolerance[seen.image[some]] ** 2
+    squares = np.sum(again.residuals**2, axis=1) / tolerance[seen.image[usable]] ** 2
     score = float(np.sum(1 - np.minimum(squares[np.isfinite(squares)], 1.0)))
     return score, int(oriented.sum()) - len(start.pair or ())

@@ -58,10 +58,12 @@ def resect_fischler_bolles(tangents: FloatArray, points: FloatArray) -> tuple[Re
     """
     uv, xyz = checked_points("fischler-bolles", tangents, points, needed=3)
     poses = resect_triples(rays_from_tangents(uv[:3])[None], xyz[None, :3])
-    found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
-    if not found:
+    solutions = [
+        solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])
+    ]
+    if not solutions:
         raise GeometryError("fischler-bolles: no camera sees the first three points under these angles")
-    return sort_solutions(found)
+    return sort_solutions(solutions)
 
 
 def resect_triples(rays: FloatArray, points: FloatArray) -> Poses:

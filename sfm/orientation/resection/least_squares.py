@@ -445,10 +445,10 @@ def checked_points(
         raise GeometryError(f"{method}: points {min(i, j) + 1} and {max(i, j) + 1} coincide")
     for name, values in (("object", xyz), ("image", uv)):
         # the points that the method starts from, and all points
-        for some in (values[: max(needed, 3)], values):
-            s = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
+        for part in (values[: max(needed, 3)], values):
+            s = np.linalg.svd(part - part.mean(axis=0), compute_uv=False)
             if s[1] <= COLLINEAR * s[0]:
-                raise GeometryError(f"{method}: the {len(some)} {name} points lie on one line or coincide")
+                raise GeometryError(f"{method}: the {len(part)} {name} points lie on one line or coincide")
     return uv, xyz
 
 
