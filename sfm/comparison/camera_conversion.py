@@ -79,7 +79,14 @@ def convert_camera(
         raise SurveyFileError(
             f"camera {camera.name}: model '{model}', expected one of {', '.join(CONVERTIBLE)}"
         )
-    xy = _grid(camera, region_px)
+    # pixels spread evenly over the region, including its border
+    width, height = camera.size_px
+    region = np.array([-0.5, -0.5, width - 0.5, height - 0.5]) if region_px is None else region_px
+    extent = region[2:] - region[:2]
+    steps = np.maximum(np.rint(GRID_STEPS * extent / extent.max()).astype(int), 8) + 1
+    x = np.linspace(region[0], region[2], steps[0])
+    y = np.linspace(region[1], region[3], steps[1])
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     uv = tangents_from_pixel(camera, xy)
     if not np.isfinite(uv).all():
         raise GeometryError(
@@ -221,7 +228,11 @@ def start_values(camera: Camera, model: str) -> Camera:
             values |= {"b1": 1 - stretch if MODELS[model].corrects else stretch - 1}
         if MODELS[model].corrects and same:
             opencv = _as_full_opencv(camera)
-            K = _reversed_series(*_power_series(opencv))
+            # the first three series coefficients of the rational radial term
+            k1, k2, k3, d1, d2, d3 = (opencv[f"k{i}"] for i in range(1, 7))
+            s1 = k1 - d1
+            s2 = k2 - d2 - d1 * s1
+            K = _reversed_series(s1, s2, k3 - d3 - d2 * s1 - d1 * s2)
             values |= {f"K{i}": K[i - 1] / c ** (2 * i) for i in (1, 2, 3)}
             values |= {"P1": -opencv["p2"] / c, "P2": opencv["p1"] / c}
     if to_opencv:
@@ -267,25 +278,6 @@ def _as_full_opencv(camera: Camera) -> dict[str, float]:
     """Return the parameters of full_opencv, 0 for those that the camera's model does not have."""
     values = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
     return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | values
-
-
-def _power_series(values: dict[str, float]) -> tuple[float, float, float]:
-    """Return the first three series coefficients of the rational radial term of full_opencv."""
-    k1, k2, k3, d1, d2, d3 = (values[f"k{i}"] for i in range(1, 7))
-    s1 = k1 - d1
-    s2 = k2 - d2 - d1 * s1
-    return s1, s2, k3 - d3 - d2 * s1 - d1 * s2
-
-
-def _grid(camera: Camera, region_px: FloatArray | None) -> FloatArray:
-    """Return pixels spread evenly over the region, including its border, (k, 2)."""
-    width, height = camera.size_px
-    region = np.array([-0.5, -0.5, width - 0.5, height - 0.5]) if region_px is None else region_px
-    extent = region[2:] - region[:2]
-    steps = np.maximum(np.rint(GRID_STEPS * extent / extent.max()).astype(int), 8) + 1
-    x = np.linspace(region[0], region[2], steps[0])
-    y = np.linspace(region[1], region[3], steps[1])
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 @compiled

@@ -142,7 +142,10 @@ def find_cause(
         return None
     reference = np.ones(len(pairs.a), dtype=bool) if reference is None else reference
     rows = [row for row in ROWS if not (row.scale and pairs.scale is None)]
-    cost = -3 * math.log(_relative_sigma(pairs))
+    parts = ((pairs.a, pairs.Q_a), (pairs.b, pairs.Q_b))
+    variances = [float(np.median(np.diagonal(Q))) / mean_distance(xyz) ** 2 for xyz, Q in parts]
+    relative_sigma = math.sqrt(sum(variances) + ROUNDING**2)  # of a coordinate, over the extent of the object
+    cost = -3 * math.log(min(1.0, relative_sigma))
     try:
         nothing = _fitted(pairs, NOTHING, reference, cost)
     except GeometryError:
@@ -276,13 +279,6 @@ def _fitted(
     factor = unit.factor if unit else 1.0
     stretches = _stretches(pairs, T, d, Q, similarity, search.stable, factor) if row.strain else ()
     return _Fit(row, pairs, T, ln_p - penalty, True, search.stable, lengths, unit, stretches, other)
-
-
-def _relative_sigma(pairs: PointPairs) -> float:
-    """Return the standard deviation of a coordinate, divided by the extent of the object, at most 1."""
-    parts = ((pairs.a, pairs.Q_a), (pairs.b, pairs.Q_b))
-    sizes = [float(np.median(np.diagonal(Q))) / mean_distance(xyz) ** 2 for xyz, Q in parts]
-    return min(1.0, math.sqrt(sum(sizes) + ROUNDING**2))
 
 
 def _independent(columns: FloatArray, rows: int) -> FloatArray:

@@ -8,7 +8,6 @@ import numpy as np
 
 from sfm.comparison.causes import Cause
 from sfm.comparison.significance import ResultComparison
-from sfm.model.conventions import FloatArray
 from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
 from sfm.model.remarks.verdict import Level, Verdict, judge
 from sfm.model.solution import MAX_POINTS
@@ -62,34 +61,40 @@ def remarks_of_cause(
             numbers = {"lengths": stretch.lengths, "sigma": stretch.sigma}
             if cause.unit is not None:
                 numbers["factor"] = cause.unit.factor
-            yield remark(
-                "strained", axis=_describe_direction(stretch.axis), moved=moved, **numbers, **between
-            )
+            # with its largest component positive
+            axis = stretch.axis * np.sign(stretch.axis[np.argmax(np.abs(stretch.axis))])
+            words = "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
+            yield remark("strained", axis=words, moved=moved, **numbers, **between)
     if row.bending:
         yield remark("bent", distance=largest, moved=moved, **between)
-
-
-def _describe_direction(axis: FloatArray) -> str:
-    """Return a direction as text, with its largest component positive."""
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    return "(" + ", ".join(f"{x + 0.0:.2f}" for x in np.round(axis, 2)) + ")"
 
 
 def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
     first, second = comparison.names
     longest = np.linalg.norm(comparison.point_difference, axis=1)
     unit = comparison.unit or "object units"
+    tested = int(np.isfinite(comparison.statistic).sum())
     if comparison.cause is not None:
         yield from remarks_of_cause(
             comparison.cause, first, second, len(comparison.points), (float(longest.max()), unit)
         )
     elif comparison.changed:
-        yield _remark_on_differences(comparison, longest, unit)
-    tested = int(np.isfinite(comparison.statistic).sum())
+        names = [
+            name for name, differs in zip(comparison.points, comparison.significant, strict=True) if differs
+        ]
+        if not comparison.majority:
+            yield remark("no_majority_agrees", first=first, second=second)
+        elif names:
+            farthest = float(longest[comparison.significant].max())
+            yield remark(
+                "points_differ", points=names, differing=len(names), tested=tested, distance=(farthest, unit)
+            )
+        else:
+            statistic, critical = comparison.global_statistic, comparison.global_critical
+            yield remark("points_differ", statistic=statistic, critical=critical)
     if comparison.untested is not None:
-        if (
-            comparison.cause is None or comparison.untested.kind != "untestable"
-        ):  # a cause was found and tested
+        # untestable differences of which a cause is known were tested with it
+        if comparison.cause is None or comparison.untested.kind != "untestable":
             yield comparison.untested
     elif comparison.approximate:
         yield remark("tested_singly")
@@ -97,22 +102,6 @@ def _remarks(comparison: ResultComparison) -> Iterator[Remark]:
         yield remark("tested_part", tested=tested, points=len(comparison.points))
     if comparison.changed and comparison.independent:
         yield from _remarks_on_cameras(comparison)
-
-
-def _remark_on_differences(comparison: ResultComparison, longest: FloatArray, unit: str) -> Remark:
-    """Return the remark on differences without any other cause than that points moved."""
-    if not comparison.majority:
-        return remark("no_majority_agrees", first=comparison.names[0], second=comparison.names[1])
-    names = [name for name, differs in zip(comparison.points, comparison.significant, strict=True) if differs]
-    if not names:
-        return remark(
-            "points_differ", statistic=comparison.global_statistic, critical=comparison.global_critical
-        )
-    largest = float(longest[comparison.significant].max())
-    tested = int(np.isfinite(comparison.statistic).sum())
-    return remark(
-        "points_differ", points=names, differing=len(names), tested=tested, distance=(largest, unit)
-    )
 
 
 def _remarks_on_cameras(comparison: ResultComparison) -> Iterator[Remark]:

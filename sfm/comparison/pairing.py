@@ -375,7 +375,15 @@ def pairs_of_results(
     ]
     joint = all(result.covariance is not None for result in known)
     rows_a, rows_b = (result.covariance_rows(p) for result, p in zip((a, b), points.T, strict=True))
-    together = (rows_a >= 0) & (rows_b >= 0) if joint else _has_sigma(a, b, points)
+    if joint:
+        together = (rows_a >= 0) & (rows_b >= 0)
+    else:  # the covariance of either point of each pair
+        of_points = [
+            np.isfinite(result.point_covariance[p]).all(axis=(1, 2))
+            for result, p in zip((a, b), points.T, strict=True)
+            if result.point_covariance is not None
+        ]
+        together = np.any(of_points, axis=0) if of_points else np.zeros(len(points), dtype=bool)
     chosen = np.flatnonzero(together)
     chosen = chosen[:: -(-len(chosen) // MAX_POINTS)] if len(chosen) else chosen
     pa, pb = points[chosen].T
@@ -418,16 +426,6 @@ def rounding_of(xyz: FloatArray) -> float:
 def coordinates_of(points: IntArray) -> IntArray:
     """Return the rows of the coordinates of points, (3 k,)."""
     return np.asarray((3 * points[:, None] + np.arange(3)).ravel())
-
-
-def _has_sigma(a: Solution, b: Solution, points: IntArray) -> BoolArray:
-    """Return whether the covariance of either point of each pair is known, (n,)."""
-    known = [
-        np.isfinite(result.point_covariance[p]).all(axis=(1, 2))
-        for result, p in zip((a, b), points.T, strict=True)
-        if result.point_covariance is not None
-    ]
-    return np.any(known, axis=0) if known else np.zeros(len(points), dtype=bool)
 
 
 def _covariance_of(result: Solution, points: IntArray, joint: bool) -> FloatArray:

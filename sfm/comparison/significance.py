@@ -33,7 +33,6 @@ from sfm.comparison.pairing import (
 from sfm.comparison.solutions import rotation_angle_deg
 from sfm.comparison.stable_points import critical_value
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera
 from sfm.model.conventions import METRES, BoolArray, FloatArray, IntArray
 from sfm.model.display import html_table, text_table
 from sfm.model.distributions import FALSE_ALARM
@@ -263,7 +262,17 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
     differences = []
     pairs = dict.fromkeys(zip(a.network.camera[ia].tolist(), b.network.camera[ib].tolist(), strict=True))
     if a.images_named and b.images_named:
-        pairs |= dict.fromkeys(_of_one_name(a.estimate.cameras, b.estimate.cameras, set(pairs)))
+        paired_a, paired_b = {p for p, _ in pairs}, {q for _, q in pairs}
+        index = {
+            (camera.name, camera.size_px): q
+            for q, camera in enumerate(b.estimate.cameras)
+            if q not in paired_b
+        }
+        pairs |= {
+            (p, index[camera.name, camera.size_px]): None
+            for p, camera in enumerate(a.estimate.cameras)
+            if p not in paired_a and (camera.name, camera.size_px) in index
+        }
     for p, q in pairs:
         ours, theirs = a.estimate.cameras[p], b.estimate.cameras[q]
         conversion = None
@@ -292,19 +301,6 @@ def _interior(a: Solution, b: Solution, ia: IntArray, ib: IntArray) -> tuple[Int
             )
         )
     return tuple(differences)
-
-
-def _of_one_name(
-    a: tuple[Camera, ...], b: tuple[Camera, ...], paired: set[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """Pair cameras with the same name and the same size of photographs that are not paired yet."""
-    ours, theirs = {p for p, _ in paired}, {q for _, q in paired}
-    index = {(camera.name, camera.size_px): q for q, camera in enumerate(b) if q not in theirs}
-    return [
-        (p, index[camera.name, camera.size_px])
-        for p, camera in enumerate(a)
-        if p not in ours and (camera.name, camera.size_px) in index
-    ]
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,10 @@ def compare(
     angle[images] = rotation_angle_deg(a.rotation[images], moved.rotation[images])
     squares = [(reprojection(network, estimate) ** 2).ravel() for estimate in (a, b)]
     rms = tuple(float(np.sqrt(np.mean(s))) if len(s) else 0.0 for s in squares)
-    interior = tuple(_difference(p, q) for p, q in zip(a.cameras, b.cameras, strict=True))
+    interior = tuple(
+        q.parameters - p.parameters if p.model == q.model else np.full(len(p.parameters), np.nan)
+        for p, q in zip(a.cameras, b.cameras, strict=True)
+    )
     interior_px = [interior_effect_px(p, q) for p, q in zip(a.cameras, b.cameras, strict=True)]
     rounding = rounding_of(a.points[common])
     return Comparison(
@@ -242,12 +245,6 @@ def interior_effect_px(a: Camera, b: Camera) -> float:
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     shift = pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
     return _longest(shift)
-
-
-def _difference(a: Camera, b: Camera) -> FloatArray:
-    if a.model != b.model:
-        return np.full(len(a.parameters), np.nan)
-    return b.parameters - a.parameters
 
 
 def _longest(vectors: FloatArray) -> float:

@@ -69,7 +69,9 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         at, (width, height) = camera.principal_point_px, camera.size_px
         diagonal = float(np.hypot(width, height))
         away = float(np.hypot(at[0] - width / 2, at[1] - height / 2) / diagonal)
-        sigma = _principal_sigma_px(result, number) / diagonal
+        sigmas = np.nan_to_num(result.adjustment.interior_sigma(number)[camera.parts[1]], nan=0.0)  # 0: held
+        sigma_px = float(sigmas.max()) / (float(np.mean(camera.pixel_mm)) if camera.in_mm else 1.0)
+        sigma = sigma_px / diagonal
         surely = away - EXPECTED_SIGMAS * sigma
         off = remark("principal_point_far", camera=camera.name, share=away, sigma=sigma, surely=surely)
         far = unless_note(off)
@@ -80,13 +82,6 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
                 remark("format_of_other_size", camera=camera.name, width=other[0], height=other[1])
             )
     return tuple(remarks)
-
-
-def _principal_sigma_px(result: SurveyResult, number: int) -> float:
-    """Return the larger standard deviation of the two principal point coordinates, px; 0 if held."""
-    camera = result.adjustment.estimate.cameras[number]
-    sigma = np.nan_to_num(result.adjustment.interior_sigma(number)[camera.parts[1]], nan=0.0)
-    return float(sigma.max()) / (float(np.mean(camera.pixel_mm)) if camera.in_mm else 1.0)
 
 
 def _pixels(result: SurveyResult) -> tuple[Remark, ...]:

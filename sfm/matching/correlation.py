@@ -128,7 +128,11 @@ def match_ncc(
     least = least_deviations(left, right)
     out = np.zeros((len(a), OUTPUTS))
     half, reach = side // 2, search_px // 2
-    corners = _corners(a, b, half, reach, grey_left.shape, grey_right.shape)
+    # the corner of each template (-1: outside), and both corners of each search window
+    to, size_right = np.nan_to_num(np.rint(b), nan=-1e6), np.array(grey_right.shape[1::-1])
+    low = np.clip(to - reach, 0, size_right)
+    high = np.clip(to + reach + 1, 0, size_right)
+    corners = np.column_stack([template_corners(a, half, grey_left.shape), low, high]).astype(np.int64)
     for k, (x, y, x0, y0, x1, y1) in enumerate(corners.tolist()):
         if x < 0 or x1 - x0 < side or y1 - y0 < side:
             out[k] = NOT_COMPARED
@@ -139,7 +143,15 @@ def match_ncc(
         read_peak(template, window, surface, surface, least, min_correlation, max_second, out[k])
     out[~np.isfinite(a).all(axis=1) | ~np.isfinite(b).all(axis=1)] = NOT_COMPARED
     matches = matches_of(out, corners[:, 2:4], a, half)
-    return matches if back_px is None else _confirm(left, right, a, matches, side, search_px, back_px)
+    if back_px is None:
+        return matches
+    good = np.flatnonzero(matches.good)
+    back = match_ncc(right, left, matches.xy[good], a[good], template_px=side, search_px=search_px)
+    lost = good[~(np.linalg.norm(back.xy - a[good], axis=1) <= back_px)]
+    flag, xy = matches.flag.copy(), matches.xy.copy()
+    flag[lost] |= int(NccFlag.NOT_CONFIRMED)
+    xy[lost] = np.nan
+    return replace(matches, flag=flag, xy=xy)
 
 
 def matches_of(out: FloatArray, origin: FloatArray | IntArray, xy_left: FloatArray, half: int) -> NccMatches:
@@ -160,34 +172,11 @@ def least_deviations(left: AnyArray, right: AnyArray) -> tuple[float, float]:
     return MIN_CONTRAST * full_scale(left), MIN_CONTRAST * full_scale(right)
 
 
-def _corners(
-    a: FloatArray, b: FloatArray, half: int, reach: int, left: tuple[int, ...], right: tuple[int, ...]
-) -> AnyArray:
-    """Return the corner of each template (-1: outside), and both corners of each search window, (k, 6)."""
-    to, size_right = np.nan_to_num(np.rint(b), nan=-1e6), np.array(right[1::-1])
-    low = np.clip(to - reach, 0, size_right)
-    high = np.clip(to + reach + 1, 0, size_right)
-    return np.column_stack([template_corners(a, half, left), low, high]).astype(np.int64)
-
-
 def template_corners(a: FloatArray, half: int, shape: tuple[int, ...]) -> IntArray:
     """Return first column and row of the template at each point, -1 if it reaches outside, (k, 2)."""
     at = np.nan_to_num(np.rint(a), nan=-1e6)
     outside = np.asarray(((at < half) | (at > np.array(shape[1::-1]) - 1 - half)).any(axis=1))
     return np.asarray(np.where(outside[:, None], -1, at - half), dtype=np.int64)
-
-
-def _confirm(
-    left: AnyArray, right: AnyArray, a: FloatArray, matches: NccMatches, side: int, search: int, limit: float
-) -> NccMatches:
-    """Match back from right to left, and flag the matches that do not return."""
-    good = np.flatnonzero(matches.good)
-    back = match_ncc(right, left, matches.xy[good], a[good], template_px=side, search_px=search)
-    lost = good[~(np.linalg.norm(back.xy - a[good], axis=1) <= limit)]
-    flag, xy = matches.flag.copy(), matches.xy.copy()
-    flag[lost] |= int(NccFlag.NOT_CONFIRMED)
-    xy[lost] = np.nan
-    return replace(matches, flag=flag, xy=xy)
 
 
 def ambiguous(

@@ -75,16 +75,12 @@ def grey_of(photograph: AnyArray | Grey) -> AnyArray:
         array = array.astype(np.float32) @ np.array(LUMINANCE, dtype=np.float32)
     if array.ndim != 2 or array.size == 0:
         raise PhotographError(f"found a photograph of shape {array.shape}, expected (H, W) or (H, W, 3)")
-    if array.dtype.kind == "f" and not _finite(array):
-        raise PhotographError("found intensities that are not finite, needed finite numbers everywhere")
+    if array.dtype.kind == "f":
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = array.sum()  # if their sum is finite, all intensities are, and it is faster
+        if not (np.isfinite(total) or np.isfinite(array).all()):
+            raise PhotographError("found intensities that are not finite, needed finite numbers everywhere")
     return np.ascontiguousarray(array, dtype=np.float32)
-
-
-def _finite(array: AnyArray) -> bool:
-    """Return whether all intensities are finite; if their sum is finite, they all are, and it is faster."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = array.sum()
-    return bool(np.isfinite(total) or np.isfinite(array).all())
 
 
 def grey_of_8_bit(photograph: AnyArray) -> AnyArray:

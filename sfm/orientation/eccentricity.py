@@ -61,7 +61,15 @@ def fit_circles(views: CircleViews, n_points: int, *, radius: FloatArray | None 
     """
     point = views.point
     known = np.full(n_points, np.nan) if radius is None else radius
-    normal, log_radius = _start(views, n_points)
+    # start with normals towards the mean of the cameras, and radii from the major axes
+    towards = -np.einsum("kij,kj->ki", views.rotation, views.rays)
+    towards /= np.linalg.norm(towards, axis=1)[:, None]
+    normal = sum_rows(views.point, towards, n_points)
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    scale = np.sqrt(np.abs(np.linalg.det(views.pixel_jacobian)))
+    major = np.sqrt(np.linalg.eigvalsh(views.shape)[:, 1]) / scale * np.abs(views.rays[:, 2])
+    count = np.bincount(views.point, minlength=n_points)
+    log_radius = np.bincount(views.point, np.log(major), minlength=n_points) / count
     log_radius = np.where(np.isfinite(known), np.log(np.where(np.isfinite(known), known, 1.0)), log_radius)
     whitening = np.linalg.inv(np.linalg.cholesky(views.shape))
     weight = np.ones(len(point))
@@ -105,18 +113,6 @@ def ellipse_shape(semi_axes: FloatArray, angle: FloatArray) -> FloatArray:
     c, s = np.cos(angle), np.sin(angle)
     turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     return np.asarray(turn * (semi_axes**2)[:, None, :] @ np.swapaxes(turn, 1, 2))
-
-
-def _start(views: CircleViews, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Return normals towards the mean of the cameras, (n, 3), and ln of radii from the major axes, (n,)."""
-    towards = -np.einsum("kij,kj->ki", views.rotation, views.rays)
-    towards /= np.linalg.norm(towards, axis=1)[:, None]
-    normal = sum_rows(views.point, towards, n_points)
-    normal /= np.linalg.norm(normal, axis=1)[:, None]
-    scale = np.sqrt(np.abs(np.linalg.det(views.pixel_jacobian)))
-    major = np.sqrt(np.linalg.eigvalsh(views.shape)[:, 1]) / scale * np.abs(views.rays[:, 2])
-    count = np.bincount(views.point, minlength=n_points)
-    return normal, np.bincount(views.point, np.log(major), minlength=n_points) / count
 
 
 def _ellipses(

@@ -53,7 +53,15 @@ def intersect_image_points(
     wide = np.array([of_estimate.wide_angle for of_estimate in estimate.cameras])[camera[image]]
     if wide.any():
         position = np.concatenate([position, position[image[wide]]])
-        rotation = np.concatenate([rotation, _rotations_along_rays(rotation[image[wide]], uv[wide])])
+        # rotations with axis -z along the rays
+        u, v = uv[wide].T
+        ones = np.ones(len(u))
+        z = np.column_stack([-u, -v, ones])
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+        x = np.column_stack([ones, 0 * ones, u])
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        along = rotation[image[wide]] @ np.stack([x, np.cross(z, x), z], axis=2)
+        rotation = np.concatenate([rotation, along])
         image = image.copy()
         image[wide] = len(estimate.position) + np.arange(int(wide.sum()))
         uv[wide] *= 0.0  # keeps NaN
@@ -66,17 +74,6 @@ def intersect_image_points(
         n_points=n_points,
         tolerance=tolerance_px / min(of_estimate.c_px for of_estimate in estimate.cameras),
     )
-
-
-def _rotations_along_rays(rotation: FloatArray, uv: FloatArray) -> FloatArray:
-    """Return rotations with axis -z along the rays with tangents (u, v) under given rotations, (k, 3, 3)."""
-    u, v = uv.T
-    ones = np.ones(len(uv))
-    z = np.column_stack([-u, -v, ones])
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
-    x = np.column_stack([ones, 0 * ones, u])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.asarray(rotation @ np.stack([x, np.cross(z, x), z], axis=2))
 
 
 def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:

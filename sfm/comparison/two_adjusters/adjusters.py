@@ -317,7 +317,11 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
         compared: in-house adjustment of this network with the cameras of the comparison.
     """
     own_cameras = survey.estimate.cameras
-    more = _parameters_to_free(own_cameras, compared.estimate.cameras)
+    names: dict[str, None] = {}  # parameters held in the survey whose counterparts are free here
+    for ours, theirs in zip(own_cameras, compared.estimate.cameras, strict=True):
+        free = corresponding_free(theirs, ours.model) & ~ours.free
+        names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
+    more = tuple(names)
     if not more or not compared.converged:
         return None
     adjusted = partial(adjust, network, datum=Datum("free"), sigma_px=survey.sigma_px, reject="none")
@@ -332,12 +336,3 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     tested = contradicted_parameters(adjusted(freer.estimate, covariance=True))
     clear = tuple(dict.fromkeys(name for _, name in tested if name in more))
     return replace(fit, free=clear or more)
-
-
-def _parameters_to_free(cameras: tuple[Camera, ...], compared: tuple[Camera, ...]) -> tuple[str, ...]:
-    """Return the survey's fixed parameters whose counterparts are free in the comparison."""
-    names: dict[str, None] = {}
-    for ours, theirs in zip(cameras, compared, strict=True):
-        free = corresponding_free(theirs, ours.model) & ~ours.free
-        names |= dict.fromkeys(name for name, on in zip(ours.names, free, strict=True) if on)
-    return tuple(names)

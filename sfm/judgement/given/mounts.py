@@ -53,6 +53,8 @@ def judge_mounts(
             continue
         kept[k] = False
         turn = rotation_from_angles(*mount.angles[0]).T @ mounts.rotation[camera]
+        P, X = mount.position[0], mounts.position[camera]
+        cosine = float(P @ X / max(float(np.linalg.norm(P) * np.linalg.norm(X)), TINY))
         mistakes = explanations(
             [mount], lambda mended: _shape(mended[0], reference, mounts.position).fits(level)
         )
@@ -61,7 +63,7 @@ def judge_mounts(
                 "mount_contradicted",
                 camera=free.adjustment.estimate.cameras[camera].name,
                 angle=(_degrees((np.trace(turn) - 1) / 2), "deg"),
-                direction=(_degrees(_cosine(mount.position[0], mounts.position[camera])), "deg"),
+                direction=(_degrees(cosine), "deg"),
                 sigmas=float(np.sqrt(model.kept().chi2)),
                 mistake=next(iter(mistakes), None),
                 rest=rest if rest > model.kept().dof else None,
@@ -125,10 +127,6 @@ def judge_mount_scales(
     by = numbers_of_scale(off, sigma, level)
     said = remark("scale_contradicted", cameras=contradicting, others=others, **by)
     return given.select(np.zeros(len(given), dtype=bool)), (said,)
-
-
-def _cosine(a: FloatArray, b: FloatArray) -> float:
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), TINY))
 
 
 def _degrees(cosine: float) -> float:

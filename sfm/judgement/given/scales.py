@@ -68,7 +68,16 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
         tests += shared.tests
         used[list(shared.out)] = False
         factor[shared.bars] = shared.factor
-    sources += _sources_of_points(task, groups)
+    for group in groups:
+        scale = scale_of_points(group.placed)
+        if scale is None:
+            continue
+        if not (task.in_control or group.placed.points.stated.any()):
+            # coordinates without a standard deviation may be those of a print
+            scale = scale.looser(UNSTATED_FRACTION)
+        is_plate = task.of_plate and group.of == "control"
+        origin = plate_name(0) if is_plate else group.of
+        sources.append(Source(origin, scale, points=group.of, is_plate=is_plate))
     if not sources:
         return JudgedScales(bars)
     compared = Comparison.of(task, sources)
@@ -377,19 +386,6 @@ class Comparison(NamedTuple):
         ]
         others = [name for k, name in enumerate(self.names) if k not in which] or None
         return out, remark("plate_sizes_contradict", given=given, others=others, **by)
-
-
-def _sources_of_points(task: Task, groups: Sequence[Group]) -> Iterator[Source]:
-    """Yield dependable groups of points that give a scale."""
-    for group in groups:
-        scale = scale_of_points(group.placed)
-        if scale is None:
-            continue
-        if not (task.in_control or group.placed.points.stated.any()):
-            # coordinates without a standard deviation may be those of a print
-            scale = scale.looser(UNSTATED_FRACTION)
-        is_plate = task.of_plate and group.of == "control"
-        yield Source(plate_name(0) if is_plate else group.of, scale, points=group.of, is_plate=is_plate)
 
 
 def _lengths(task: Task) -> dict[str, list[Source]]:

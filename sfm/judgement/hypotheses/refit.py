@@ -204,7 +204,15 @@ def shifts_of(
         beta: parameters of the alternative, (q,).
     """
     if plain.datum == "control":
-        return _shift_of_cameras(plain, before, other), float("nan")
+        largest = 0.0  # of determined interior parameters
+        for k, (camera, changed) in enumerate(
+            zip(before.estimate.cameras, other.estimate.cameras, strict=True)
+        ):
+            sigma = plain.interior_sigma(k)
+            known = np.isfinite(sigma) & (sigma > 0)
+            change = np.abs((changed.parameters - camera.parameters)[known] / sigma[known])
+            largest = max(largest, float(change.max(initial=0.0)))
+        return largest, float("nan")
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))
     X, Y = before.estimate.points, other.estimate.points
     stays = np.ones(len(X), dtype=bool)
@@ -218,17 +226,6 @@ def shifts_of(
     away = alternative.family.displaced(alternative, plain.estimate.points, beta)[known] / sigma[known]
     largest, squares = np.abs(change).max(initial=0.0), (change**2).mean()
     return float(max(largest, np.abs(away).max(initial=0.0))), float(np.sqrt(max(squares, (away**2).mean())))
-
-
-def _shift_of_cameras(plain: Adjustment, before: Adjustment, other: Adjustment) -> float:
-    """Return the largest change of determined interior parameters, in standard deviations."""
-    largest = 0.0
-    for k, (camera, changed) in enumerate(zip(before.estimate.cameras, other.estimate.cameras, strict=True)):
-        sigma = plain.interior_sigma(k)
-        known = np.isfinite(sigma) & (sigma > 0)
-        change = np.abs((changed.parameters - camera.parameters)[known] / sigma[known])
-        largest = max(largest, float(change.max(initial=0.0)))
-    return largest
 
 
 def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Sequence[Alternative]) -> float:

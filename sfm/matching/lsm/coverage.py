@@ -6,13 +6,13 @@ reported as too precise, and no residual would show it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sfm.model.camera import Camera, pixel_from_tangents, ray_directions, tangents_from_pixel
+from sfm.model.camera import pixel_from_tangents, ray_directions, tangents_from_pixel
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, rows_of
@@ -179,8 +179,10 @@ def project_points(estimate: Estimate, camera: IntArray, image: IntArray, points
     """Return the image of one object point per row, px, NaN behind the photograph, (k, 2)."""
     UVW = np.asarray(np.einsum("ki,kij->kj", points - estimate.position[image], estimate.rotation[image]))
     out = np.full((len(image), 2), np.nan)
-    for lens, rows in _rows_by_camera(estimate, camera, image):
-        out[rows] = pixel_from_tangents(lens, _tangents_in_front(UVW[rows]))
+    uv = -UVW[:, :2] / np.where(UVW[:, 2:] < 0, UVW[:, 2:], np.nan)
+    for k, rows in enumerate(rows_of(camera[image], len(estimate.cameras))):
+        if len(rows):
+            out[rows] = pixel_from_tangents(estimate.cameras[k], uv[rows])
     return out
 
 
@@ -229,18 +231,3 @@ def plane_warps(
         warps[:, :2, a] = linear
         warps[:, 2, a] = -np.einsum("kc,kc->k", bent, linear) / np.einsum("kc,kc->k", linear, linear)
     return warps
-
-
-def _tangents_in_front(UVW: FloatArray) -> FloatArray:
-    """Return the tangents of rays, NaN behind the photograph, (k, 2)."""
-    W = np.where(UVW[:, 2:] < 0, UVW[:, 2:], np.nan)
-    return np.asarray(-UVW[:, :2] / W)
-
-
-def _rows_by_camera(
-    estimate: Estimate, camera: IntArray, image: IntArray
-) -> Iterator[tuple[Camera, IntArray]]:
-    """Yield each camera that has rows, and its rows."""
-    for lens, rows in zip(estimate.cameras, rows_of(camera[image], len(estimate.cameras)), strict=True):
-        if len(rows):
-            yield lens, rows

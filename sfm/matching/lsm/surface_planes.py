@@ -99,7 +99,9 @@ def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> Bo
                 break
             uv, inverse = -UVW[on, :2] / UVW[on, 2:], -1 / UVW[on, 2]
             near = cKDTree(uv).query(uv, k=NEIGHBOURS + 1)[1]
-            near = _without_self(near)
+            itself = near == np.arange(len(near))[:, None]
+            itself[~itself.any(axis=1), -1] = True  # several at one position
+            near = near[~itself].reshape(len(near), -1)
             plane, N = _planes(uv[near] - uv[:, None], inverse[near])
             off = np.abs(inverse - plane[:, 2]) / np.sqrt(1 + np.linalg.inv(N)[:, 2, 2])
             out = doubtful[point[on]] & (off > TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off))
@@ -108,13 +110,6 @@ def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> Bo
             worst = out & (off >= np.where(out[near], off[near], 0.0).max(axis=1))
             good[point[on[worst]]] = False
     return good
-
-
-def _without_self(near: IntArray) -> IntArray:
-    """Return the neighbours of each point without itself; `near`, (k, NEIGHBOURS + 1), contains it."""
-    itself = near == np.arange(len(near))[:, None]
-    itself[~itself.any(axis=1), -1] = True  # several at one position
-    return np.asarray(near[~itself].reshape(len(near), -1))
 
 
 def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -161,7 +156,8 @@ def match_where_plane(
     """
     rows = np.flatnonzero(matches.good)
     start, linear = matches.xy[rows].copy(), linear_part(matches.warp[rows])
-    sides, by_size = [window_px], [_rows(matches, rows)]
+    good = LsmMatches(**{field.name: getattr(matches, field.name)[rows] for field in fields(matches)})
+    sides, by_size = [window_px], [good]
     while len(rows) and (side := int(SIDE_RATIO * sides[-1]) | 1) >= MIN_WINDOW_PX:
         smaller = match_lsm(
             left, right, xy_left[rows], start, window_px=side, interpolation=interpolation, start=linear
@@ -181,11 +177,6 @@ def match_where_plane(
         moved = by_size[number].xy[of_size] - by_size[0].xy[of_size]
         off[rows[of_size]] = moved * sides[number] ** 2 / (sides[0] ** 2 - sides[number] ** 2)
     return LsmMatches(**columns), off
-
-
-def _rows(matches: LsmMatches, rows: IntArray) -> LsmMatches:
-    """Return some of the matches."""
-    return LsmMatches(**{field.name: getattr(matches, field.name)[rows] for field in fields(matches)})
 
 
 def _largest_that_agrees(by_size: list[LsmMatches]) -> IntArray:

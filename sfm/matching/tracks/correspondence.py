@@ -121,7 +121,17 @@ def match_targets(
     if min_rays < 2:
         raise GeometryError(f"matching: min_rays is {min_rays}, an object point needs at least 2 rays")
     scene, unusable = _scene(estimate, camera, targets, kinds, diameters_px, tolerance_px, max_size_ratio)
-    pairs = _pairs(estimate, max_partners)
+    # pairs of photographs: each with the nearest ones taken from another position
+    index = np.flatnonzero(estimate.oriented)
+    base = np.linalg.norm(estimate.position[index][:, None] - estimate.position[index][None], axis=2)
+    apart = base > 1e-3 * base.max(initial=0.0)
+    order = np.argsort(np.where(apart, base, np.inf), axis=1, kind="stable")
+    near = {
+        (min(i, int(j)), max(i, int(j)))
+        for i in range(len(index))
+        for j in order[i, : min(max_partners, int(apart[i].sum()))]
+    }
+    pairs = index[np.array(sorted(near), dtype=np.int64).reshape(-1, 2)]
     search = _Search(
         scene,
         np.repeat(np.arange(m), np.diff(scene.first)),
@@ -287,17 +297,3 @@ def _window(camera: Camera) -> FloatArray:
     left, right = (tangents_from_pixel(camera, np.column_stack([0 * y + at, y])) for at in (0, width - 1))
     top, bottom = (tangents_from_pixel(camera, np.column_stack([x, 0 * x + at])) for at in (0, height - 1))
     return np.array([left[:, 0].max(), bottom[:, 1].max(), right[:, 0].min(), top[:, 1].min()])
-
-
-def _pairs(estimate: Estimate, max_partners: int) -> IntArray:
-    """Return pairs of photographs: each with the nearest ones taken from another position."""
-    index = np.flatnonzero(estimate.oriented)
-    base = np.linalg.norm(estimate.position[index][:, None] - estimate.position[index][None], axis=2)
-    apart = base > 1e-3 * base.max(initial=0.0)
-    order = np.argsort(np.where(apart, base, np.inf), axis=1, kind="stable")
-    pairs = {
-        (min(i, int(j)), max(i, int(j)))
-        for i in range(len(index))
-        for j in order[i, : min(max_partners, int(apart[i].sum()))]
-    }
-    return index[np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)]

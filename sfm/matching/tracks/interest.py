@@ -118,20 +118,20 @@ def textured_squares(
 
     Source: the weight of Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
     """
-    weight = _weight(grey_of(photograph), side_px)
+    grey = grey_of(photograph)
+    weight = np.empty_like(grey)
+    for first, end, begin, gx, gy in _strips(grey, side_px // 2):
+        weight[first:end] = _texture(gx, gy, side_px)[0][first - begin : end - begin]
     free = allowed & (weight > TEXTURE_OF_MEAN * weight.mean())
     margin = max(border_px, 1)
     free[:margin], free[-margin:], free[:, :margin], free[:, -margin:] = False, False, False, False
-    return np.array(_side_by_side(free, side_px), dtype=float).reshape(-1, 2)
-
-
-def _gradients(grey: AnyArray) -> tuple[AnyArray, AnyArray]:
-    """Return the derivatives of a photograph along x and y, each (H, W)."""
-    reach = 2 * REACH_PX + 1
-    smooth = cv2.GaussianBlur(grey, (reach, reach), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
-    along_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
-    along_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
-    return along_x, along_y
+    corners = []  # line by line, each square disjoint from those before
+    for y in range(len(free)):
+        for x in np.flatnonzero(free[y]).tolist():
+            if free[y, x]:
+                corners.append((x, y))
+                free[y : y + side_px, max(0, x - side_px + 1) : x + side_px] = False
+    return np.array(corners, dtype=float).reshape(-1, 2)
 
 
 def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray, AnyArray]]:
@@ -147,7 +147,10 @@ def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray
         end = min(first + STRIP, len(grey))
         begin, behind = max(0, first - half), min(len(grey), end + half)
         above = min(begin, REACH_PX + 1)  # lines that the derivatives need
-        gx, gy = _gradients(grey[begin - above : behind + REACH_PX + 1])
+        seen, side = grey[begin - above : behind + REACH_PX + 1], 2 * REACH_PX + 1
+        smooth = cv2.GaussianBlur(seen, (side, side), DERIVATION_PX, borderType=cv2.BORDER_REFLECT_101)
+        gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
+        gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=1, scale=0.5, borderType=cv2.BORDER_REFLECT_101)
         yield first, end, begin, gx[above : above + behind - begin], gy[above : above + behind - begin]
 
 
@@ -160,25 +163,6 @@ def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]
     trace = np.maximum(xx + yy, 1e-12)
     det = np.maximum(xx * yy - xy * xy, 0.0)
     return (det / trace).astype(np.float32), (4 * det / (trace * trace)).astype(np.float32)
-
-
-def _weight(grey: AnyArray, side: int) -> AnyArray:
-    """Return the weight of the window around every pixel, (H, W)."""
-    weight = np.empty_like(grey)
-    for first, end, begin, gx, gy in _strips(grey, side // 2):
-        weight[first:end] = _texture(gx, gy, side)[0][first - begin : end - begin]
-    return weight
-
-
-def _side_by_side(free: BoolArray, side: int) -> list[tuple[int, int]]:
-    """Return the first free positions (x, y), line by line, with disjoint squares; `free` is changed."""
-    corners = []
-    for y in range(len(free)):
-        for x in np.flatnonzero(free[y]).tolist():
-            if free[y, x]:
-                corners.append((x, y))
-                free[y : y + side, max(0, x - side + 1) : x + side] = False
-    return corners
 
 
 @compiled

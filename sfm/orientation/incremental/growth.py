@@ -414,19 +414,15 @@ def _free_by_stages(camera: Camera, network: Network, index: int) -> Camera:
     n, m = len(network.points), len(network.images)
     redundancy = 2 * len(network.image_points) - 6 * m - 3 * n + 7
     surplus = min(2 * int(of_camera[network.image_points.image].sum()) - 6 * int(of_camera.sum()), redundancy)
-    early = camera.free & _determined_early(camera)
+    # few photographs determine focal lengths and the first radial parameter
+    early = camera.plays(Role.FOCAL)
+    early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
+    early &= camera.free
     if m >= ALL_FREE_PHOTOGRAPHS and surplus >= SURPLUS_PER_PARAMETER * camera.free.sum():
         return camera
     if m >= FIRST_ADJUSTMENT and surplus >= SURPLUS_PER_PARAMETER * early.sum():
         return replace(camera, free=early)
     return replace(camera, free=np.zeros_like(camera.free))
-
-
-def _determined_early(camera: Camera) -> BoolArray:
-    """Return the parameters that few photographs determine: focal lengths and the first radial one, (n,)."""
-    early = camera.plays(Role.FOCAL)
-    early[np.flatnonzero(camera.plays(Role.RADIAL))[:1]] = True
-    return early
 
 
 def _too_few(fitting: int, points: int, needed: int) -> Remark:
@@ -482,20 +478,14 @@ def photograph_support(
     rays = np.bincount(seen.point[fits], minlength=len(network.points))
     known = estimate.determined[seen.point] & estimate.oriented[seen.image]
     alone = fits & ((rays[seen.point] >= 3) | fixed[seen.point])
-    confirmed = _count(alone, seen.image, m) + _surplus_of_pairs(network, fits & ~alone)
+    surplus = np.zeros(m)  # conditions in pairs of photographs beyond a relative orientation
+    for first, second, count in network.common_points(fits & ~alone):
+        beyond = np.maximum(count - RELATIVE_UNKNOWNS, 0)
+        surplus += np.bincount(first, beyond, minlength=m) + np.bincount(second, beyond, minlength=m)
+    confirmed = _count(alone, seen.image, m) + surplus.astype(np.int64)
     against = ~fits & (known | _inside_network(network, estimate))
     fitting, known_count, against_count = (_count(rows, seen.image, m) for rows in (fits, known, against))
     return Support(fitting, known_count, confirmed, against_count)
-
-
-def _surplus_of_pairs(network: Network, two_rays: BoolArray) -> IntArray:
-    """Return the surplus conditions, beyond a relative orientation, in the pairs of each photograph, (m,)."""
-    m = len(network.images)
-    total = np.zeros(m)
-    for first, second, count in network.common_points(two_rays):
-        surplus = np.maximum(count - RELATIVE_UNKNOWNS, 0)
-        total += np.bincount(first, surplus, minlength=m) + np.bincount(second, surplus, minlength=m)
-    return total.astype(np.int64)
 
 
 def _inside_network(network: Network, estimate: Estimate) -> BoolArray:

@@ -140,7 +140,13 @@ def orient(
         ()
     """
     if not isinstance(estimate, Estimate):
-        estimate = empty_estimate(network, _as_cameras(estimate, int(network.camera.max()) + 1))
+        count = int(network.camera.max()) + 1
+        cameras = tuple(estimate) if isinstance(estimate, Sequence) else ()
+        if len(cameras) < count or not all(isinstance(camera, Camera) for camera in cameras):
+            raise GeometryError(
+                f"orient: {type(estimate).__name__}, expected an Estimate or {counted(count, 'camera')}"
+            )
+        estimate = empty_estimate(network, cameras)
 
     def begin(values: Estimate, share: float = 1.0) -> Growth:
         diagonal = np.array([np.hypot(*camera.size_px) for camera in values.cameras])
@@ -197,16 +203,6 @@ def orient(
         else remark("approximate_unused", control="control")
     )
     return replace(without, remarks=(*without.remarks, unused))
-
-
-def _as_cameras(cameras: Sequence[Camera], count: int) -> tuple[Camera, ...]:
-    """Return the cameras of a network; GeometryError for anything else."""
-    listed = tuple(cameras) if isinstance(cameras, Sequence) else ()
-    if len(listed) < count or not all(isinstance(given, Camera) for given in listed):
-        raise GeometryError(
-            f"orient: {type(cameras).__name__}, expected an Estimate or {counted(count, 'camera')}"
-        )
-    return listed
 
 
 def _holds_control(network: Network, orientation: Orientation) -> bool:
@@ -320,9 +316,13 @@ def _finish(growth: Growth, start: Start, cameras: tuple[Camera, ...], *, contra
     fits = residuals <= growth.tolerance_px[network.camera[seen.image]]
     if growth.estimate.oriented.sum() < 2:
         failures = _failures(growth)
+        of_reason: dict[str, list[str]] = {}
+        for name, reason in failures:
+            of_reason.setdefault(reason.text.rstrip("."), []).append(name)
+        reasons = [f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items()]
         raise NotOrientedError(
             f"orientation: {growth.estimate.oriented.sum()} of {len(network.images)} photographs could be "
-            f"oriented, at least 2 are needed: {_list_failures(failures)}",
+            f"oriented, at least 2 are needed: {listed(reasons, most=10, separator='; ')}",
             failures,
         )
     if start.pair is not None and len(control) >= 3:
@@ -354,15 +354,6 @@ def _failures(growth: Growth) -> tuple[tuple[str, Remark], ...]:
     )
 
 
-def _list_failures(failures: tuple[tuple[str, Remark], ...]) -> str:
-    """Return the reasons in words, each once, with its photographs."""
-    of_reason: dict[str, list[str]] = {}
-    for name, reason in failures:
-        of_reason.setdefault(reason.text.rstrip("."), []).append(name)
-    words = (f"{listed(names, most=10)}: {reason}" for reason, names in of_reason.items())
-    return listed(words, most=10, separator="; ")
-
-
 @dataclass(frozen=True)
 class GivenStart:
     """Accepted given values, completed by resection and intersection."""
@@ -381,7 +372,11 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
     """
     control = growth.network.control.complete
     held = control.point[growth.fixed[control.point]]
-    _complete(growth)
+    # orient and intersect everything without given values; given values do not change
+    for _ in range(MAX_COMPLETIONS):
+        growth.intersect(only_missing=True)
+        if not growth.resect_next():
+            break
     start = growth.estimate
     if start.oriented.sum() < 2:
         return None
@@ -399,15 +394,16 @@ def start_from_given(growth: Growth, refine: Refine | None, final_tolerance_px: 
     fitting = growth.share_fitting()[growth.estimate.oriented] >= KEPT_SHARE
     if fitting.mean() <= KEPT_SHARE or (growth.tolerance_px > KEPT_TOLERANCE * final_tolerance_px).any():
         return None
-    return GivenStart(start, replaced) if _near_control(growth, start, held) else None
-
-
-def _complete(growth: Growth) -> None:
-    """Orient and intersect everything without given values; given values do not change."""
-    for _ in range(MAX_COMPLETIONS):
-        growth.intersect(only_missing=True)
-        if not growth.resect_next():
-            break
+    seen = growth.network.image_points
+    rows = np.isin(seen.point, held) & start.oriented[seen.image]
+    if rows.any():  # most rays of fixed control points fit their coordinates from the given orientations
+        limit = growth.start_tolerance_px[growth.network.camera[seen.image]]
+        lengths = residual_lengths(
+            growth.network, Estimate(growth.estimate.cameras, start.position, start.rotation, start.points)
+        )
+        if not (lengths <= limit)[rows].mean() >= KEPT_SHARE:
+            return None
+    return GivenStart(start, replaced)
 
 
 def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
@@ -430,19 +426,6 @@ def _replace_misfits(growth: Growth) -> tuple[Remark, ...]:
         for i in wrong
         if after[i] >= MIN_SHARE
     )
-
-
-def _near_control(growth: Growth, start: Estimate, held: IntArray) -> bool:
-    """Return whether most rays of fixed control points fit their coordinates from the given orientations."""
-    seen = growth.network.image_points
-    rows = np.isin(seen.point, held) & start.oriented[seen.image]
-    if not rows.any():
-        return True
-    limit = growth.start_tolerance_px[growth.network.camera[seen.image]]
-    lengths = residual_lengths(
-        growth.network, Estimate(growth.estimate.cameras, start.position, start.rotation, start.points)
-    )
-    return bool((lengths <= limit)[rows].mean() >= KEPT_SHARE)
 
 
 def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[str, Remark], ...]:

@@ -116,17 +116,14 @@ def cofactors_in_angles(cofactors: FloatArray, rotation: FloatArray) -> FloatArr
         pseudo-inverse is used.
     """
     J = np.eye(6)
-    J[3:, 3:] = np.linalg.pinv(_rotation_from_angle_rates(rotation))
-    return J @ cofactors @ J.T
-
-
-def _rotation_from_angle_rates(rotation: FloatArray) -> FloatArray:
-    """Return d w / d (omega, phi, kappa), w the rotation in image axes: columns Rz'Ry'ex, Rz'ey, ez."""
+    # d w / d (omega, phi, kappa), w the rotation in image axes, has the columns Rz'Ry'ex, Rz'ey, ez
     phi = np.arcsin(np.clip(rotation[0, 2], -1.0, 1.0))
     kappa = np.arctan2(-rotation[0, 1], rotation[0, 0])
     Rz = rotation_from_angles(0.0, 0.0, kappa)
     Ry = rotation_from_angles(0.0, phi, 0.0)
-    return np.stack([(Ry @ Rz)[0], Rz[1], np.array([0.0, 0.0, 1.0])], axis=1)
+    rates = np.stack([(Ry @ Rz)[0], Rz[1], np.array([0.0, 0.0, 1.0])], axis=1)
+    J[3:, 3:] = np.linalg.pinv(rates)
+    return J @ cofactors @ J.T
 
 
 DONE, LIMIT, BEHIND, RANK = 0, 1, 2, 3  # results of the adjustment of one pose
