@@ -73,10 +73,15 @@ class Row:
 
 NOTHING = Row()
 ROWS = (  # the simple ones first
-    *(Row(scale=True), Row(mirror=True), Row(scale=True, mirror=True)),
-    *(Row(strain=True), Row(bending=True)),
-    *(Row(names=True), Row(scale=True, names=True)),
-    *(Row(mirror=True, names=True), Row(scale=True, mirror=True, names=True)),
+    Row(scale=True),
+    Row(mirror=True),
+    Row(scale=True, mirror=True),
+    Row(strain=True),
+    Row(bending=True),
+    Row(names=True),
+    Row(scale=True, names=True),
+    Row(mirror=True, names=True),
+    Row(scale=True, mirror=True, names=True),
 )
 
 
@@ -151,12 +156,8 @@ def find_cause(
     except GeometryError:
         return None
     limit = math.log(len(rows) / LEVEL)
-    if not changed:
-        rows = [row for row in rows if row == Row(scale=True)]
-    elif nothing.agreed:  # a majority agrees without any cause
-        rows = [row for row in rows if not row.mirror]
     best = nothing
-    for row in rows:
+    for row in _tested_rows(rows, changed=changed, agreed=nothing.agreed):
         if row.names and best.agreed and best.stable.sum() == reference.sum():
             continue  # all points agree with their given names
         with suppress(GeometryError):
@@ -170,6 +171,13 @@ def find_cause(
     if changed and not nothing.agreed and is_unrelated(pairs.a, pairs.b):
         return Cause(NOTHING, other_object=True)
     return None
+
+
+def _tested_rows(rows: list[Row], *, changed: bool, agreed: bool) -> list[Row]:
+    """Return the rows that may explain the differences; `agreed`: a majority agrees without any cause."""
+    if not changed:
+        return [row for row in rows if row == Row(scale=True)]
+    return [row for row in rows if not row.mirror] if agreed else rows
 
 
 def is_unrelated(a: FloatArray, b: FloatArray) -> bool:
@@ -204,23 +212,18 @@ def _fit(pairs: PointPairs, row: Row, nothing: _Fit, reference: BoolArray, cost:
         )
     if a_from_b is None:
         return None
-    other = _assigned(pairs, a_from_b, given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool))
+    # the point of b for each point of a: by its name if that fits, else by its position
+    named = given.stable if given.agreed else np.zeros(len(pairs.a), dtype=bool)
+    rows, every = np.flatnonzero(named), np.ones(len(named), dtype=bool)
+    nearest = nearest_places(
+        (pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1)
+    )
+    other = np.asarray(np.where(named, np.arange(len(named)), -1))
+    other[nearest[:, 0]] = nearest[:, 1]
     kept = other >= 0
     if kept.sum() < max(MIN_STABLE, STABLE_FRACTION * len(pairs.a)):
         return None
     return _fitted(pairs.chosen(np.flatnonzero(kept), other[kept]), row, reference[kept], cost, other)
-
-
-def _assigned(pairs: PointPairs, a_from_b: Similarity, given: BoolArray) -> IntArray:
-    """Return the point of b for each point of a: by its name if that fits, else by its position, (n,)."""
-    every = np.ones(len(pairs.a), dtype=bool)
-    rows = np.flatnonzero(given)
-    nearest = nearest_places(
-        (pairs.a, every), (a_from_b.apply(pairs.b), every), np.stack([rows, rows], axis=1)
-    )
-    other = np.where(given, np.arange(len(every)), -1)
-    other[nearest[:, 0]] = nearest[:, 1]
-    return np.asarray(other)
 
 
 def _fitted(
@@ -230,17 +233,15 @@ def _fitted(
     n = len(pairs.a)
     deforms = row.strain or row.bending
     estimated = row.scale or deforms or pairs.scale is None
-    source = pairs.b @ MIRROR if row.mirror else pairs.b
-    T = fit_robustly(source[reference], pairs.a[reference], scale=None if estimated else pairs.scale)
-    if row.mirror:
-        T = replace(T, rotation=T.rotation @ MIRROR)
-    if deforms:  # also for large deformations
-        T = fit_affinity(T, pairs.a, pairs.b, reference)
+    T = _transform(pairs, row, reference, None if estimated else pairs.scale)
     d, Q = pairs.differences(T)
     similarity = motions(pairs.a)
     G = similarity[:, : MOTIONS["similarity" if estimated else "rigid"]]
     if deforms:
-        G = _independent(np.hstack([G, (bending if row.bending else strain)(pairs.a)]), 3 * n)
+        # an orthogonal basis of the span, with entries of about the same size
+        columns = np.hstack([G, (bending if row.bending else strain)(pairs.a)])
+        left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+        G = np.asarray(left[:, singular > 1e-6 * singular[0]] * math.sqrt(3 * n))
     parameters = G.shape[1] - MOTIONS["similarity" if pairs.scale is None else "rigid"]
     lost = 0 if other is None else len(other) - n
     searched = 0.0
@@ -281,10 +282,15 @@ def _fitted(
     return _Fit(row, pairs, T, ln_p - penalty, True, search.stable, lengths, unit, stretches, other)
 
 
-def _independent(columns: FloatArray, rows: int) -> FloatArray:
-    """Return an orthogonal basis of the span of columns, with entries of about the same size."""
-    left, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, size > 1e-6 * size[0]] * math.sqrt(rows))
+def _transform(pairs: PointPairs, row: Row, reference: BoolArray, scale: float | None) -> Similarity:
+    """Return the transformation from b to a under a row that most points of the reference agree on."""
+    source = pairs.b @ MIRROR if row.mirror else pairs.b
+    T = fit_robustly(source[reference], pairs.a[reference], scale=scale)
+    if row.mirror:
+        T = replace(T, rotation=T.rotation @ MIRROR)
+    if row.strain or row.bending:  # also for large deformations
+        T = fit_affinity(T, pairs.a, pairs.b, reference)
+    return T
 
 
 def _lengths(

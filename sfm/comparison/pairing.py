@@ -55,8 +55,10 @@ def pair_results(a: Solution, b: Solution) -> Pairing:
         b: second result.
     """
     images = _by_name(
-        *(a.network.images, a.estimate.oriented & a.images_named),
-        *(b.network.images, b.estimate.oriented & b.images_named),
+        a.network.images,
+        a.estimate.oriented & a.images_named,
+        b.network.images,
+        b.estimate.oriented & b.images_named,
     )
     by_name = len(images)
     images, xy = _images_by_image_points(a, b, images)

@@ -372,7 +372,9 @@ def judge_points(
         d, Q = points.differences(transform)
         try:
             test = congruency(
-                *(d, Q, points.a),
+                d,
+                Q,
+                points.a,
                 motion="none" if align == "none" else "similarity" if points.scale is None else "rigid",
                 redundancy=points.redundancy,
                 reference=chosen[free],
@@ -388,9 +390,15 @@ def judge_points(
     statistic, critical, global_critical = _single_tests(difference, blocks, points.redundancy, alpha)
     if not np.isfinite(statistic).any():
         return without(remark("no_covariance", unknown="sigmas"))
-    mean = float(np.nanmean(statistic))
     return PointTest(
-        *(sigma, None, statistic, critical, statistic > critical, mean, global_critical, every),
+        sigma=sigma,
+        untested=None,
+        statistic=statistic,
+        critical=critical,
+        significant=statistic > critical,
+        global_statistic=float(np.nanmean(statistic)),
+        global_critical=global_critical,
+        stable=every,
         approximate=True,
     )
 
@@ -405,10 +413,16 @@ def _congruency_test(test: Congruency, tested: IntArray, sigma: FloatArray, toge
     stable[tested] = test.stable
     significant = np.zeros(n, dtype=bool)
     significant[tested] = test.moved
-    first, critical = test.first_test, float(test.critical[test.reference][0])
     return PointTest(
-        *(sigma, None, statistic, critical, significant, first.statistic, first.critical),
-        *(stable, False, test.agreed),
+        sigma=sigma,
+        untested=None,
+        statistic=statistic,
+        critical=float(test.critical[test.reference][0]),
+        significant=significant,
+        global_statistic=test.first_test.statistic,
+        global_critical=test.first_test.critical,
+        stable=stable,
+        majority=test.agreed,
     )
 
 

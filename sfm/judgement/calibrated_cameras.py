@@ -281,11 +281,9 @@ class Mount:
         names = ("X", "Y", "Z"), ("omega", "phi", "kappa")
         position = zip(names[0], self.position.tolist(), self.position_sigma.tolist(), strict=True)
         rotation = zip(names[1], self.rotation_deg.tolist(), self.rotation_sigma_deg.tolist(), strict=True)
-        return (
-            ("base", self.base, self.base_sigma, True),
-            *((name, value, sigma, True) for name, value, sigma in position),
-            *((name, value, sigma, False) for name, value, sigma in rotation),
-        )
+        lengths = [(name, value, sigma, True) for name, value, sigma in position]
+        angles = [(name, value, sigma, False) for name, value, sigma in rotation]
+        return (("base", self.base, self.base_sigma, True), *lengths, *angles)
 
 
 @dataclass(frozen=True)

@@ -241,43 +241,16 @@ class SurveyResult:
         index = {name: i for i, name in enumerate(self.network.images)}
         of_index = [photograph for photograph in self.photographs if photograph.image in index]
         of_index.sort(key=lambda photograph: index[photograph.image])
-        nothing = np.full((0, 3), np.nan)
+        image, xy, ellipses, reasons = list[int](), [np.zeros((0, 2))], [np.zeros((0, 3))], list[str]()
+        for photograph in of_index:
+            measured, rejected = len(photograph.xy), len(photograph.rejected_xy)
+            image += [index[photograph.image]] * (measured + rejected)
+            xy += [photograph.xy, photograph.rejected_xy]
+            ellipses += [np.column_stack([photograph.semi_axes, photograph.angle])]
+            ellipses += [np.full((rejected, 3), np.nan)]
+            reasons += [""] * measured + [_reason(int(flag)) for flag in photograph.rejected_flag]
         return SeenTargets(
-            np.array(
-                [
-                    index[photograph.image]
-                    for photograph in of_index
-                    for _ in range(len(photograph.xy) + len(photograph.rejected_xy))
-                ],
-                dtype=np.int64,
-            ),
-            np.vstack(
-                [
-                    np.zeros((0, 2)),
-                    *(part for photograph in of_index for part in (photograph.xy, photograph.rejected_xy)),
-                ]
-            ),
-            np.vstack(
-                [
-                    nothing,
-                    *(
-                        part
-                        for photograph in of_index
-                        for part in (
-                            np.column_stack([photograph.semi_axes, photograph.angle]),
-                            np.full((len(photograph.rejected_xy), 3), np.nan),
-                        )
-                    ),
-                ]
-            ),
-            tuple(
-                words
-                for photograph in of_index
-                for words in (
-                    *[""] * len(photograph.xy),
-                    *(_reason(int(flag)) for flag in photograph.rejected_flag),
-                )
-            ),
+            np.array(image, dtype=np.int64), np.vstack(xy), np.vstack(ellipses), tuple(reasons)
         )
 
     @cached_property

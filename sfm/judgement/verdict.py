@@ -74,18 +74,21 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
     a = result.adjustment
     statistics, consistency = statistics_of(a), consistency_of(a)
     of_sigma0 = sigma0_remarks(sigma0_of(a), a)
-    sigma0_is_high = any(said.kind == "sigma0_high" for said in of_sigma0)  # by a cause, whatever it shifts
+    of_stages = result.stage_remarks
+    if not any(said.kind == "sigma0_high" for said in of_sigma0):  # by a cause, whatever it shifts
+        of_stages = slight_as_tests(of_stages)
+    stated = () if result.photographs else stated_precision_remarks(a)  # only given image points state theirs
     remarks = (
         *convergence_remarks(a),
         *photograph_remarks(result),
-        *(result.stage_remarks if sigma0_is_high else slight_as_tests(result.stage_remarks)),
+        *of_stages,
         *other_solution_remarks(result),
         *of_sigma0,
         *residual_remarks(longest_residual(a)),
         *gross_error_remarks(a, rejects=result.reject != "none"),
         *ray_remarks(a),
         *consistency_remarks(consistency, int(a.rejected.sum()), automatic=a.network.automatic_points),
-        *(() if result.photographs else stated_precision_remarks(a)),  # only given image points state theirs
+        *stated,
         *sharpness_remarks(result, edges_of(result.photographs), consistency),
         *camera_remarks(result, calibrated_cameras(result, interior_of(a))),
         *given_remarks(result, given_of(a, result.length_unit), statistics, check_coordinates(result)),
@@ -112,14 +115,12 @@ def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustm
 def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
     """Return the verdict on an adjustment, see `judge_adjustment`."""
     total, oriented = len(a.network.images), int(a.estimate.oriented.sum())
-    missing = total - oriented
+    missing, of_missing = total - oriented, list[Remark]()
+    if missing:
+        of_missing = [remark("photographs_missing", missing=missing, total=total, share=missing / total)]
     remarks = (
         *convergence_remarks(a),
-        *(
-            (remark("photographs_missing", missing=missing, total=total, share=missing / total),)
-            if missing
-            else ()
-        ),
+        *of_missing,
         *a.remarks,
         *sigma0_remarks(sigma0_of(a), a),
         *residual_remarks(longest_residual(a)),
@@ -224,10 +225,11 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
         decided = {"decided_by": ("known handedness",)}
     elif binomial_sf(right - 1, right + mirrored, 0.5) < result.adjustment.false_alarm:  # a sign test
         decided = {"decided_by": ("most photographs",)}
-    return (
-        *(replace(photograph.reason, subjects={"photograph": (photograph.image,)}) for photograph in single),
-        *(replace(reason, subjects={**reason.subjects, **decided}) for reason in groups.values()),
-    )
+    of_single = [
+        replace(photograph.reason, subjects={"photograph": (photograph.image,)}) for photograph in single
+    ]
+    of_groups = [replace(reason, subjects=reason.subjects | decided) for reason in groups.values()]
+    return tuple(of_single + of_groups)
 
 
 def other_solution_remarks(result: SurveyResult) -> tuple[Remark, ...]:
@@ -304,10 +306,8 @@ def ray_remarks(a: Adjustment) -> tuple[Remark, ...]:
         by_rays[network.control.complete.point] = False
     two = int((by_rays & (rays - lost == 2)).sum())
     names = [network.points[j] for j in most] or None
-    return (
-        remark("rays_tested", tested=int(took_part.sum()), more=len(most), points=names),
-        *((remark("third_ray_missing", two=two, total=n),) if two else ()),
-    )
+    tested = remark("rays_tested", tested=int(took_part.sum()), more=len(most), points=names)
+    return (tested, remark("third_ray_missing", two=two, total=n)) if two else (tested,)
 
 
 def consistency_remarks(
@@ -401,16 +401,17 @@ def given_remarks(
         checks: coordinates that took no part.
     """
     level = result.adjustment.levels.question
+    tests = [
+        remark("given_tested", of=test.what, chi2=test.statistic, dof=test.dof, p=test.probability)
+        for test in result.given_tests
+        if test.dof  # else nothing was tested
+    ]
     return (
         *_differing(given, level),
         *_kinds(statistics, {test.what for test in result.given_tests}, level),
         *_checks(checks, result.length_unit, level),
         *_scale(result),
-        *(
-            remark("given_tested", of=test.what, chi2=test.statistic, dof=test.dof, p=test.probability)
-            for test in result.given_tests
-            if test.dof  # else nothing was tested
-        ),
+        *tests,
     )
 
 

@@ -84,8 +84,8 @@ class ConjugatePoints:
         for field in fields(self):
             parts = [getattr(points, field.name) for points in (self, *others)]
             if field.name == "reason":
-                changed = change(*(np.array(column, dtype=object) for column in parts))
-                columns["reason"] = tuple(changed.tolist())
+                words = [np.array(column, dtype=object) for column in parts]
+                columns["reason"] = tuple(change(*words).tolist())
             elif field.name != "method":
                 columns[field.name] = change(parts[0].copy(), *parts[1:])
         return ConjugatePoints(**columns)

@@ -8,9 +8,8 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -127,22 +126,15 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     """Return the judged values with the survey observations and mounts that do not contradict others."""
     settings, network, mounts = task.settings, given.network, given.mounts
     in_control = given.datum.kind == "control"
-    of_datum = (network.control, network.exterior) if in_control else (ObjectPoints(), ExteriorObservations())
     in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.observations)]
     tables = [Table(kind, k, parts) for k, parts, kind in in_free if len(kind)]
-    part = replace(
-        task.free.adjustment.network,
-        control=task.in_free(of_datum[0])[1],
-        exterior=task.in_free(of_datum[1])[1],
-        scale_bars=task.in_free(network.scale_bars)[1],
-        observations=tuple(table.kind for table in tables),
-    )
+    part = _in_free_network(task, given, tables)
     kinds = [*confirmed(part), *part.observations]
     reference = task.free.reference_of(kinds if mounts is None else [*kinds, mounts])
     if reference is None:
         return given
-    if in_control and given.placing is not None:
-        place = partial(_unchanged, given.placing)
+    settled = given.placing if in_control else None  # further observations do not change it
+    place = place if settled is None else lambda _: settled
     wrong = judge_tables(tables, part, reference, place, settings.level)
     there, bars = task.in_free(network.scale_bars)
     if (
@@ -169,19 +161,28 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     names = [kind.parts(network, estimate) for kind in kinds]
     every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.observations)]
     observations = tuple(table.kind for table in as_judged(every, wrong))
-    remarks = (*(contradiction.remark(names) for contradiction in wrong), *of_mounts)
+    remarks = tuple(contradiction.remark(names) for contradiction in wrong) + of_mounts
     return replace(
         given,
         network=replace(network, observations=observations),
-        remarks=(*given.remarks, *remarks),
+        remarks=given.remarks + remarks,
         mounts=mounts,
         others_contradict=bool(remarks),
     )
 
 
-def _unchanged(placing: Similarity, network: Network) -> Similarity:
-    """Return a placing that further observations of a network do not change."""
-    return placing
+def _in_free_network(task: Task, given: JudgedGiven, tables: Sequence[Table]) -> Network:
+    """Return the free network with the given values that take part, and the observations of the tables."""
+    network = given.network
+    if given.datum.kind != "control":
+        network = replace(network, control=ObjectPoints(), exterior=ExteriorObservations())
+    return replace(
+        task.free.adjustment.network,
+        control=task.in_free(network.control)[1],
+        exterior=task.in_free(network.exterior)[1],
+        scale_bars=task.in_free(network.scale_bars)[1],
+        observations=tuple(table.kind for table in tables),
+    )
 
 
 def _judged(task: Task) -> JudgedGiven:
@@ -202,14 +203,13 @@ def _judged(task: Task) -> JudgedGiven:
         network = replace(network, **{of: judged})
     if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
+    remarks = tuple(said for group in groups for said in _remarks_on(task, group)) + scales.remarks
+    if contradiction is not None:
+        remarks = (*remarks, contradiction)
     return JudgedGiven(
         network,
         datum,
-        (
-            *(said for group in groups for said in _remarks_on(task, group)),
-            *scales.remarks,
-            *(() if contradiction is None else (contradiction,)),
-        ),
+        remarks,
         tuple(group.test for group in groups) + scales.tests,
         next((group.placed.placing for group in used), None),
         any(group.checks_handedness for group in groups),

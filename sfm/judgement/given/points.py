@@ -34,13 +34,12 @@ from sfm.model.similarity import Similarity, extended_axes, fit_similarities, fi
 
 MAX_TRIPLES = 300  # tried similarities from three points; with half of the points correct, 37 are correct
 MAX_STEPS = 20  # iterations of a similarity; one that fits needs fewer than ten
-STRAINS = (  # derivatives of coordinates by the parameters, along an axis or of an affinity, (u, 3, 3)
-    *(np.diag(e)[None] for e in np.eye(3)),
-    np.array(
-        [np.diag([1.0, -1, 0]), np.diag([0, 1.0, -1])]
-        + [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
-    ),
+ALONG_AXES = tuple(np.diag(e)[None] for e in np.eye(3))
+AFFINITY = np.array(
+    [np.diag([1.0, -1, 0]), np.diag([0, 1.0, -1])]
+    + [np.outer(a, b) + np.outer(b, a) for a, b in combinations(np.eye(3), 2)]
 )
+STRAINS = (*ALONG_AXES, AFFINITY)  # derivatives of coordinates by the parameters, (u, 3, 3)
 UNCHANGED = Similarity(1.0, np.eye(3), np.zeros(3))
 ROUNDING = 16 * np.finfo(float).eps  # rounding error of transformed coordinates, relative to the largest
 

@@ -26,8 +26,15 @@ from sfm.model.similarity import mean_distance
 
 CAMERA = ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2")
 CAMERA_ROLES = (
-    *(Role.FOCAL, Role.X0, Role.Y0, Role.RADIAL, Role.RADIAL),
-    *(Role.DECENTRING, Role.DECENTRING, Role.AFFINITY, Role.SHEAR),
+    Role.FOCAL,
+    Role.X0,
+    Role.Y0,
+    Role.RADIAL,
+    Role.RADIAL,
+    Role.DECENTRING,
+    Role.DECENTRING,
+    Role.AFFINITY,
+    Role.SHEAR,
 )
 STRAIN, BENDING = 5, 18  # columns
 CAMERA_PLACES = tuple(range(len(CAMERA)))  # indices in the freedoms of a photograph

@@ -13,7 +13,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from operator import attrgetter
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -66,8 +67,11 @@ MAX_WORK = 3e8
 MAX_PHOTOGRAPHS = 300  # largest tested network, because its normal equations are dense
 MIN_SHAPE = 4  # given points with a shape that the datum does not determine
 OF_FREE_POINTS = (  # tests that do not apply to given points
-    *("assumptions_tested", "assumptions_untested", "photographs_untested"),
-    *("constancy_weakly_tested", "held_weakly_tested"),
+    "assumptions_tested",
+    "assumptions_untested",
+    "photographs_untested",
+    "constancy_weakly_tested",
+    "held_weakly_tested",
 )
 # Shift of coordinates, in standard deviations, below which a cause does not matter.
 MIN_NAMED_SIGMAS = 1.0
@@ -259,6 +263,14 @@ def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
     return tuple(cause for cause in _with_joint_shifts(plain, causes) if cause.matters)
 
 
+class _Adjusted(NamedTuple):
+    """An alternative with an adjustment of its own."""
+
+    evidence: float  # gain of ln likelihood minus the price of parameters and search
+    alternative: Alternative
+    refit: Refit
+
+
 def _best(
     plain: Adjustment,
     causes: tuple[Cause, ...] = (),
@@ -275,15 +287,62 @@ def _best(
     columns = columns_of(current)
     reduced = reduce_adjustment(current, columns)
     every, level = alternatives_of(current, reduced, columns), plain.levels.family
+    to_try = _to_adjust(every, level)
+    work = max(len(to_try), 1) * len(plain.network.images) ** 3
+
+    def judged(alternative: Alternative, refitted: Refit) -> _Adjusted:
+        beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before) if causes else np.inf
+        gain = min(alternative.deflated(refitted.gain, reduced.redundancy), beyond)
+        return _Adjusted(gain - alternative.price, alternative, refitted)
+
+    def adjusted(alternatives: Iterable[Alternative]) -> list[_Adjusted]:
+        most = int(MAX_WORK / work)
+        refits = [
+            (alternative, refit(plain, alternative, current, before, most=most))
+            for alternative in alternatives
+        ]
+        return [judged(alternative, refitted) for alternative, refitted in refits if refitted is not None]
+
+    holding = adjusted(reported("alternatives adjusted", to_try, len(to_try)))
+    holding += [judged(alternative, refitted) for alternative, refitted in beside]
+    best = max(holding, key=attrgetter("evidence"), default=None)
+    if best is None or not best.evidence > np.log(1 / level):
+        return None
+    finished = best.refit
+    if not finished.finished:
+        finished = refit(plain, best.alternative, current, before) or finished
+    # a large error makes photographs differ, whatever caused it: that separates it from no other explanation
+    near = best.alternative.evidence_beside_spread - MIN_LEAD
+    tried = {other.alternative.kind for other in holding}
+    rivals = {
+        alternative.kind: alternative
+        for alternative in reversed(every)
+        if alternative.evidence_beside_spread > near
+    }
+    holding += adjusted([rival for kind, rival in rivals.items() if kind not in tried])
+    as_well = tuple(
+        (other.alternative, other.refit)
+        for other in holding
+        if other.alternative.kind != best.alternative.kind and best.evidence - other.evidence < MIN_LEAD
+    )
+    return Cause(best.alternative, finished, as_well)
+
+
+def _to_adjust(every: Sequence[Alternative], level: float) -> list[Alternative]:
+    """Return the alternatives with most evidence: one of each cause, and at most MAX_TRIED of a kind.
+
+    Args:
+        every: all alternatives, best evidence first.
+        level: of the tests of a result.
+    """
+    needed = np.log(1 / level)
     once: dict[tuple[object, ...], Alternative] = {}
     for alternative in every:
-        if is_significant(alternative, len(every), level) and alternative.evidence > np.log(1 / level):
+        if is_significant(alternative, len(every), level) and alternative.evidence > needed:
             once.setdefault(alternative.family.cause(alternative), alternative)
     if once:  # if one parameter of all photographs explains the errors, no other cause is needed
         for alternative in every:
-            if isinstance(alternative.family, InteriorFamily) and alternative.evidence_beside_spread > np.log(
-                1 / level
-            ):
+            if isinstance(alternative.family, InteriorFamily) and alternative.evidence_beside_spread > needed:
                 once.setdefault(alternative.family.cause(alternative), alternative)
     of_kind: Counter[object] = Counter()
     to_try = []
@@ -291,40 +350,7 @@ def _best(
         of_kind[cause[0]] += 1
         if of_kind[cause[0]] <= MAX_TRIED:
             to_try.append(alternative)
-    work = max(len(to_try), 1) * len(plain.network.images) ** 3
-
-    def adjusted(alternatives: Iterable[Alternative]) -> list[tuple[float, Alternative, Refit]]:
-        refits = [
-            (alternative, refit(plain, alternative, current, before, most=int(MAX_WORK / work)))
-            for alternative in alternatives
-        ]
-        return [
-            (evidence(alternative, new), alternative, new) for alternative, new in refits if new is not None
-        ]
-
-    def evidence(alternative: Alternative, refitted: Refit) -> float:
-        beyond = _beyond_spread(alternative, refitted, reduced.redundancy, before) if causes else np.inf
-        return min(alternative.deflated(refitted.gain, reduced.redundancy), beyond) - alternative.price
-
-    holding = adjusted(reported("alternatives adjusted", to_try, len(to_try)))
-    holding += [(evidence(alternative, refitted), alternative, refitted) for alternative, refitted in beside]
-    most, best, new = max(
-        holding, key=lambda adjusted_alternative: adjusted_alternative[0], default=(-np.inf, None, None)
-    )
-    if best is None or new is None or not most > np.log(1 / level):
-        return None
-    if not new.finished:
-        new = refit(plain, best, current, before) or new
-    # a large error makes photographs differ, whatever caused it: that separates it from no other explanation
-    near, kinds = best.evidence_beside_spread - MIN_LEAD, {alternative.kind for _, alternative, _ in holding}
-    rivals = {
-        alternative.kind: alternative
-        for alternative in reversed(every)
-        if alternative.evidence_beside_spread > near
-    }
-    holding += adjusted([rival for kind, rival in rivals.items() if kind not in kinds])
-    as_well = [each for each in holding if each[1].kind != best.kind and most - each[0] < MIN_LEAD]
-    return Cause(best, new, tuple((alternative, refitted) for _, alternative, refitted in as_well))
+    return to_try
 
 
 def _with_free_shape(held: Adjustment, free: Adjustment) -> list[tuple[Alternative, Refit]]:
@@ -394,7 +420,8 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], latest: Cause) -
         if gain - cause.alternative.price < np.log(1 / plain.levels.family):
             causes, latest = tuple(known for known, _ in before), replace(latest, refit=alone)
     joint = zip(causes, latest.refit.before, strict=True)
-    return (*(replace(known, refit=replace(known.refit, beta=beta)) for known, beta in joint), latest)
+    kept = tuple(replace(known, refit=replace(known.refit, beta=beta)) for known, beta in joint)
+    return (*kept, latest)
 
 
 def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Cause, ...]:

@@ -94,9 +94,9 @@ def refit(
         before: earlier alternatives with their parameters, which are adjusted jointly.
         most: number of adjustments after which no further round begins.
     """
-    every = (*(other for other, _ in before), alternative)
-    ends = np.cumsum([0, *(len(beta) for _, beta in before), len(alternative.gain.beta)])
-    beta = np.concatenate([*(beta for _, beta in before), alternative.gain.beta])
+    every = [other for other, _ in before] + [alternative]
+    betas = [beta for _, beta in before] + [alternative.gain.beta]
+    ends, beta = np.cumsum([0] + [len(beta) for beta in betas]), np.concatenate(betas)
     current, step = start, np.concatenate([np.zeros(int(ends[-2])), alternative.gain.beta])
     D = _side_by_side(every, current, columns_of(current))
     taken, finished = 0, True
@@ -318,23 +318,21 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
             constancy[alternative.family.constant] = max(
                 reach, constancy.get(alternative.family.constant, 0.0)
             )
-    return (
-        *untested,
-        *(
-            remark(
-                "held_weakly_tested",
-                camera=camera,
-                parameters=tuple(parameters),
-                sigmas=max(parameters.values()),
-                without=without,
-            )
-            for camera, parameters in held.items()
-        ),
-        *(
-            remark("constancy_weakly_tested", of=constant, sigmas=reach, without=without)
-            for constant, reach in constancy.items()
-        ),
+    of_held = tuple(
+        remark(
+            "held_weakly_tested",
+            camera=camera,
+            parameters=tuple(parameters),
+            sigmas=max(parameters.values()),
+            without=without,
+        )
+        for camera, parameters in held.items()
     )
+    of_constancy = tuple(
+        remark("constancy_weakly_tested", of=constant, sigmas=reach, without=without)
+        for constant, reach in constancy.items()
+    )
+    return untested + of_held + of_constancy
 
 
 def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:

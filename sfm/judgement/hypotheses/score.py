@@ -224,8 +224,25 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     scale = 1 / np.sqrt(np.diagonal(S))
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
-        *(used, F, v, image, point, B, A, L, W, inverse, y, t, m, a.redundancy),
-        *(seen.xy[used], share, network.may_correlate[used], a.error_correlation, a.sigma0_px),
+        used=used,
+        F=F,
+        v=v,
+        image=image,
+        point=point,
+        B=B,
+        A=A,
+        L=L,
+        W=W,
+        Sinv=inverse,
+        y=y,
+        t=t,
+        photographs=m,
+        redundancy=a.redundancy,
+        xy=seen.xy[used],
+        share=share,
+        may_correlate=network.may_correlate[used],
+        correlation=a.error_correlation,
+        sigma0_px=a.sigma0_px,
     )
 
 

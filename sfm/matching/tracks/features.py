@@ -93,23 +93,8 @@ def sift_features(
     if photograph.ndim > 2 or photograph.dtype != np.uint8:
         eight_bit = np.rint(np.clip(grey_of_8_bit(eight_bit), 0, FULL_SCALE_8)).astype(np.uint8)
     least = MIN_CONTRAST if noise is None else NOISE_CONTRAST * float(np.hypot(noise, ROUNDING_8))
-    while True:
-        contrast = min(MIN_CONTRAST, least) if shrink == 1 else MIN_CONTRAST
-        sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=contrast, enable_precise_upscale=True)
-        height, width = (max(1, side // shrink) for side in eight_bit.shape)
-        # whole blocks of pixels: a remainder at the border belongs to none
-        blocks = eight_bit[: height * shrink, : width * shrink]
-        picture = cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA)
-        points = sift.detect(picture, None)
-        if hidden is not None:
-            at = shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5
-            points = [points[k] for k in np.flatnonzero(is_shown(hidden[shown], at)).tolist()]
-        if len(points) >= max_features or shrink == 1:
-            break
-        shrink //= 2
-    response = np.array([p.response for p in points], dtype=np.float32)
-    if shrink == 1:
-        points = [points[k] for k in _least_contrast(response, max_features, least).tolist()]
+    of_shown = None if hidden is None else hidden[shown]
+    sift, picture, shrink, points = _detect(eight_bit, of_shown, shrink, max_features, least)
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     kept = _strongest_per_cell(xy, np.array([p.response for p in points]), picture.shape, max_features)
     points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
@@ -154,6 +139,40 @@ def shown_part(hidden: BoolArray | None, shape: tuple[int, ...]) -> tuple[slice,
             slice(max(0, first // MARGIN_PX - 1) * MARGIN_PX, min(shape[axis], last + 1 + MARGIN_PX))
         )
     return parts[0], parts[1]
+
+
+def _detect(
+    eight_bit: AnyArray, hidden: BoolArray | None, shrink: int, enough: int, least: float
+) -> tuple[cv2.SIFT, AnyArray, int, list[cv2.KeyPoint]]:
+    """Detect features in a photograph that is reduced as much as leaves enough of them.
+
+    Args:
+        eight_bit: the photograph, (H, W).
+        hidden: pixels without features, (H, W); None if all are shown.
+        shrink: largest factor of the reduction, a power of 2.
+        enough: number of features.
+        least: smallest contrast at full size, over the full scale.
+
+    Returns:
+        The detector, the reduced photograph, its factor and its features.
+    """
+    while True:
+        contrast = min(MIN_CONTRAST, least) if shrink == 1 else MIN_CONTRAST
+        sift = cv2.SIFT.create(nOctaveLayers=LAYERS, contrastThreshold=contrast, enable_precise_upscale=True)
+        height, width = (max(1, side // shrink) for side in eight_bit.shape)
+        # whole blocks of pixels: a remainder at the border belongs to none
+        blocks = eight_bit[: height * shrink, : width * shrink]
+        picture = cv2.resize(blocks, (width, height), interpolation=cv2.INTER_AREA)
+        points = list(sift.detect(picture, None))
+        if hidden is not None:
+            at = shrink * (np.array([p.pt for p in points]).reshape(-1, 2) + 0.5) - 0.5
+            points = [points[k] for k in np.flatnonzero(is_shown(hidden, at)).tolist()]
+        if shrink == 1:
+            response = np.array([p.response for p in points], dtype=np.float32)
+            points = [points[k] for k in _least_contrast(response, enough, least).tolist()]
+        if len(points) >= enough or shrink == 1:
+            return sift, picture, shrink, points
+        shrink //= 2
 
 
 def _least_contrast(response: AnyArray, most: int, least: float) -> IntArray:
