@@ -22,7 +22,7 @@ from benchmarks import textured_scenes
 from benchmarks.textured_scenes import PIXEL_MM, RIPPLES, TexturedScene, intensities, surface_at
 from datasets.textured import render
 from sfm.matching import conjugate
-from sfm.matching.conjugate import affinities_around, match_points
+from sfm.matching.conjugate import MatchSettings, affinities_around, match_points
 from sfm.model.camera import camera_from_values, project
 from sfm.model.conventions import AnyArray, FloatArray
 
@@ -103,7 +103,9 @@ def count_matches(left: AnyArray, right: AnyArray, xy: FloatArray, truth: FloatA
         with patch.object(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(
             nothing.xy[:0], nothing.xy[:0], at
         )):  # fmt: skip
-            matches = match_points(left, right, xy, xy_right=truth + off, wide=method == "turned")
+            matches = match_points(
+                left, right, xy, xy_right=truth + off, settings=MatchSettings(wide=method == "turned")
+            )
     seconds = time.process_time() - begun
     error = np.linalg.norm(matches.right - truth, axis=1)
     with np.errstate(invalid="ignore"):

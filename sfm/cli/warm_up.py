@@ -20,7 +20,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
-from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate import MatchSettings, match_points
 from sfm.matching.conjugate_patches import METHODS
 from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.tracks.correspondence import match_targets
@@ -107,7 +107,7 @@ def compile_matching() -> None:
     photograph = drawn_photograph(False)
     at = foerstner_points(photograph, border_px=30).xy[:4]
     for method in METHODS:
-        match_points(photograph, photograph, at, method=method, search_px=41)
+        match_points(photograph, photograph, at, settings=MatchSettings(method=method, search_px=41))
     resample(photograph, at)
     cells = np.random.default_rng(4).integers(0, 255, (60, 60)).astype(np.uint8)
     texture = np.kron(cells, np.ones((5, 5), dtype=np.uint8))

@@ -228,7 +228,7 @@ def _mirrored(result: SurveyResult) -> tuple[Remark, ...]:
     of_single = [
         replace(photograph.reason, subjects={"photograph": (photograph.image,)}) for photograph in single
     ]
-    of_groups = [replace(reason, subjects=reason.subjects | decided) for reason in groups.values()]
+    of_groups = [replace(reason, subjects={**reason.subjects, **decided}) for reason in groups.values()]
     return tuple(of_single + of_groups)
 
 

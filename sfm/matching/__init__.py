@@ -9,6 +9,7 @@
 - `radiometry_of`, `histogram`, `equalise_histogram`, `match_brightness`, `fit_radiometry`: mean, contrast and
   histogram of photographs, and how to adapt the brightness of one to another.
 - `resample`: intensities between pixels.
+- `MatchSettings`, `LsmSettings`, `NccLimits`, `TrackSettings`, `TargetLimits`: options of these functions.
 
     >>> import numpy as np
     >>> from sfm.matching import match_ncc

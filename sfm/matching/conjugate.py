@@ -24,16 +24,16 @@ import numpy as np
 from sfm.matching.conjugate_patches import (
     METHODS,
     ConjugatePoints,
-    Settings,
+    MatchSettings,
     Starts,
     flag_unconfirmed,
     match_upright,
     match_warped,
 )
 from sfm.matching.correlation import (
-    MIN_CORRELATION,
     LsmFlag,
     NccFlag,
+    NccLimits,
     ambiguous,
     in_words,
     independent_pixels,
@@ -72,7 +72,6 @@ SCALES = (1 / 1.3, 1 / 1.14, 1.0, 1.14, 1.3)
 SAME_PX = 5.0  # peaks of two shapes closer than this are the same position
 REACH_PX = 3  # of the match that follows
 OWN_PX = 500  # around a point, within which similar patches are searched for
-BACK_PX = 1.0  # a match whose way back ends farther than this from its start is another point
 MIN_TEMPLATE_PX = 7  # smaller templates match almost anything once they are rotated and scaled
 REACH_SIGMAS = 3.0  # of the position that key points predict
 MIN_REACH_PX = 4  # of that search
@@ -86,16 +85,9 @@ def match_points(
     left: AnyArray,
     right: AnyArray,
     xy_left: FloatArray,
+    settings: MatchSettings = MatchSettings(),
     *,
     xy_right: FloatArray | None = None,
-    method: str = "lsm",
-    template_px: int = 21,
-    search_px: int = 121,
-    equalise: bool = False,
-    interpolation: str = "six_tap",
-    min_correlation: float = MIN_CORRELATION,
-    back_px: float | None = BACK_PX,
-    wide: bool = True,
 ) -> ConjugatePoints:
     """Find points of the left photograph in the right one.
 
@@ -112,18 +104,9 @@ def match_points(
         left: photograph, (H, W), 8 or 16 bit or float, grey or colour.
         right: the other photograph.
         xy_left: points in the left photograph, px, (k, 2).
+        settings: method, sizes of template and search window, and limits of a match.
         xy_right: centres of the search windows, px, (k, 2); by default the positions in the left photograph.
             If they are given, positions predicted by key points must lie within the windows.
-        method: ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters).
-        template_px: odd side of the template; document 002 uses 19.
-        search_px: odd side of the search window; document 002 uses 21.
-        equalise: equalise the histograms of both photographs before least squares matching.
-        interpolation: six_tap, bicubic or bilinear; see `sfm.matching.lsm.two_photo.match_lsm`.
-        min_correlation: smallest r of a match. Least squares matching starts from r = 0.5 or more, since the
-            warp makes the patches more similar.
-        back_px: matching back must end within this distance of the start, px; None: no matching back.
-        wide: search again for points that are not found. Without it the photographs must be rotated by less
-            than 5 degrees and have the same scale within 10 %.
 
     Returns:
         One result per point.
@@ -133,16 +116,16 @@ def match_points(
 
     Source: document 002, sec. 2 (equations 2.1 to 2.20).
     """
-    if method not in METHODS:
-        raise GeometryError(f"matching: method '{method}', expected one of {', '.join(METHODS)}")
+    if settings.method not in METHODS:
+        raise GeometryError(f"matching: method '{settings.method}', expected one of {', '.join(METHODS)}")
     a = np.asarray(xy_left, dtype=float).reshape(-1, 2)
     b = a if xy_right is None else np.asarray(xy_right, dtype=float).reshape(-1, 2)
     seen = equally_blurred(left, right)
-    reach = -(-((search_px - template_px) // 2) // seen.shrink)
-    back = None if back_px is None else back_px / seen.shrink
-    by = Settings(
-        method, template_px, template_px + 2 * reach, equalise, interpolation, min_correlation, back
-    )
+    side = settings.template_px
+    reach = -(-((settings.search_px - side) // 2) // seen.shrink)
+    back = None if settings.back_px is None else settings.back_px / seen.shrink
+    wide = settings.wide and side >= MIN_TEMPLATE_PX
+    by = replace(settings, search_px=side + 2 * reach, back_px=back, wide=wide)
     matched = _match_by_size(
         seen.left,
         seen.right,
@@ -150,7 +133,6 @@ def match_points(
         seen.small(b),
         by,
         given=xy_right is not None,
-        wide=wide and template_px >= MIN_TEMPLATE_PX,
     )
     right_xy = np.where(matched.good[:, None], seen.full(matched.right), np.nan)
     covariance = np.where(matched.good[:, None, None], seen.shrink**2 * matched.covariance, np.nan)
@@ -160,7 +142,7 @@ def match_points(
 
 
 def _match_by_size(
-    left: AnyArray, right: AnyArray, a: FloatArray, b: FloatArray, by: Settings, *, given: bool, wide: bool
+    left: AnyArray, right: AnyArray, a: FloatArray, b: FloatArray, by: MatchSettings, *, given: bool
 ) -> ConjugatePoints:
     """Match points with templates of the requested size, and with larger ones where these show too little.
 
@@ -171,9 +153,8 @@ def _match_by_size(
         b: centres of the search windows, px, (k, 2).
         by: matching settings.
         given: whether the caller gave the centres; if not, they are the positions in the left photograph.
-        wide: whether points not found are tried again, rotated, scaled, and with larger templates.
     """
-    if not wide:
+    if not by.wide:
         return flag_unconfirmed(left, right, match_upright(left, right, a, b, by), by)
     maps = local_affinities(left, right, a)
     if given:
@@ -193,7 +174,7 @@ def _match(
     right: AnyArray,
     a: FloatArray,
     b: FloatArray,
-    by: Settings,
+    by: MatchSettings,
     maps: LocalAffinities,
     *,
     given: bool,
@@ -232,7 +213,7 @@ def match_turned(
     right: AnyArray,
     xy_left: FloatArray,
     xy_right: FloatArray,
-    by: Settings,
+    by: MatchSettings,
     *,
     given: bool,
 ) -> ConjugatePoints:
@@ -274,7 +255,7 @@ def match_turned(
 
 
 def _starts(
-    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
+    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: MatchSettings
 ) -> tuple[Starts, Starts, FloatArray]:
     """Return the best position of all shapes, the best one elsewhere, and the second r of that best shape."""
     grey_left, grey_right = grey_of_8_bit(left), grey_of_8_bit(right)
@@ -291,7 +272,7 @@ def _starts(
                 linear,
                 reach_px=np.full(len(xy_left), max(round(by.reach_px / scale), 1)),
                 template_px=by.template_px,
-                min_correlation=by.start_correlation,
+                limits=NccLimits(by.start_correlation),
             )
             shapes.append(linear)
             peaks.append(correlated.peak)

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from sfm.matching.correlation import (
+    MIN_CORRELATION,
     START_CORRELATION,
     LsmFlag,
     NccFlag,
+    NccLimits,
     NccMatches,
     ambiguous,
     in_words,
@@ -26,12 +28,14 @@ from sfm.matching.correlation import (
 )
 from sfm.matching.lsm.patch_equations import MARGIN, linear_part
 from sfm.matching.lsm.surface_planes import MAX_SQUARED_RATIO, match_where_plane, squares_over_covariance
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import equalise_histogram, grey_of
+from sfm.model.arguments import checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.runtime.sampling import AFTER, BEFORE
 
 METHODS = {"ncc": "", "lsm": "affine", "lsm8": "projective", "shift": "shift"}
+BACK_PX = 1.0  # a match whose way back ends farther than this from its start is another point
 MAX_BIAS_PX = 1.0  # of a match whose surface is curved
 NOT_PLANE = "surface not plane over the template"
 
@@ -91,17 +95,24 @@ class ConjugatePoints:
         return ConjugatePoints(**columns)
 
 
+@checked_fields
 @dataclass(frozen=True)
-class Settings:
-    """Matching settings; see `sfm.matching.conjugate.match_points`."""
+class MatchSettings:
+    """Settings of `sfm.matching.conjugate.match_points`."""
 
-    method: str
-    template_px: int
-    search_px: int
-    equalise: bool
-    interpolation: str
-    min_correlation: float
-    back_px: float | None
+    method: str = "lsm"  # ncc, or ncc and then shift (2), lsm (6) or lsm8 (8 geometric parameters)
+    template_px: int = 21  # odd side of the template; document 002 uses 19
+    search_px: int = 121  # odd side of the search window; document 002 uses 21
+    equalise: bool = False  # equalise the histograms of both photographs before least squares matching
+    interpolation: str = "six_tap"  # or bicubic or bilinear; see `sfm.matching.lsm.two_photo.LsmSettings`
+    min_correlation: float = MIN_CORRELATION
+    """smallest r of a match. Least squares matching starts from r = 0.5 or more, since the warp makes the
+    patches more similar."""
+    back_px: float | None = BACK_PX
+    """matching back must end within this distance of the start, px; None: no matching back"""
+    wide: bool = True
+    """search again for points that are not found. Without it the photographs must be rotated by less than 5
+    degrees and have the same scale within 10 %."""
 
     @property
     def reach_px(self) -> int:
@@ -126,7 +137,7 @@ class Starts:
 
 
 def match_upright(
-    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: Settings
+    left: AnyArray, right: AnyArray, xy_left: FloatArray, xy_right: FloatArray, by: MatchSettings
 ) -> ConjugatePoints:
     """Match points, px, (k, 2), whose templates are neither rotated nor scaled on the right."""
     correlated = match_ncc(
@@ -136,13 +147,13 @@ def match_upright(
         xy_right,
         template_px=by.template_px,
         search_px=by.search_px,
-        min_correlation=by.start_correlation,
+        limits=NccLimits(by.start_correlation),
     )
     return _refined(left, right, xy_left, correlated, np.tile(np.eye(2), (len(xy_left), 1, 1)), by)
 
 
 def match_warped(
-    left: AnyArray, right: AnyArray, xy_left: FloatArray, start: Starts, by: Settings
+    left: AnyArray, right: AnyArray, xy_left: FloatArray, start: Starts, by: MatchSettings
 ) -> ConjugatePoints:
     """Match points, px, (k, 2), whose templates are rotated, scaled and sheared in the right photograph."""
     correlated = match_ncc_warped(
@@ -153,7 +164,7 @@ def match_warped(
         start.linear,
         reach_px=start.reach_px,
         template_px=by.template_px,
-        min_correlation=by.start_correlation,
+        limits=NccLimits(by.start_correlation),
     )
     return _refined(left, right, xy_left, correlated, start.linear, by)
 
@@ -162,7 +173,7 @@ def flag_unconfirmed(
     left: AnyArray,
     right: AnyArray,
     matched: ConjugatePoints,
-    by: Settings,
+    by: MatchSettings,
     reach_px: IntArray | None = None,
 ) -> ConjugatePoints:
     """Return the matches, with a flag on those that do not lead back to within `back_px`.
@@ -209,7 +220,12 @@ def flag_unconfirmed(
 
 
 def _refined(
-    left: AnyArray, right: AnyArray, a: FloatArray, correlated: NccMatches, linear: FloatArray, by: Settings
+    left: AnyArray,
+    right: AnyArray,
+    a: FloatArray,
+    correlated: NccMatches,
+    linear: FloatArray,
+    by: MatchSettings,
 ) -> ConjugatePoints:
     """Return the positions found by correlation, or refine them by least squares matching."""
     # A peak at the border of the search window is a valid start: least squares matching may leave the window.
@@ -237,14 +253,17 @@ def _refined(
     start = np.where(
         started[:, None], np.where(correlated.good[:, None], correlated.xy, correlated.peak), -1.0
     )
-    lsm = match_lsm(
-        *seen,
-        a,
-        start,
+    settings = LsmSettings(
         model=METHODS[by.method],
         window_px=by.template_px,
         interpolation=by.interpolation,
         min_correlation=by.min_correlation,
+    )
+    lsm = match_lsm(
+        *seen,
+        a,
+        start,
+        settings,
         start=np.where(started[:, None, None], linear, np.eye(2)),
     )
     outside = _what_is_outside(left, a, by.template_px // 2, kernel=True)

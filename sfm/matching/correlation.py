@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from sfm.matching.radiometry import full_scale, grey_of, odd_window
-from sfm.model.arguments import checked_arguments
+from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -76,6 +76,15 @@ class NccMatches:
         return np.asarray(self.flag == 0)
 
 
+@checked_fields
+@dataclass(frozen=True)
+class NccLimits:
+    """What a match of normalised cross-correlation must reach."""
+
+    min_correlation: float = 0.5  # smallest r of a match
+    max_second: float = 1.0  # largest ratio of the second-best r to the best
+
+
 @checked_arguments(xy_left="k 2", xy_right="n 2")
 def match_ncc(
     left: AnyArray,
@@ -85,8 +94,7 @@ def match_ncc(
     *,
     template_px: int = 19,
     search_px: int = 121,
-    min_correlation: float = 0.5,
-    max_second: float = 1.0,
+    limits: NccLimits = NccLimits(),
     back_px: float | None = None,
 ) -> NccMatches:
     """Search windows of the right photograph for the patches around points of the left one.
@@ -100,8 +108,7 @@ def match_ncc(
         template_px: odd side of the template.
         search_px: odd side of the window within which the whole template moves. It is clipped at the border
             of the photograph.
-        min_correlation: smallest r of a match.
-        max_second: largest ratio of the second-best r to the best.
+        limits: what a match must reach.
         back_px: if given, matching back must end within this distance of the left point, px.
 
     Returns:
@@ -140,7 +147,9 @@ def match_ncc(
         template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])
         window = np.ascontiguousarray(grey_right[y0:y1, x0:x1])
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
-        read_peak(template, window, surface, surface, least, min_correlation, max_second, out[k])
+        read_peak(
+            template, window, surface, surface, least, limits.min_correlation, limits.max_second, out[k]
+        )
     out[~np.isfinite(a).all(axis=1) | ~np.isfinite(b).all(axis=1)] = NOT_COMPARED
     matches = matches_of(out, corners[:, 2:4], a, half)
     if back_px is None:
@@ -281,6 +290,29 @@ def read_peak(
         return
     r = tw / np.sqrt(tt * ww)
     out[R], out[GAIN], out[OFFSET] = r, tw / tt, wm - tw / tt * tm
+    second = _second_peak(surface, highest, bi, bj)
+    out[SECOND] = second
+    if r < min_r:
+        out[FLAG] = LOW
+    elif bi == 0 or bj == 0 or bi == rows - 1 or bj == cols - 1:
+        out[FLAG] = BORDER
+    elif second > max_second * r:
+        out[FLAG] = DOUBT
+    if out[FLAG] == 0:
+        _fit_parabola(around, bi, bj, r, n, out)
+
+
+@compiled
+def _second_peak(surface: AnyArray, highest: AnyArray, bi: int, bj: int) -> float:
+    """Return the highest r of a surface at a peak away from the best one, -1 if there is none.
+
+    Args:
+        surface: r of each position of the template in the window, float32.
+        highest: largest r of each row, float32, so that most rows are not searched.
+        bi: row of the best position.
+        bj: its column.
+    """
+    rows, cols = surface.shape
     second = np.float32(-1.0)
     for i in range(rows):
         if highest[i] <= second:
@@ -295,15 +327,21 @@ def read_peak(
                     top = top and surface[u, v] <= r2
             if top:
                 second = r2
-    out[SECOND] = second
-    if r < min_r:
-        out[FLAG] = LOW
-    elif bi == 0 or bj == 0 or bi == rows - 1 or bj == cols - 1:
-        out[FLAG] = BORDER
-    elif second > max_second * r:
-        out[FLAG] = DOUBT
-    if out[FLAG] != 0:
-        return
+    return second
+
+
+@compiled
+def _fit_parabola(around: AnyArray, bi: int, bj: int, r: float, n: int, out: FloatArray) -> None:
+    """Fit a parabola around the best position; add the position of its top to `out`, with its covariance.
+
+    Args:
+        around: r everywhere.
+        bi: row of the best position.
+        bj: its column.
+        r: correlation there.
+        n: number of pixels of the template.
+        out: the row of the result.
+    """
     # least squares parabola through the nine coefficients around the peak (weights in closed form)
     gx, gy, hxx, hyy, hxy = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(-1, 2):
@@ -358,8 +396,7 @@ def match_ncc_warped(
     *,
     reach_px: IntArray,
     template_px: int = 19,
-    min_correlation: float = 0.5,
-    max_second: float = 1.0,
+    limits: NccLimits = NccLimits(),
 ) -> NccMatches:
     """Search windows of the right photograph, each resampled by an affine map, for templates.
 
@@ -371,8 +408,7 @@ def match_ncc_warped(
         linear: right px per left px around each point, (k, 2, 2).
         reach_px: largest distance from the prediction along a row and a column, left px, (k,).
         template_px: odd side of the template.
-        min_correlation: smallest r of a match.
-        max_second: largest ratio of the second-best r to the best.
+        limits: what a match must reach.
 
     Returns:
         One result per point, with positions and covariances in the right photograph.
@@ -417,7 +453,9 @@ def match_ncc_warped(
         template = np.ascontiguousarray(grey_left[y : y + side, x : x + side])  # like the windows
         surface = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
         allowed = np.where(inside, surface, np.float32(-1.0))
-        read_peak(template, window, allowed, surface, least, min_correlation, max_second, out[k])
+        read_peak(
+            template, window, allowed, surface, least, limits.min_correlation, limits.max_second, out[k]
+        )
     around = np.repeat(-(half + reach_px)[:, None], 2, axis=1)  # window corners, from their centres
     matches = matches_of(out, around, np.zeros_like(a), half)
     return replace(

@@ -6,6 +6,7 @@ It refuses everything else in one line: what was found, and what was expected.
 
 from __future__ import annotations
 
+import dataclasses
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -87,6 +88,32 @@ def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R
         return checked
 
     return decorate
+
+
+def checked_fields(cls: type[R]) -> type[R]:
+    """Return a dataclass whose fields are checked against their annotations when it is made.
+
+    Args:
+        cls: dataclass of settings, without arrays.
+
+    Raises:
+        GeometryError: the class is called with a value of another type.
+    """
+    make, names = cls.__init__, tuple(field.name for field in dataclasses.fields(cls))  # type: ignore[arg-type]
+    allowed: dict[str, tuple[Any, ...]] = {}
+
+    @wraps(make)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        if not allowed:
+            hints = typing.get_type_hints(cls)
+            allowed.update({name: _alternatives(hints[name])[0] for name in names})
+        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+            if name in allowed:  # Python refuses other names itself
+                _checked(f"{cls.__name__}: {name}", value, allowed[name])
+        make(self, *args, **kwargs)
+
+    cls.__init__ = checked  # type: ignore[assignment]
+    return cls
 
 
 def check_indices(where: str, indices: IntArray, count: int) -> None:

@@ -9,6 +9,7 @@
   adjusts them.
 - `intersect`: object points from the rays of oriented photographs.
 - `orient_absolute`: a model onto control.
+- `OrientSettings`, `RayLimits`: the options of `orient` and `intersect`.
 
 Rays are tangents u = -U/W, v = -V/W; `sfm.model.camera.tangents_from_pixel` computes them from pixels. Other
 methods for resection, pairs and scanned photographs are in `sfm.textbook`.

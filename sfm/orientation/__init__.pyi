@@ -3,8 +3,10 @@
 from sfm.model.similarity import AbsoluteOrientation as AbsoluteOrientation
 from sfm.model.similarity import orient_absolute as orient_absolute
 from sfm.orientation.incremental.sequence import Orientation as Orientation
+from sfm.orientation.incremental.sequence import OrientSettings as OrientSettings
 from sfm.orientation.incremental.sequence import orient as orient
 from sfm.orientation.intersection import Intersection as Intersection
+from sfm.orientation.intersection import RayLimits as RayLimits
 from sfm.orientation.intersection import intersect as intersect
 from sfm.orientation.relative import RelativeOrientation as RelativeOrientation
 from sfm.orientation.relative import refine_coplanarity as refine_coplanarity

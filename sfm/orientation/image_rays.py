@@ -11,7 +11,7 @@ from sfm.model.camera import Camera, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
-from sfm.orientation.intersection import Intersection, intersect
+from sfm.orientation.intersection import Intersection, RayLimits, intersect
 
 PLANAR_POINTS = 4
 RANSAC_TRIALS = 60  # only planes with four fifths of the pairs matter: one is missed with probability 2e-14
@@ -72,7 +72,7 @@ def intersect_image_points(
         position,
         rotation,
         n_points=n_points,
-        tolerance=tolerance_px / min(of_estimate.c_px for of_estimate in estimate.cameras),
+        limits=RayLimits(tolerance=tolerance_px / min(of_estimate.c_px for of_estimate in estimate.cameras)),
     )
 
 
@@ -122,7 +122,12 @@ def fit_homography(
         if mask is None or mask.sum() < PLANAR_POINTS:
             return np.eye(3), np.zeros(n, dtype=bool)
         used = mask.ravel().astype(bool)
-    H = _direct_homography(first[used], second[used])
+    # the direct linear solution with conditioned coordinates (Hartley, Zisserman 2004, alg. 4.2)
+    T1, T2 = _conditioner(first[used]), _conditioner(second[used])
+    r1, r2 = rays_of(first[used]) @ T1.T, rays_of(second[used]) @ T2.T
+    equations = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
+    h = np.linalg.svd(equations, full_matrices=False)[2][-1].reshape(3, 3)
+    H = np.asarray(np.linalg.inv(T2) @ h @ T1)
     if np.sum((rays_of(first[used]) @ H.T) * rays_of(second[used])) < 0:
         H = -H
     residuals = np.linalg.norm(transfer_residuals(H, first, second), axis=1)
@@ -175,15 +180,6 @@ def decompose_homography(H: FloatArray, first: FloatArray) -> list[tuple[FloatAr
     if abs(solutions[0][2] @ solutions[1][2]) > 1 - NO_BASE:
         return solutions[:1]
     return solutions
-
-
-def _direct_homography(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the direct linear solution with conditioned coordinates (Hartley, Zisserman 2004, alg. 4.2)."""
-    T1, T2 = _conditioner(first), _conditioner(second)
-    r1, r2 = rays_of(first) @ T1.T, rays_of(second) @ T2.T
-    rows = np.einsum("nij,nk->nijk", skew(r2), r1).reshape(-1, 9)
-    h = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
-    return np.asarray(np.linalg.inv(T2) @ h @ T1)
 
 
 def _conditioner(uv: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.arguments import check_indices, checked_arguments, checked_fields
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
 from sfm.runtime.small_algebra import solve_scaled
@@ -36,6 +36,17 @@ class Intersection:
     redundancy: int  # 2 (rays used) - 3 (points)
 
 
+@checked_fields
+@dataclass(frozen=True)
+class RayLimits:
+    """What the rays of an intersected point must reach."""
+
+    tolerance: float = np.inf
+    """largest residual vector of a ray that takes part, tangents. With a finite tolerance the point is the
+    one that most rays support."""
+    min_angle_deg: float = 0.0  # smallest ray angle of a determined point, deg
+
+
 @checked_arguments(tangents="k 2", image="k", point="k", positions="m 3", rotations="m 3 3", weights="k 2 2")
 def intersect(
     tangents: FloatArray,
@@ -46,8 +57,7 @@ def intersect(
     *,
     n_points: int | None = None,
     weights: FloatArray | None = None,
-    tolerance: float = np.inf,
-    min_angle_deg: float = 0.0,
+    limits: RayLimits = RayLimits(),
 ) -> Intersection:
     """Return the object points determined by many rays, each by least squares on its image residuals.
 
@@ -60,9 +70,7 @@ def intersect(
         rotations: R of the photographs, image to object axes, shape (m, 3, 3).
         n_points: number of object points; the largest index + 1 if not given.
         weights: weight matrix of each ray, shape (k, 2, 2); unit matrices if not given.
-        tolerance: largest residual vector of a ray that takes part, tangents. With a finite tolerance the
-            point is the one that most rays support.
-        min_angle_deg: smallest ray angle of a determined point, deg.
+        limits: what the rays of a point must reach.
 
     Returns:
         Points with covariance; a point needs two rays and lies in front of all photographs that see it.
@@ -93,8 +101,10 @@ def intersect(
         np.ascontiguousarray(rotations, dtype=float),
         np.array(P, dtype=float, order="C"),  # writable, because the kernels are compiled for that
     )
-    limit, cos_limit = tolerance * tolerance, float(np.cos(np.radians(min_angle_deg)))
-    cost = _intersect_all(rays, ray, start, limit, cos_limit, xyz, Q, count, angle, residuals, used)
+    tolerance, cos_limit = limits.tolerance, float(np.cos(np.radians(limits.min_angle_deg)))
+    cost = _intersect_all(
+        rays, ray, start, tolerance * tolerance, cos_limit, xyz, Q, count, angle, residuals, used
+    )
     redundancy = int(2 * used.sum() - 3 * np.isfinite(xyz).all(axis=1).sum())
     sigma0 = float(np.sqrt(cost / redundancy)) if redundancy > 0 else np.nan
     return Intersection(xyz, Q, sigma0**2 * Q, residuals, used, count, angle, sigma0, redundancy)
@@ -128,10 +138,7 @@ def _intersect_all(
 
     The rays of point j are `ray[start[j]:start[j + 1]]`; a ray fits up to the squared residual `limit`.
     """
-    longest = 0
-    for j in range(len(xyz)):
-        longest = max(longest, start[j + 1] - start[j])
-    direction = np.empty((longest, 3))
+    direction = np.empty((len(ray), 3))  # of the rays of one point, which may be all
     X, best_X = np.empty(3), np.empty(3)
     N, b, dx = np.empty((3, 3)), np.empty(3), np.empty(3)
     total = 0.0
@@ -142,7 +149,6 @@ def _intersect_all(
             continue
         for i in range(m):
             _direction(rays, of_point[i], direction[i])
-        for i in range(m):
             used[of_point[i]] = True
         nearest = _nearest_to_rays(rays, of_point, direction, used, N, b, X)
         if np.isinf(limit) or m == 2:
@@ -170,24 +176,9 @@ def _intersect_all(
             if not ok:
                 X[:] = best_X
                 break
-        smallest = 1.0
-        count = 0
+        count, smallest = 0, 1.0
         if ok:
-            for i in range(m):
-                k = of_point[i]
-                square = _square(rays, k, X)
-                if np.isinf(square) and used[k]:
-                    ok = False
-                used[k] = used[k] and square <= limit
-                if not used[k]:
-                    continue
-                count += 1
-                for h in range(i):
-                    if used[of_point[h]]:
-                        c = 0.0
-                        for d in range(3):
-                            c += direction[i, d] * direction[h, d]
-                        smallest = min(smallest, c)
+            ok, count, smallest = _select(rays, of_point, direction, X, limit, used)
         if not ok or count < 2 or smallest > cos_limit:
             _drop(of_point, used)
             continue
@@ -210,6 +201,33 @@ def _drop(of_point: IntArray, used: BoolArray) -> None:
     """Mark rays as not taking part."""
     for i in range(len(of_point)):
         used[of_point[i]] = False
+
+
+@compiled
+def _select(
+    rays: _Rays, of_point: IntArray, direction: FloatArray, X: FloatArray, limit: float, used: BoolArray
+) -> tuple[bool, int, float]:
+    """Keep the used rays that fit a point; return whether it is in front of all, their number and spread.
+
+    The spread is the cosine of the largest angle between two of them.
+    """
+    in_front, count, smallest = True, 0, 1.0
+    for i in range(len(of_point)):
+        k = of_point[i]
+        square = _square(rays, k, X)
+        if np.isinf(square) and used[k]:
+            in_front = False
+        used[k] = used[k] and square <= limit
+        if not used[k]:
+            continue
+        count += 1
+        for h in range(i):
+            if used[of_point[h]]:
+                c = 0.0
+                for d in range(3):
+                    c += direction[i, d] * direction[h, d]
+                smallest = min(smallest, c)
+    return in_front, count, smallest
 
 
 @compiled

@@ -11,6 +11,7 @@ import numpy as np
 from sfm.matching.correlation import (
     NOT_COMPARED,
     OUTPUTS,
+    NccLimits,
     NccMatches,
     least_deviations,
     match_ncc,
@@ -80,7 +81,7 @@ def match_pyramid(
             b * scale,
             template_px=side,
             search_px=side + 2 * (reach // 2 + 1),
-            min_correlation=min_correlation,
+            limits=NccLimits(min_correlation=min_correlation),
         )
         if matches is not None:  # a match that failed on a level above keeps the flag of that level
             flag = np.where(matches.flag != 0, matches.flag, found.flag)

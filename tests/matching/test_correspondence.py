@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import difference_of_blur, match_points
+from sfm.matching.conjugate import MatchSettings, difference_of_blur, match_points
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.matching.tracks.correspondence import match_targets
@@ -379,7 +379,7 @@ def test_photographs_alike_have_no_difference_of_blur() -> None:
 def test_one_photograph_out_of_focus_is_matched(blur_left: float, blur_right: float) -> None:
     points = _points()
     truth = (points - MIDDLE) @ A.T + MIDDLE + SHIFT
-    found = match_points(*_pair(blur_left, blur_right), points, search_px=81)
+    found = match_points(*_pair(blur_left, blur_right), points, settings=MatchSettings(search_px=81))
     e = (found.right - truth)[found.good]
     assert found.good.mean() > 0.6
     assert np.abs(e).max() < 1.5 and np.sqrt((e**2).mean()) < 0.3

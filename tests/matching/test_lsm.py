@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate import MatchSettings, match_points
 from sfm.matching.correlation import LsmFlag, match_ncc
-from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.errors import GeometryError, PhotographError
 from tests.places import SHARED
@@ -52,7 +52,10 @@ def test_cheaper_kernels_cost_what_is_said(kernel: str, least: float, most: floa
     pairs, left, right = _pairs()
     assert (
         least
-        < _ratio_to_bound(match_lsm(left, right, pairs.centre, pairs.centre, interpolation=kernel), pairs)
+        < _ratio_to_bound(
+            match_lsm(left, right, pairs.centre, pairs.centre, settings=LsmSettings(interpolation=kernel)),
+            pairs,
+        )
         < most
     )
 
@@ -74,7 +77,9 @@ def test_a_difference_of_blur_moves_no_window() -> None:
     blurred = cv2.GaussianBlur(pairs.right, (0, 0), 0.4, sigmaY=0.05)  # 0.16 px^2 along x
 
     def errors(left: AnyArray, right: AnyArray, *, blur: bool) -> tuple[FloatArray, LsmMatches]:
-        matches = match_lsm(left, right, pairs.centre, pairs.centre, window_px=15, blur=blur)
+        matches = match_lsm(
+            left, right, pairs.centre, pairs.centre, settings=LsmSettings(window_px=15, blur=blur)
+        )
         return matches.xy - pairs.centre - pairs.shift, matches
 
     sharp, _ = errors(pairs.left, blurred, blur=False)
@@ -92,11 +97,11 @@ def test_pictures_without_noise_are_matched() -> None:
     noise = rng.integers(0, 255, (200, 260)).astype(np.uint8)
     picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
     at = np.array([[x, y] for x in range(50, 210, 20) for y in range(50, 160, 20)], dtype=float)
-    same = match_lsm(picture, picture, at, at, window_px=15, blur=True)
+    same = match_lsm(picture, picture, at, at, settings=LsmSettings(window_px=15, blur=True))
     assert same.good.all() and np.isfinite(same.sigma0).all()
     assert (np.diagonal(same.covariance, axis1=1, axis2=2) >= 0).all()
     for levels in (picture, (picture // 64 * 64).astype(np.uint8)):
-        found = match_points(levels, levels, at, method="lsm", search_px=41)
+        found = match_points(levels, levels, at, settings=MatchSettings(method="lsm", search_px=41))
         assert found.good.mean() > 0.9
         np.testing.assert_allclose(found.right[found.good], at[found.good], atol=1e-3)
 
@@ -106,7 +111,7 @@ def test_converges_from_two_pixels_away(model: str) -> None:
     pairs, left, right = _pairs()
     angle = np.random.default_rng(5).uniform(0, 2 * np.pi, PATCHES)
     start = pairs.centre + pairs.shift + 2 * np.column_stack([np.cos(angle), np.sin(angle)])
-    matches = match_lsm(left, right, pairs.centre, start, model=model)
+    matches = match_lsm(left, right, pairs.centre, start, settings=LsmSettings(model=model))
     right_place = np.linalg.norm(matches.xy - pairs.centre - pairs.shift, axis=1) < 0.1
     assert right_place.mean() >= 0.995
     assert not (matches.good & ~right_place).any()
@@ -132,7 +137,7 @@ def test_converges_from_three_pixels_after_correlation() -> None:
 def test_shift_model_on_patches_that_are_only_shifted() -> None:
     pairs = affine_pairs(3, 100, distortion=0.0)
     left, right = with_noise(pairs.left, SIGMA, 1), with_noise(pairs.right, SIGMA, 2)
-    matches = match_lsm(left, right, pairs.centre, pairs.centre, model="shift")
+    matches = match_lsm(left, right, pairs.centre, pairs.centre, settings=LsmSettings(model="shift"))
     e = matches.xy - pairs.centre - pairs.shift
     # 200 errors: the mean of their normalised squares is uncertain by sqrt(2 / 200) = 0.1
     assert (e**2 / matches.covariance[:, [0, 1], [0, 1]]).mean() == pytest.approx(1, abs=0.3)
@@ -152,11 +157,17 @@ def test_a_window_of_a_plane_whose_tilt_is_wrong() -> None:
         return float(np.sqrt(np.einsum("ki,kij,kj->k", e, np.linalg.inv(matches.covariance), e).mean() / 2))
 
     shift, affine = (
-        match_lsm(left, right, pairs.centre, pairs.centre, start=start, model=model)
+        match_lsm(left, right, pairs.centre, pairs.centre, start=start, settings=LsmSettings(model=model))
         for model in ("shift", "affine")
     )
     tilt = match_lsm(
-        left, right, pairs.centre, pairs.centre, start=start, model="tilt", along=rng.uniform(1, 9) * along
+        left,
+        right,
+        pairs.centre,
+        pairs.centre,
+        start=start,
+        along=rng.uniform(1, 9) * along,
+        settings=LsmSettings(model="tilt"),
     )
     assert over_stated(tilt) == pytest.approx(over_stated(affine), abs=3 * UNCERTAIN)
     assert over_stated(shift) > 1.5 * over_stated(tilt)
@@ -167,7 +178,9 @@ def test_a_window_of_a_plane_whose_tilt_is_wrong() -> None:
 
 def test_without_noise_the_warp_itself_is_found() -> None:
     pairs = affine_pairs(4, 30, grain_px=3.0)
-    matches = match_lsm(pairs.left, pairs.right, pairs.centre, pairs.centre, stop_px=1e-6)
+    matches = match_lsm(
+        pairs.left, pairs.right, pairs.centre, pairs.centre, settings=LsmSettings(stop_px=1e-6)
+    )
     assert matches.xy == pytest.approx(pairs.centre + pairs.shift, abs=1e-3)
     assert matches.warp[:, :2, :2] == pytest.approx(pairs.linear, abs=1e-3)
     assert matches.gain == pytest.approx(pairs.gain, abs=1e-3)
@@ -176,7 +189,9 @@ def test_without_noise_the_warp_itself_is_found() -> None:
 def test_points_between_pixels_of_the_left_photograph() -> None:
     pairs = affine_pairs(4, 30, grain_px=3.0)
     offset = np.array([0.3, -0.4])
-    matches = match_lsm(pairs.left, pairs.right, pairs.centre + offset, pairs.centre, stop_px=1e-6)
+    matches = match_lsm(
+        pairs.left, pairs.right, pairs.centre + offset, pairs.centre, settings=LsmSettings(stop_px=1e-6)
+    )
     truth = pairs.centre + pairs.shift + np.einsum("kij,j->ki", pairs.linear, offset)
     assert matches.xy == pytest.approx(truth, abs=1e-3)
 
@@ -194,12 +209,15 @@ def test_failures_are_flagged() -> None:
     assert match_lsm(left, right, np.array([[3.0, 30.0]]), at).flag[0] == LsmFlag.OUTSIDE
     assert match_lsm(left, right, at, np.array([[3.0, 30.0]])).flag[0] == LsmFlag.OUTSIDE
     assert match_lsm(left, right, at + np.nan, at).flag[0] == LsmFlag.OUTSIDE
-    far = match_lsm(left, right, at, at + pairs.shift[:1] + 2.0, max_shift_px=1.0)
+    far = match_lsm(left, right, at, at + pairs.shift[:1] + 2.0, settings=LsmSettings(max_shift_px=1.0))
     assert far.flag[0] == LsmFlag.TOO_FAR
     assert np.isnan(far.xy).all() and np.isnan(far.covariance).all()
-    assert match_lsm(left, right, at, at, max_steps=1).flag[0] == LsmFlag.DIVERGED
+    assert match_lsm(left, right, at, at, settings=LsmSettings(max_steps=1)).flag[0] == LsmFlag.DIVERGED
     assert not match_lsm(left, right, at, pairs.centre[1:2]).good[0]  # another texture
-    assert match_lsm(left, right, at, at, min_correlation=0.999).flag[0] == LsmFlag.LOW_CORRELATION
+    assert (
+        match_lsm(left, right, at, at, settings=LsmSettings(min_correlation=0.999)).flag[0]
+        == LsmFlag.LOW_CORRELATION
+    )
 
 
 def test_kinds_of_photographs() -> None:
@@ -216,13 +234,13 @@ def test_kinds_of_photographs() -> None:
 def test_bad_input_is_refused_in_one_line() -> None:
     photograph, at = np.full((60, 60), MEAN), np.array([[30.0, 30.0]])
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
-        match_lsm(photograph, photograph, at, at, window_px=20)
+        match_lsm(photograph, photograph, at, at, settings=LsmSettings(window_px=20))
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
-        match_lsm(photograph, photograph, at, at, model="helmert")
+        match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="helmert"))
     with pytest.raises(GeometryError, match=r"epipolar lines of shape \(0,\), needed \(1, 2\) for a tilt"):
-        match_lsm(photograph, photograph, at, at, model="tilt")
+        match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="tilt"))
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
-        match_lsm(photograph, photograph, at, at, interpolation="sinc")
+        match_lsm(photograph, photograph, at, at, settings=LsmSettings(interpolation="sinc"))
     with pytest.raises(GeometryError, match="1 point in the left photograph, 2 in the right"):
         match_lsm(photograph, photograph, at, np.vstack([at, at]))
     with pytest.raises(PhotographError, match="int32 intensities"):
@@ -242,7 +260,7 @@ def test_speckle_photographs_as_they_come(name: str, step: int) -> None:
     """They were shifted by bilinear interpolation; bicubic interpolation lags behind by as much as that."""
     first, other = _speckle(name, 0), _speckle(name, step)
     at = _grid(first)
-    matches = match_lsm(first, other, at, at, interpolation="bicubic", stop_px=1e-5)
+    matches = match_lsm(first, other, at, at, settings=LsmSettings(interpolation="bicubic", stop_px=1e-5))
     assert matches.good.all()
     e = matches.xy - at - [-step / 10, 0]
     assert np.abs(e.mean(axis=0)).max() <= 0.005
@@ -261,7 +279,7 @@ def test_speckle_photographs_shifted_exactly(name: str, step: int) -> None:
     waves = np.fft.rfft(first, axis=1) * np.exp(2j * np.pi * frequency * step / 10)
     other = np.fft.irfft(waves, n=first.shape[1], axis=1).astype(np.float32)
     at = _grid(first)
-    matches = match_lsm(first, other, at, at, stop_px=1e-5)
+    matches = match_lsm(first, other, at, at, settings=LsmSettings(stop_px=1e-5))
     assert matches.good.all()
     e = matches.xy - at - [-step / 10, 0]
     assert np.abs(e.mean(axis=0)).max() <= 0.002
@@ -290,7 +308,7 @@ def test_why_no_exact_method_finds_the_stated_shift_of_the_speckle_photographs(n
     lag = A.conj() * B * np.exp(-1j * w * t)
     late = -float((w * lag.imag).sum() / (w**2 * lag.real).sum())  # px to the right of the stated place
     at = _grid(first)
-    matches = match_lsm(first, other, at, at, stop_px=1e-5)
+    matches = match_lsm(first, other, at, at, settings=LsmSettings(stop_px=1e-5))
     assert (matches.xy - at)[:, 0].mean() + t == pytest.approx(late, abs=0.003)
     if name == "hc_dic" and step in (1, 3, 7):
         assert abs(late) > 0.01  # twice what is asked of matching: truth itself is off

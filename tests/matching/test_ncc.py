@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import match_points
-from sfm.matching.correlation import NccFlag, ambiguous, independent_pixels, match_ncc
+from sfm.matching.conjugate import MatchSettings, match_points
+from sfm.matching.correlation import NccFlag, NccLimits, ambiguous, independent_pixels, match_ncc
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.radiometry import (
     equalise_histogram,
@@ -84,7 +84,9 @@ def test_back_matching_confirms_and_refutes() -> None:
     assert match_ncc(left, right, at, at, search_px=61, back_px=0.5).good.all()
     hidden = right.copy()
     hidden[90:170, 90:170] = right[10:90, 10:90]  # what was there is gone
-    matches = match_ncc(left, hidden, at, at, search_px=61, back_px=0.5, min_correlation=0.0)
+    matches = match_ncc(
+        left, hidden, at, at, search_px=61, back_px=0.5, limits=NccLimits(min_correlation=0.0)
+    )
     gone = (np.abs(at + SHIFT - 129.5) < 25).all(axis=1)
     assert gone.any() and not matches.good[gone].any()
 
@@ -128,7 +130,7 @@ def test_failures_are_flagged() -> None:
     noise = np.random.default_rng(1).normal(128, 30, (260, 260))
     assert match_ncc(left, noise, one, one).flag[0] == NccFlag.LOW_CORRELATION
     stripes = np.tile(128 + 60 * np.sin(np.arange(260) * 2 * np.pi / 8), (260, 1))
-    twice = match_ncc(stripes, stripes, one, one, max_second=0.9)
+    twice = match_ncc(stripes, stripes, one, one, limits=NccLimits(max_second=0.9))
     assert twice.flag[0] in (NccFlag.AMBIGUOUS, NccFlag.AT_BORDER)
     cut = match_ncc(left, right, one, np.array([[40.0, 30.0]]), search_px=121)  # window cut by the corner
     assert cut.xy[0] == pytest.approx(one[0] + SHIFT, abs=0.25)
@@ -149,12 +151,14 @@ def test_bad_windows_are_refused_in_one_line() -> None:
 )
 def test_conjugate_points(method: str, tolerance: float) -> None:
     left, right, at = _photographs()
-    found = match_points(left, right, at, method=method, search_px=61)
+    found = match_points(left, right, at, settings=MatchSettings(method=method, search_px=61))
     assert found.good.all()
     assert found.right == pytest.approx(at + SHIFT, abs=tolerance)  # one of a hundred has a smaller window
     assert np.sqrt(((found.right - at - SHIFT) ** 2).mean()) < tolerance / 2.5
     eight_bit = [np.rint(p).clip(0, 255).astype(np.uint8) for p in (left, right)]
-    equalised = match_points(*eight_bit, at, method=method, search_px=61, equalise=True)
+    equalised = match_points(
+        *eight_bit, at, settings=MatchSettings(method=method, search_px=61, equalise=True)
+    )
     assert equalised.right == pytest.approx(at + SHIFT, abs=2 * tolerance)
 
 
@@ -162,7 +166,10 @@ def test_windows_of_document_002() -> None:
     left, right, at = _photographs()
     eight_bit = [np.rint(p).clip(0, 255).astype(np.uint8) for p in (left, right)]
     found = match_points(
-        *eight_bit, at, xy_right=at + np.rint(SHIFT), template_px=19, search_px=21, equalise=True
+        *eight_bit,
+        at,
+        xy_right=at + np.rint(SHIFT),
+        settings=MatchSettings(template_px=19, search_px=21, equalise=True),
     )
     assert found.good.all()
     assert found.right == pytest.approx(at + SHIFT, abs=0.1)
@@ -174,13 +181,15 @@ def test_photographs_of_different_size_depth_and_colour() -> None:
     eight = np.rint(left).clip(0, 255).astype(np.uint8)
     deep = np.rint(right[:190, :210].clip(0, 255) * 257).astype(np.uint16)
     colour = np.repeat(deep[..., None], 3, axis=2)
-    whole = match_points(left, right, some, search_px=61)
+    whole = match_points(left, right, some, settings=MatchSettings(search_px=61))
     for other in (deep, colour):
         for equalise in (False, True):
-            found = match_points(eight, other, some, search_px=61, equalise=equalise)
+            found = match_points(eight, other, some, settings=MatchSettings(search_px=61, equalise=equalise))
             assert found.good.all()
             assert found.right == pytest.approx(whole.right, abs=0.05)
-    outside = match_points(eight, deep, np.array([[255.0, 100.0], [200.0, 200.0]]), search_px=31)
+    outside = match_points(
+        eight, deep, np.array([[255.0, 100.0], [200.0, 200.0]]), settings=MatchSettings(search_px=31)
+    )
     assert outside.reason == (
         "outside: the template in the left photograph",
         "outside: the search window in the right photograph",
@@ -189,7 +198,9 @@ def test_photographs_of_different_size_depth_and_colour() -> None:
 
 def test_a_point_that_is_not_found_says_why() -> None:
     left, right, _ = _photographs()
-    found = match_points(left, right, np.array([[2.0, 2.0], [100.0, 100.0]]), search_px=61)
+    found = match_points(
+        left, right, np.array([[2.0, 2.0], [100.0, 100.0]]), settings=MatchSettings(search_px=61)
+    )
     assert found.reason == ("outside: the template in the left photograph", "")
     assert np.isnan(found.right[0]).all()
 
@@ -223,8 +234,8 @@ def test_turned_photographs_and_small_templates_are_not_matched(method: str) -> 
     c, s = np.cos(np.radians(40)), np.sin(np.radians(40))
     turned = random_texture(np.random.default_rng(1), 2.0).value(130 + c * x - s * y, 130 + s * x + c * y)
     for wrong in (turned, 255 - turned):
-        assert not match_points(left, wrong, at, method=method, wide=False).good.any()
-    small = match_points(left, right, at, method=method, template_px=3)
+        assert not match_points(left, wrong, at, settings=MatchSettings(method=method, wide=False)).good.any()
+    small = match_points(left, right, at, settings=MatchSettings(method=method, template_px=3))
     assert not small.good.any()
     assert sum(reason == "ambiguous" for reason in small.reason) > 0.9 * len(at)
 
@@ -238,8 +249,8 @@ def test_conjugate_points_lead_back(method: str) -> None:
     original = left[110:151, 130:171]  # seen in both photographs; a bad copy of it in the left one alone
     left[110:151, 89:130] = original + 0.5 * (left[200:241, 200:241] - left.mean())
     right[100:156, 90:136] = rng.normal(128, 30, (56, 46))
-    assert match_points(left, right, at, method=method, back_px=None).good.all()
-    found = match_points(left, right, at, method=method)
+    assert match_points(left, right, at, settings=MatchSettings(method=method, back_px=None)).good.all()
+    found = match_points(left, right, at, settings=MatchSettings(method=method))
     assert found.reason == ("not confirmed",) and np.isnan(found.right).all()
 
 

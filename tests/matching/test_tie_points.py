@@ -28,11 +28,12 @@ from sfm.matching.lsm.coverage import (
     points_apart,
 )
 from sfm.matching.lsm.surface_planes import planes_at
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.matching.tracks import feature_tracks, interest
 from sfm.matching.tracks.feature_tracks import (
     Matches,
+    TrackSettings,
     _needed,
     _snapped,
     find_tie_points,
@@ -391,9 +392,13 @@ def test_points_of_two_rays_are_taken_for_photographs_that_have_few_others() -> 
     natural = [natural_points(one, max_features=600) for one in photographs]
     three = find_tie_points(photographs, natural)
     per_photograph = np.bincount(three.image)
-    same = find_tie_points(photographs, natural, min_image_points=int(per_photograph.min()))
+    same = find_tie_points(
+        photographs, natural, settings=TrackSettings(min_image_points=int(per_photograph.min()))
+    )
     assert (same.xy == three.xy).all()
-    more = find_tie_points(photographs, natural, min_image_points=int(per_photograph.max()) + 1)
+    more = find_tie_points(
+        photographs, natural, settings=TrackSettings(min_image_points=int(per_photograph.max()) + 1)
+    )
     rays = np.bincount(more.point)
     assert set(rays.tolist()) == {2, 3} and (rays == 3).sum() == per_photograph[0]
 
@@ -412,7 +417,7 @@ def test_matches_that_do_not_come_back_are_refused() -> None:
     photographs, truth, at = _scene()
     left, right = (grey_of(one) for one in photographs[:2])
     there = project(truth.cameras[0], truth.position[1], truth.rotation[1], truth.points)
-    match = match_lsm(left, right, at, there, window_px=15, blur=True)
+    match = match_lsm(left, right, at, there, settings=LsmSettings(window_px=15, blur=True))
     assert match.good.sum() > 15
     camera, warp = np.zeros(len(photographs), dtype=np.int64), match.warp
     along = _epipolar_lines(truth, camera, 0, 1, truth.points, np.where(np.isfinite(warp), warp, np.eye(3)))
@@ -466,7 +471,7 @@ def test_along_epipolar_lines_of_an_orientation_computed_from_the_photographs() 
     position = np.array([[-0.06, 0.0, 1.6], [0.06, 0.05, 1.65]])
     left, right = _pictures(lens, position, np.tile(np.eye(3), (2, 1, 1)))
     natural = [natural_points(one, max_features=600) for one in (left, right)]
-    found = find_tie_points([left, right], natural, min_rays=2)
+    found = find_tie_points([left, right], natural, settings=TrackSettings(min_rays=2))
     xy = [found.xy[found.image == i][np.argsort(found.point[found.image == i])] for i in range(2)]
     uv = [tangents_from_pixel(lens, one) for one in xy]
     pair = relative_orientations(uv[0], uv[1], tolerance=1.0 / lens.c_px)[0]
@@ -676,7 +681,12 @@ def _from_their_places(a: Adjustment, folder: Path) -> tuple[float, float, float
         own = np.flatnonzero(seen.image[whole] == i)
         at = seen.xy[whole[own]]
         noisy = cv2.imread(str(folder / f"surface_{i + 1}.png"), cv2.IMREAD_UNCHANGED)
-        shift[own] = match_lsm(noisy, render.intensities(i, skin), at, at, window_px=15, blur=True).xy - at
+        shift[own] = (
+            match_lsm(
+                noisy, render.intensities(i, skin), at, at, settings=LsmSettings(window_px=15, blur=True)
+            ).xy
+            - at
+        )
         X[own] = render.surface_at(i, at + shift[own])
     assert a.covariance is not None and len(np.unique(point)) == len(point) > 2000
     known = np.isfinite(X).all(axis=1)

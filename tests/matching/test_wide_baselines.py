@@ -10,10 +10,10 @@ import pytest
 from benchmarks.wide_matching import count_matches, photograph, points_and_truth, wide_scene
 from datasets.textured import render
 from sfm.matching import conjugate
-from sfm.matching.conjugate import affinities_around, match_points
+from sfm.matching.conjugate import MatchSettings, affinities_around, match_points
 from sfm.matching.conjugate_patches import ConjugatePoints
 from sfm.matching.lsm.surface_planes import match_where_plane
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.tracks import feature_tracks
 from sfm.matching.tracks.feature_tracks import link_features
 from sfm.matching.tracks.features import (
@@ -58,10 +58,12 @@ def _right(found: ConjugatePoints, truth: FloatArray) -> int:
 
 def test_key_points_lead_to_places_that_are_turned_and_scaled() -> None:
     left, right, truth = _turned(75.0, 0.8)
-    assert _right(match_points(left, right, POINTS, wide=False), truth) == 0
+    assert _right(match_points(left, right, POINTS, settings=MatchSettings(wide=False)), truth) == 0
     assert _right(match_points(left, right, POINTS), truth) >= 14
     # with search windows elsewhere they must not lead out of them
-    elsewhere = match_points(left, right, POINTS[:2], xy_right=truth[:2] + 90.0, search_px=61)
+    elsewhere = match_points(
+        left, right, POINTS[:2], xy_right=truth[:2] + 90.0, settings=MatchSettings(search_px=61)
+    )
     assert not elsewhere.good.any()
 
 
@@ -73,13 +75,24 @@ def test_without_key_points_templates_are_turned(
     monkeypatch.setattr(conjugate, "local_affinities", lambda _l, _r, at: affinities_around(none, none, at))
     left, right, truth = _turned(angle_deg, scale)
     some, start = POINTS[::3], truth[::3] + np.array([6.0, -5.0])
-    assert _right(match_points(left, right, some, xy_right=start, search_px=61, wide=False), truth[::3]) < 3
+    assert (
+        _right(
+            match_points(left, right, some, xy_right=start, settings=MatchSettings(search_px=61, wide=False)),
+            truth[::3],
+        )
+        < 3
+    )
     # this texture has one grain: at another scale it is taken for a blurred one, and smoothed
-    assert _right(match_points(left, right, some, xy_right=start, search_px=61), truth[::3]) >= len(some) - 1
+    assert (
+        _right(
+            match_points(left, right, some, xy_right=start, settings=MatchSettings(search_px=61)), truth[::3]
+        )
+        >= len(some) - 1
+    )
     other = with_noise(
         random_texture(np.random.default_rng(6), 3.0).value(*np.mgrid[0:180, 0:150]).T, NOISE, 3
     )
-    assert not match_points(left, other, some, search_px=61).good.any()
+    assert not match_points(left, other, some, settings=MatchSettings(search_px=61)).good.any()
 
 
 def test_key_points_that_agree_by_half_only_lead_nowhere() -> None:
@@ -128,14 +141,16 @@ def test_a_large_window_sums_up_weak_texture() -> None:
     left, right = (
         with_noise(MEAN + 0.25 * (one - MEAN), NOISE, k) for k, one in enumerate((pairs.left, pairs.right))
     )
-    found = match_lsm(left, right, pairs.centre, pairs.centre, window_px=31)
+    found = match_lsm(left, right, pairs.centre, pairs.centre, settings=LsmSettings(window_px=31))
     assert found.good.mean() > 0.9
     e = (found.xy - pairs.centre - pairs.shift)[found.good]
     assert np.sqrt((e**2).mean()) < 0.06
     z2 = np.einsum("ki,kij,kj->k", e, np.linalg.inv(found.covariance[found.good]), e) / 2
     assert z2.mean() == pytest.approx(1.0, abs=0.3)  # 200 squares: 0.1
     noise = [with_noise(np.full(left.shape, MEAN), NOISE, k) for k in (3, 4)]
-    assert not match_lsm(*noise, pairs.centre, pairs.centre, window_px=31, min_correlation=0.0).good.any()
+    assert not match_lsm(
+        *noise, pairs.centre, pairs.centre, settings=LsmSettings(window_px=31, min_correlation=0.0)
+    ).good.any()
 
 
 def test_windows_shrink_where_the_surface_is_not_plane() -> None:
@@ -149,9 +164,9 @@ def test_windows_shrink_where_the_surface_is_not_plane() -> None:
     right = with_noise(texture.value(at_left, y), NOISE, 2)
     points = np.array([[30.0 * k, row] for k in range(2, 7) for row in (40.0, 60.0, 80.0)])
     truth = points + 3.0 * np.cos(2 * np.pi * points[:, :1] / 60) * [1.0, 0.0]
-    large = match_lsm(left, right, points, truth, window_px=21)
+    large = match_lsm(left, right, points, truth, settings=LsmSettings(window_px=21))
     assert np.median(np.abs(large.xy[:, 0] - truth[:, 0])) > 0.35
-    found = match_points(left, right, points, search_px=41)
+    found = match_points(left, right, points, settings=MatchSettings(search_px=41))
     e = found.right - truth
     assert found.good.sum() >= 13 and np.abs(e[found.good]).max() < 0.25
     assert np.sqrt((e[found.good] ** 2 / found.sigma[found.good] ** 2).mean()) < 2.0
@@ -159,7 +174,7 @@ def test_windows_shrink_where_the_surface_is_not_plane() -> None:
 
 def test_windows_stay_large_on_a_plane() -> None:
     left, right, truth = _turned(4.0, 1.02)
-    upright = match_lsm(left, right, POINTS, truth, window_px=21)
+    upright = match_lsm(left, right, POINTS, truth, settings=LsmSettings(window_px=21))
     kept, off = match_where_plane(left, right, POINTS, upright, window_px=21)
     assert (kept.xy == upright.xy)[upright.good].all(axis=1).mean() > 0.8
     assert (off == 0.0).all(axis=1).mean() > 0.8

@@ -10,7 +10,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints
 from sfm.orientation import intersection
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.orientation.intersection import intersect
+from sfm.orientation.intersection import RayLimits, intersect
 from tests.places import ROOT
 from tests.synthetic import make_network, seed_of
 
@@ -73,7 +73,9 @@ def test_wrong_rays_are_left_out():
     rng = seed_of("wrong rays")
     wrong = rng.random(len(uv)) < 0.2
     uv[wrong] += rng.choice([-1, 1], (wrong.sum(), 2)) * rng.uniform(0.02, 0.1, (wrong.sum(), 2))
-    result = intersect(uv, seen.image, seen.point, truth.position, truth.rotation, tolerance=6 * sigma)
+    result = intersect(
+        uv, seen.image, seen.point, truth.position, truth.rotation, limits=RayLimits(tolerance=6 * sigma)
+    )
     assert not result.used[wrong].any() and result.used[~wrong].mean() > 0.999
     assert np.abs(result.points - truth.points).max() < 0.005
 
@@ -97,7 +99,7 @@ def test_undetermined_points_are_nan():
     uv = np.array([[0.1, 0.0], [0.098, 0.0], [0.1, 0.0], [0.2, 0.1], [0.0, 0.0], [0.0, 0.0]])
     image = np.array([0, 1, 0, 2, 0, 1])
     point = np.array([0, 0, 1, 1, 2, 2])
-    result = intersect(uv, image, point, positions, rotations, n_points=4, min_angle_deg=1)
+    result = intersect(uv, image, point, positions, rotations, n_points=4, limits=RayLimits(min_angle_deg=1))
     assert np.isnan(result.points).all() and not result.used.any() and (result.rays == 0).all()
     wide = intersect(uv, image, point, positions, rotations, n_points=4)
     assert np.isfinite(wide.points[0]).all() and np.isnan(wide.points[1:]).all()
@@ -151,7 +153,7 @@ def test_up_to_four_hundred_pairs_of_rays_are_tried(rays: int, pairs: int, monke
     uv = -inside[:, :2] / inside[:, 2:]
     uv[0] += 0.05
     arguments = uv, np.arange(rays), np.zeros(rays, dtype=int), positions, rotations
-    compiled = intersect(*arguments, tolerance=1e-3)
+    compiled = intersect(*arguments, limits=RayLimits(tolerance=1e-3))
     tried = 0
 
     def nearest(rays_, of_point, direction, used, *more):
@@ -163,6 +165,6 @@ def test_up_to_four_hundred_pairs_of_rays_are_tried(rays: int, pairs: int, monke
     for name in ("_intersect_all", "_best_pair"):
         monkeypatch.setattr(intersection, name, getattr(intersection, name).py_func)
     monkeypatch.setattr(intersection, "_nearest_to_rays", nearest)
-    found = intersect(*arguments, tolerance=1e-3)
+    found = intersect(*arguments, limits=RayLimits(tolerance=1e-3))
     assert tried == pairs and not found.used[0] and found.used[1:].all()
     np.testing.assert_allclose(found.points, compiled.points, atol=1e-12)

@@ -14,7 +14,7 @@ from sfm.model.network import ImagePoints, Network, ObjectPoints
 from sfm.model.remarks.remark import kinds_of
 from sfm.model.similarity import fit_similarity
 from sfm.orientation.incremental import sequence
-from sfm.orientation.incremental.sequence import orient
+from sfm.orientation.incremental.sequence import OrientSettings, orient
 from sfm.survey.orientation import refine as refine_network
 from tests.places import SHARED
 from tests.synthetic import make_network, perturb, seed_of
@@ -149,7 +149,7 @@ def test_photographs_that_cannot_be_oriented_are_named():
     wrong = seen.image == 6  # photograph 7 sees something else
     xy[wrong] = seed_of("something else").uniform(0, 1400, (int(wrong.sum()), 2))
     network = replace(network, image_points=replace(seen, xy=xy).select(keep))
-    result = orient(network, unknown(truth), start_tolerance=0.005)
+    result = orient(network, unknown(truth), settings=OrientSettings(start_tolerance=0.005))
     reasons = dict(result.failures)
     assert list(reasons) == ["image 3", "image 6", "image 7"]
     assert [reason.kind for reason in reasons.values()] == [

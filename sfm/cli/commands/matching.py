@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sfm.files.csv_tables import read_table
-from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate import MatchSettings, match_points
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.model.camera import camera_from_values, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray, pixel_from_image
@@ -60,7 +60,7 @@ def match_command(
         as_json: whether to return JSON instead of the table.
         out: file .csv or .json for the table, which is then not printed.
         picture: PNG file for the template, the matched patch and their difference.
-        how: further options of `sfm.matching.conjugate.match_points`.
+        how: further settings, see `sfm.matching.conjugate_patches.MatchSettings`.
 
     Returns:
         The text to print, and whether any point was matched.
@@ -85,10 +85,8 @@ def match_command(
             left,
             right,
             xy,
+            MatchSettings(template_px=template_px, min_correlation=min_correlation, **how),
             xy_right=start,
-            template_px=template_px,
-            min_correlation=min_correlation,
-            **how,
         )
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:

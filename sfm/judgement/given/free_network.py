@@ -134,7 +134,11 @@ class Reference:
             v.append(-linear.difference.ravel())
             stated += list(covariance)
             motions.append(A.reshape(n * d, 7))
-            own.append(np.zeros((n * d, 0)) if linear.taken is None else _columns(linear.taken[0]))
+            basis = np.zeros((n * d, 0))
+            if linear.taken is not None:  # of the columns of the cofactors of its own parameters
+                eigenvalues, vectors = np.linalg.eigh(linear.taken[0])
+                basis = np.asarray(vectors[:, eigenvalues > RANK * eigenvalues.max(initial=0.0)])
+            own.append(basis)
             item.append(parts + len(of))
             of += [k] * (int(parts.max(initial=-1)) + 1)
             rows += n * d
@@ -206,9 +210,3 @@ def confirmed(network: Network) -> tuple[Kind, ...]:
 def thinned(count: int) -> IntArray:
     """Return the indices of the given values that are judged: not all if there are more than MAX_PLACES."""
     return np.arange(count)[:: max(1, -(-count // MAX_PLACES))]
-
-
-def _columns(cofactor: FloatArray) -> FloatArray:
-    """Return a basis of the columns of the cofactors of parameters, (r c, h)."""
-    values, vectors = np.linalg.eigh(cofactor)
-    return np.asarray(vectors[:, values > RANK * values.max(initial=0.0)])

@@ -61,14 +61,10 @@ def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...
         stated: moment of each photograph as the survey states it, (m,); a photograph with another moment in
             the network was adjusted free of its rig. The moments of the network if not given.
     """
-    moment, mounts = a.network.moment, a.estimate.mounts
-    if moment is None or mounts is None:
+    moment = a.network.moment
+    if moment is None or a.estimate.mounts is None:
         return ()
-    tested = np.zeros(0, dtype=np.int64)  # photographs that others of their moment can contradict
-    if a.error_correlation is None:
-        together = np.bincount(moment)[moment]
-        mounted = np.isin(np.arange(len(mounts.rig)), np.flatnonzero(mounts.position.any(axis=1)))
-        tested = np.flatnonzero((together > 1) & (mounted[a.network.camera] | (together > 2)))
+    tested = _testable(a) if a.error_correlation is None else np.zeros(0, dtype=np.int64)
     stated = moment if stated is None else stated
     freed = np.flatnonzero(moment != stated)
     critical = level_of_single(a.levels.question, max(len(tested) + len(freed), 1))
@@ -116,6 +112,15 @@ def _bump(a: Adjustment, i: int, step: FloatArray, chi2: float, *, free: bool) -
         float(chi2_sf(chi2, 6)),
         free,
     )
+
+
+def _testable(a: Adjustment) -> IntArray:
+    """Return the photographs that others of their moment can contradict."""
+    moment, mounts = a.network.moment, a.estimate.mounts
+    assert moment is not None and mounts is not None
+    together = np.bincount(moment)[moment]
+    mounted = np.isin(np.arange(len(mounts.rig)), np.flatnonzero(mounts.position.any(axis=1)))
+    return np.flatnonzero((together > 1) & (mounted[a.network.camera] | (together > 2)))
 
 
 def _of_mounted(a: Adjustment, tested: IntArray, critical: float) -> Iterator[Bump]:

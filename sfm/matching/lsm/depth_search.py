@@ -9,6 +9,7 @@ depths, which are all returned.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,17 +25,24 @@ MIN_ALIKE = 2  # photographs that show the surroundings alike at a further depth
 MOST = 8  # depths that are returned; two would do to see that a pattern is repeated
 
 
+@dataclass(frozen=True)
+class SearchedRay:
+    """The ray of an image point, and where on it a surface may be."""
+
+    image: int  # index of the photograph
+    xy: FloatArray  # image point, px, (2,)
+    normal: FloatArray  # normal of the surface, towards the photograph, (3,)
+    nearest: float  # smallest depth along the axis of the photograph, object unit
+    farthest: float  # largest depth, object unit
+
+
 def search_depths(
     template: AnyArray,
     others: Mapping[int, AnyArray],
     estimate: Estimate,
     camera: IntArray,
-    i: int,
-    xy: FloatArray,
+    searched: SearchedRay,
     *,
-    normal: FloatArray,
-    nearest: float,
-    farthest: float,
     window_px: int,
 ) -> FloatArray:
     """Return the object points on a ray whose surroundings other photographs show alike, the best first.
@@ -46,21 +54,18 @@ def search_depths(
         others: other photographs, by their index, (H, W).
         estimate: orientation of all photographs, good to REACH_PX.
         camera: index of the camera of each photograph, (m,).
-        i: index of the photograph of the ray.
-        xy: image point of the ray, px, (2,).
-        normal: normal of the surface, towards the photograph, (3,).
-        nearest: smallest depth along the axis of the photograph, object unit.
-        farthest: largest depth, object unit.
+        searched: the ray.
         window_px: odd side of the windows.
 
     Returns:
         Object points, (p, 3).
     """
+    i, xy, normal = searched.image, searched.xy, searched.normal
     (ray,) = ray_directions(tangents_from_pixel(estimate.cameras[camera[i]], xy[None]), estimate.rotation[i])
 
     def on_ray(count: int) -> FloatArray:
         # equal steps in 1 / depth are nearly equal steps in the image
-        depth = 1 / np.linspace(1 / nearest, 1 / farthest, count)
+        depth = 1 / np.linspace(1 / searched.nearest, 1 / searched.farthest, count)
         return np.asarray(estimate.position[i] + depth[:, None] * ray)
 
     def path(j: int, points: FloatArray) -> FloatArray:

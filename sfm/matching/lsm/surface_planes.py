@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.matching.lsm.patch_equations import linear_part
-from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
 from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
@@ -159,9 +159,8 @@ def match_where_plane(
     good = LsmMatches(**{field.name: getattr(matches, field.name)[rows] for field in fields(matches)})
     sides, by_size = [window_px], [good]
     while len(rows) and (side := int(SIDE_RATIO * sides[-1]) | 1) >= MIN_WINDOW_PX:
-        smaller = match_lsm(
-            left, right, xy_left[rows], start, window_px=side, interpolation=interpolation, start=linear
-        )
+        settings = LsmSettings(window_px=side, interpolation=interpolation)
+        smaller = match_lsm(left, right, xy_left[rows], start, settings, start=linear)
         start[smaller.good], linear[smaller.good] = (
             smaller.xy[smaller.good],
             linear_part(smaller.warp[smaller.good]),

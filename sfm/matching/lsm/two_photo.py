@@ -45,7 +45,7 @@ from sfm.matching.lsm.patch_equations import (
     resample_patch,
 )
 from sfm.matching.radiometry import Grey, grey_of, odd_window
-from sfm.model.arguments import checked_arguments
+from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -101,21 +101,39 @@ class LsmMatches:
         return np.asarray(self.flag == 0)
 
 
+@checked_fields
+@dataclass(frozen=True)
+class LsmSettings:
+    """Settings of least squares matching."""
+
+    model: str = "affine"
+    """shift (2), tilt (4), affine (6) or projective (8 parameters), each with gain and offset. The tilt of a
+    plane is all that is unknown of its warp in oriented photographs."""
+    window_px: int = 21  # odd side of the template
+    interpolation: str = "six_tap"
+    """kernel for the right photograph. On fine texture the standard deviation is 1.25 times that of six_tap
+    with bilinear, and 1.06 times with bicubic. If the whole patch is shifted by the same 0.1 to 0.4 px, both
+    are off by up to 0.013 px, six_tap by 0.002 px."""
+    stop_px: float = 0.0002
+    """the steps end when the next shift would be shorter than this. The remaining shift has the direction of
+    the start, which neighbouring points share: 0.002 px would rotate photographs."""
+    max_steps: int = 30  # a patch that needs more steps counts as diverged
+    max_shift_px: float = 5.0  # largest distance from the start
+    min_correlation: float = 0.5  # smallest r of a match
+    blur: bool = False
+    """whether three more unknowns describe the difference of blur between the photographs. On an oblique
+    surface the blur always differs, since a pixel covers more of it. Without these unknowns, windows move by
+    0.01 px, in the same way in all matches of a template."""
+
+
 @checked_arguments(xy_left="k 2", xy_right="n 2")
 def match_lsm(
     left: AnyArray | Grey,
     right: AnyArray | Grey,
     xy_left: FloatArray,
     xy_right: FloatArray,
+    settings: LsmSettings = LsmSettings(),
     *,
-    model: str = "affine",
-    window_px: int = 21,
-    interpolation: str = "six_tap",
-    stop_px: float = 0.0002,
-    max_steps: int = 30,
-    max_shift_px: float = 5.0,
-    min_correlation: float = 0.5,
-    blur: bool = False,
     start: FloatArray | None = None,
     along: FloatArray | None = None,
     threads: int = 1,
@@ -127,20 +145,7 @@ def match_lsm(
         right: the other photograph.
         xy_left: points in the left photograph, px, any fraction, (k, 2).
         xy_right: approximate positions of these points in the right photograph, px, (k, 2).
-        model: shift (2), tilt (4), affine (6) or projective (8 parameters), each with gain and offset. The
-            tilt of a plane is all that is unknown of its warp in oriented photographs.
-        window_px: odd side of the template.
-        interpolation: kernel for the right photograph. On fine texture the standard deviation is 1.25 times
-            that of six_tap with bilinear, and 1.06 times with bicubic. If the whole patch is shifted by the
-            same 0.1 to 0.4 px, both are off by up to 0.013 px, six_tap by 0.002 px.
-        stop_px: the steps end when the next shift would be shorter than this. The remaining shift has the
-            direction of the start, which neighbouring points share: 0.002 px would rotate photographs.
-        max_steps: a patch that needs more steps counts as diverged.
-        max_shift_px: largest distance from the start.
-        min_correlation: smallest r of a match.
-        blur: whether three more unknowns describe the difference of blur between the photographs. On an
-            oblique surface the blur always differs, since a pixel covers more of it. Without these unknowns,
-            windows move by 0.01 px, in the same way in all matches of a template.
+        settings: geometric model, window, interpolation, end of the steps, and limits of a match.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model keeps; by default the unit matrix.
         along: for tilt: directions of the epipolar lines in the left photograph, of any length, (k, 2); a
@@ -157,14 +162,15 @@ def match_lsm(
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
     Computer and Robot Vision II, ch. 16; the inverse form is Baker and Matthews (2004), IJCV 56(3).
     """
+    model = settings.model
     if model not in MODELS:
         raise GeometryError(f"LSM: model '{model}', expected one of {', '.join(MODELS)}")
-    kind = interpolation_index(interpolation)
+    kind = interpolation_index(settings.interpolation)
     if kind < BILINEAR:
         raise GeometryError(
             "LSM: interpolation 'nearest' has no gradient, expected one of bilinear, bicubic, six_tap"
         )
-    half = odd_window("LSM", window_px) // 2
+    half = odd_window("LSM", settings.window_px) // 2
     a = np.ascontiguousarray(xy_left, dtype=float).reshape(-1, 2)
     b = np.ascontiguousarray(xy_right, dtype=float).reshape(-1, 2)
     k = len(a)
@@ -186,11 +192,28 @@ def match_lsm(
     warp[:, 2, 2] = 1.0
     warp[:, :2] += b[:, :, None] * warp[:, 2, None]
     out = np.zeros((k, OUTPUTS))
-    fixed = (grey_of(left), grey_of(right), half, kind, MODELS[model], BLUR if blur else 0)
-    limits = Limits(float(stop_px), int(max_steps), float(max_shift_px), float(min_correlation))
+    grey_left, grey_right, blurred = grey_of(left), grey_of(right), BLUR if settings.blur else 0
+    limits = Limits(
+        float(settings.stop_px),
+        int(settings.max_steps),
+        float(settings.max_shift_px),
+        float(settings.min_correlation),
+    )
 
     def work(part: slice) -> None:
-        _match_all(*fixed, limits, a[part], lines[part], warp[part], out[part])
+        _match_all(
+            grey_left,
+            grey_right,
+            half,
+            kind,
+            MODELS[model],
+            blurred,
+            limits,
+            a[part],
+            lines[part],
+            warp[part],
+            out[part],
+        )
 
     if threads > 1:
         with ThreadPoolExecutor(threads) as pool:

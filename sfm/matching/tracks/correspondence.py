@@ -27,7 +27,7 @@ from sfm.matching.tracks.evidence import (
     prune,
     same_target,
 )
-from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.arguments import check_indices, checked_arguments, checked_fields
 from sfm.model.camera import Camera, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
@@ -55,6 +55,18 @@ class Correspondences:
         return np.bincount(self.point, minlength=len(self.points))
 
 
+@checked_fields
+@dataclass(frozen=True)
+class TargetLimits:
+    """Limits of the search for targets that belong together."""
+
+    max_size_ratio: float = 1.6  # largest ratio of two diameters on the object for one target
+    min_angle_deg: float = 5.0  # smallest angle of two rays that may start a point
+    max_partners: int = 20  # photographs with which each one is paired to start points
+    max_false: float = 0.1
+    """largest number of chance points, expected among all hypotheses, for a point to be accepted"""
+
+
 @checked_arguments(camera="m")
 def match_targets(
     estimate: Estimate,
@@ -65,10 +77,7 @@ def match_targets(
     min_rays: int = 3,
     kinds: Sequence[IntArray] | None = None,
     diameters_px: Sequence[FloatArray] | None = None,
-    max_size_ratio: float = 1.6,
-    min_angle_deg: float = 5.0,
-    max_partners: int = 20,
-    max_false: float = 0.1,
+    limits: TargetLimits = TargetLimits(),
 ) -> Correspondences:
     """Match unlabelled targets across all oriented photographs at once and intersect their points.
 
@@ -82,10 +91,7 @@ def match_targets(
         kinds: only targets with the same number match (such as dark and bright), m arrays (k_i,).
         diameters_px: diameters of the targets, m arrays (k_i,). If given, only targets with equal sizes on
             the object match.
-        max_size_ratio: largest ratio of two diameters on the object for one target.
-        min_angle_deg: smallest angle of two rays that may start a point.
-        max_partners: number of photographs with which each one is paired to start points.
-        max_false: largest number of chance points, expected among all hypotheses, for a point to be accepted.
+        limits: further limits of the search.
 
     Returns:
         The correspondences; points are ordered by their first photograph and target.
@@ -120,7 +126,9 @@ def match_targets(
     check_indices("match_targets: camera", camera, len(estimate.cameras))
     if min_rays < 2:
         raise GeometryError(f"matching: min_rays is {min_rays}, an object point needs at least 2 rays")
-    scene, unusable = _scene(estimate, camera, targets, kinds, diameters_px, tolerance_px, max_size_ratio)
+    scene, unusable = _scene(
+        estimate, camera, targets, kinds, diameters_px, tolerance_px, limits.max_size_ratio
+    )
     # pairs of photographs: each with the nearest ones taken from another position
     index = np.flatnonzero(estimate.oriented)
     base = np.linalg.norm(estimate.position[index][:, None] - estimate.position[index][None], axis=2)
@@ -129,7 +137,7 @@ def match_targets(
     near = {
         (min(i, int(j)), max(i, int(j)))
         for i in range(len(index))
-        for j in order[i, : min(max_partners, int(apart[i].sum()))]
+        for j in order[i, : min(limits.max_partners, int(apart[i].sum()))]
     }
     pairs = index[np.array(sorted(near), dtype=np.int64).reshape(-1, 2)]
     search = _Search(
@@ -137,12 +145,12 @@ def match_targets(
         np.repeat(np.arange(m), np.diff(scene.first)),
         pairs,
         essential_matrices(estimate.position, estimate.rotation, pairs),
-        math.cos(math.radians(min_angle_deg)),
+        math.cos(math.radians(limits.min_angle_deg)),
         unusable,
         [],
         [],
     )
-    while _take_best(search, max(3, min_rays), math.log(max_false)):
+    while _take_best(search, max(3, min_rays), math.log(limits.max_false)):
         pass
     if min_rays == 2:
         _take_lone_pairs(search)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.matching.correlation import MIN_CORRELATION
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks.features import (
     EPIPOLAR_PX,
@@ -32,7 +32,7 @@ from sfm.matching.tracks.features import (
     overlapping_pairs,
 )
 from sfm.matching.tracks.interest import NaturalPoints
-from sfm.model.arguments import checked_arguments
+from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -73,15 +73,23 @@ class TiePoints:
         return len(self.image)
 
 
+@checked_fields
+@dataclass(frozen=True)
+class TrackSettings:
+    """Settings of the measurement of natural points in several photographs."""
+
+    window_px: int = WINDOW_PX  # odd side of the window of least squares matching
+    min_rays: int = 3  # fewest photographs per point
+    min_image_points: int = 0  # a photograph with fewer image points also receives its points with two rays
+    min_correlation: float = MIN_CORRELATION  # smallest coefficient r of a match
+
+
 @checked_arguments()
 def find_tie_points(
     photographs: Sequence[AnyArray],
     natural: Sequence[NaturalPoints],
+    settings: TrackSettings = TrackSettings(),
     *,
-    window_px: int = WINDOW_PX,
-    min_rays: int = 3,
-    min_image_points: int = 0,
-    min_correlation: float = MIN_CORRELATION,
     seed: int = 0,
     threads: int = 1,
     known: Matches | None = None,
@@ -92,10 +100,7 @@ def find_tie_points(
     Args:
         photographs: m photographs, (H, W), 8 or 16 bit, grey or colour.
         natural: the result of `natural_points` for each of them.
-        window_px: odd side of the window of least squares matching.
-        min_rays: fewest photographs per point.
-        min_image_points: a photograph with fewer image points also receives its points with two rays.
-        min_correlation: smallest coefficient r of a match.
+        settings: windows, and what a point needs.
         seed: seed of the random samples.
         threads: number of pairs of photographs matched at the same time.
         known: see `link_features`.
@@ -115,30 +120,29 @@ def find_tie_points(
             f"find_tie_points: {counted(len(photographs), 'photograph')} and natural points of "
             f"{len(natural)}, expected those of each"
         )
-    m, fewest = len(photographs), min_rays if min_image_points == 0 else min(2, min_rays)
+    m, fewest = len(photographs), settings.min_rays
+    if settings.min_image_points:
+        fewest = min(2, fewest)
     tracks = link_features(
         natural, min_rays=fewest, seed=seed, threads=threads, known=known, neighbours=neighbours
     )
-    kept = _needed(tracks.image, tracks.point, m, min_rays, min_image_points)
+    kept = _needed(tracks.image, tracks.point, m, settings)
     _, point = np.unique(tracks.point[kept], return_inverse=True)
     return measure_tracks(
         photographs,
         natural,
         Tracks(tracks.image[kept], tracks.feature[kept], point.ravel(), tracks.still),
-        window_px=window_px,
-        min_rays=min_rays,
-        min_image_points=min_image_points,
-        min_correlation=min_correlation,
+        settings,
         threads=threads,
     )
 
 
-def _needed(image: IntArray, point: IntArray, m: int, min_rays: int, min_image_points: int) -> BoolArray:
+def _needed(image: IntArray, point: IntArray, m: int, settings: TrackSettings) -> BoolArray:
     """Return which image points belong to points with enough rays, or with two where needed, (k,)."""
     n = int(point.max(initial=-1)) + 1
     rays = np.bincount(point, minlength=n)
-    enough = rays >= min_rays
-    scarce = np.bincount(image[enough[point]], minlength=m) < min_image_points
+    enough = rays >= settings.min_rays
+    scarce = np.bincount(image[enough[point]], minlength=m) < settings.min_image_points
     enough |= (rays >= 2) & (np.bincount(point[scarce[image]], minlength=n) > 0)
     return np.asarray(enough[point])
 
@@ -297,11 +301,8 @@ def measure_tracks(
     photographs: Sequence[AnyArray],
     natural: Sequence[NaturalPoints],
     tracks: Tracks,
+    settings: TrackSettings = TrackSettings(),
     *,
-    window_px: int = WINDOW_PX,
-    min_rays: int = 3,
-    min_image_points: int = 0,
-    min_correlation: float = MIN_CORRELATION,
     threads: int = 1,
 ) -> TiePoints:
     """Measure the points of tracks by least squares matching from their references.
@@ -314,17 +315,17 @@ def measure_tracks(
         photographs: m photographs.
         natural: natural points of each photograph; corners near features replace their positions.
         tracks: the features that belong to each point.
-        window_px: odd side of the window of least squares matching.
-        min_rays: fewest photographs per point.
-        min_image_points: see `find_tie_points`.
-        min_correlation: smallest coefficient r of a match.
+        settings: windows, and what a point needs.
         threads: number of pairs of photographs matched at the same time.
     """
     xy = _values_of_tracks([points.xy for points in natural], tracks)
     scale = _values_of_tracks([points.scale for points in natural], tracks)
     angle = _values_of_tracks([points.angle for points in natural], tracks)
     n = int(tracks.point.max(initial=-1)) + 1
-    reference = _middle_scale(tracks.point, scale, n)
+    order = np.lexsort([scale, tracks.point])
+    first = np.searchsorted(tracks.point[order], np.arange(n))
+    count = np.bincount(tracks.point, minlength=n)
+    reference = np.asarray(order[first + count // 2])  # the larger of two scales
     position = xy[reference].copy()
     for i, points in enumerate(natural):
         of_reference = np.flatnonzero(tracks.image[reference] == i)
@@ -345,6 +346,8 @@ def measure_tracks(
         np.column_stack([tracks.image[ref], tracks.image])[others], axis=0, return_inverse=True
     )
 
+    windows = LsmSettings(window_px=settings.window_px, min_correlation=settings.min_correlation)
+
     def match(number: int) -> None:
         i, j = pairs[number].tolist()
         rows = others[of_pair[number]]
@@ -353,9 +356,8 @@ def measure_tracks(
             grey[j],
             position[tracks.point[rows]],
             start[rows],
-            window_px=window_px,
+            windows,
             start=A[rows],
-            min_correlation=min_correlation,
         )
         measured[rows], covariance[rows] = matched.xy, matched.covariance / 2
         back = np.linalg.inv(matched.warp[:, :2, :2])
@@ -373,7 +375,7 @@ def measure_tracks(
             covariance[reference, a, b] = total / np.maximum(matched, 1)
     measured[reference] = position
     keep = np.flatnonzero(np.isfinite(measured).all(axis=1))
-    needed = _needed(tracks.image[keep], tracks.point[keep], len(photographs), min_rays, min_image_points)
+    needed = _needed(tracks.image[keep], tracks.point[keep], len(photographs), settings)
     keep = keep[needed]
     _, point = np.unique(tracks.point[keep], return_inverse=True)
     kept = np.unique(tracks.point[keep])
@@ -391,14 +393,6 @@ def _values_of_tracks(values: Sequence[FloatArray], tracks: Tracks) -> FloatArra
     """Return the values of the features of tracks, from the values of m photographs, (k, ...)."""
     first = np.cumsum([0, *(len(of_photograph) for of_photograph in values)])
     return np.asarray(np.concatenate(values)[first[tracks.image] + tracks.feature])
-
-
-def _middle_scale(point: IntArray, scale: FloatArray, n: int) -> IntArray:
-    """Return for each point the row of the feature with the middle scale (the larger of two), (n,)."""
-    order = np.lexsort([scale, point])
-    first = np.searchsorted(point[order], np.arange(n))
-    count = np.bincount(point, minlength=n)
-    return np.asarray(order[first + count // 2])
 
 
 def _snapped(xy: FloatArray, corners: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import image_tangents
 from sfm.orientation.incremental.starting_pair import Start, best_start
-from sfm.orientation.intersection import intersect
+from sfm.orientation.intersection import RayLimits, intersect
 from sfm.orientation.resection.ransac import RobustResection, fewest_fitting, resect_robust
 from sfm.runtime.progress import report_step
 
@@ -255,8 +255,7 @@ class Growth:
             self.estimate.position,
             self.estimate.rotation,
             n_points=len(self.network.points),
-            tolerance=float(self.tolerance().max()),
-            min_angle_deg=MIN_ANGLE_DEG,
+            limits=RayLimits(tolerance=float(self.tolerance().max()), min_angle_deg=MIN_ANGLE_DEG),
         )
         # if a point is elsewhere in every photograph, pairs of its rays still meet by chance
         rays = np.bincount(seen.point[self.estimate.oriented[seen.image]], minlength=len(self.network.points))

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.model.arguments import checked_arguments
+from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted, listed
@@ -45,7 +45,7 @@ from sfm.orientation.incremental.poor_photographs import (
     worst_photographs,
 )
 from sfm.orientation.incremental.starting_pair import Start
-from sfm.orientation.intersection import intersect
+from sfm.orientation.intersection import RayLimits, intersect
 
 PARALLEL_SIGMAS = 4.0  # smallest ray angle, in its standard deviations, for rays that are not parallel
 MAX_COMPLETIONS = 50  # rounds of resection and intersection without given values
@@ -92,16 +92,26 @@ class NotOrientedError(GeometryError):
         return str(self.args[0])
 
 
+@checked_fields
+@dataclass(frozen=True)
+class OrientSettings:
+    """Settings of the orientation of a network."""
+
+    seed: int = 0  # of all random choices
+    start_tolerance: float = START_TOLERANCE
+    """largest residual at the start, as a fraction of the photograph's diagonal"""
+    final_tolerance_px: float = FINAL_TOLERANCE_PX
+    """smallest tolerance, px; the tolerance follows the residuals down to it"""
+    min_points: int = MIN_POINTS  # points that a photograph must share with the network, at least 4
+
+
 @checked_arguments()
 def orient(
     network: Network,
     estimate: Estimate | Sequence[Camera],
+    settings: OrientSettings = OrientSettings(),
     *,
-    seed: int = 0,
     refine: Refine | None = None,
-    start_tolerance: float = START_TOLERANCE,
-    final_tolerance_px: float = FINAL_TOLERANCE_PX,
-    min_points: int = MIN_POINTS,
     contradicting: bool = False,
     judge: Judge | None = None,
 ) -> Orientation:
@@ -111,13 +121,10 @@ def orient(
         network: the measurements, without image points of unknown object points.
         estimate: cameras with start values, or an estimate in which exterior orientation and points are given
             where known and NaN elsewhere.
-        seed: seed of all random choices.
+        settings: tolerances, and the seed of random choices.
         refine: adjusts a fully determined part of the network (without NaN) and returns it. The cameras
             passed to it have as many free parameters as the part can determine. Its result is used only if
             the image points fit better.
-        start_tolerance: largest residual at the start, as a fraction of the photograph's diagonal.
-        final_tolerance_px: smallest tolerance, px; the tolerance follows the residuals down to it.
-        min_points: number of points that a photograph must share with the network, at least 4.
         contradicting: whether points with rays that do not meet within the tolerance also get coordinates,
             for an adjustment that judges them.
         judge: returns the misfit of an estimate with knowledge other than the image points. It is called if
@@ -148,10 +155,12 @@ def orient(
             )
         estimate = empty_estimate(network, cameras)
 
+    final_tolerance_px = settings.final_tolerance_px
+
     def begin(values: Estimate, share: float = 1.0) -> Growth:
         diagonal = np.array([np.hypot(*camera.size_px) for camera in values.cameras])
-        tolerance_px = share * start_tolerance * diagonal
-        return Growth(network, values, seed, tolerance_px, max(min_points, MIN_POINTS))
+        tolerance_px = share * settings.start_tolerance * diagonal
+        return Growth(network, values, settings.seed, tolerance_px, max(settings.min_points, MIN_POINTS))
 
     def grow(values: Estimate) -> Orientation:
         growth = begin(values)
@@ -179,6 +188,19 @@ def orient(
         given = Start(None, "given", kept.estimate.position, kept.estimate.rotation, kept.estimate.points)
         oriented = _finish(growth, given, estimate.cameras, contradicting=contradicting)
         return replace(oriented, remarks=(*oriented.remarks, *kept.replaced))
+    return _with_or_without_given(network, estimate, grow)
+
+
+def _with_or_without_given(
+    network: Network, estimate: Estimate, grow: Callable[[Estimate], Orientation]
+) -> Orientation:
+    """Return the orientation that starts from given values, or the one without them if it orients more.
+
+    Args:
+        network: the measurements.
+        estimate: cameras and given values.
+        grow: orients the network from an estimate.
+    """
     try:
         with_given = grow(estimate)
     except GeometryError:
@@ -456,7 +478,13 @@ def intersect_remaining(growth: Growth, *, contradicting: bool) -> tuple[tuple[s
     tolerance = float(growth.tolerance().max())
     for limit in (tolerance, np.inf) if contradicting else (tolerance,):
         intersection = intersect(
-            uv, seen.image, seen.point, estimate.position, estimate.rotation, n_points=n, tolerance=limit
+            uv,
+            seen.image,
+            seen.point,
+            estimate.position,
+            estimate.rotation,
+            n_points=n,
+            limits=RayLimits(tolerance=limit),
         )
         # beyond the precision of the rays and the tolerance of the orientation; False where NaN
         clear = intersection.angle > np.maximum(PARALLEL_SIGMAS * np.sqrt(2) * worst, tolerance)

@@ -20,7 +20,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of
 from sfm.model.similarity import fit_similarity
 from sfm.orientation.image_rays import PLANAR_POINTS, image_tangents
-from sfm.orientation.intersection import intersect
+from sfm.orientation.intersection import RayLimits, intersect
 from sfm.orientation.relative import RelativeOrientation, model_points, relative_orientations
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.runtime.progress import report_step
@@ -331,7 +331,7 @@ def _support(
         position,
         rotation,
         n_points=len(network.points),
-        tolerance=float(tolerance.max()),
+        limits=RayLimits(tolerance=float(tolerance.max())),
     )
     squares = np.sum(again.residuals**2, axis=1) / tolerance[seen.image[usable]] ** 2
     score = float(np.sum(1 - np.minimum(squares[np.isfinite(squares)], 1.0)))

@@ -17,7 +17,7 @@ from sfm.files.globs import why_no_folder
 from sfm.matching.lsm.coverage import MAX_COST_RATIO, plane_warps, points_apart
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import planes_at
-from sfm.matching.lsm.two_photo import match_lsm
+from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import MEMORY_BYTES, Grey, GreyPhotographs, grey_of, shrink_photograph
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.errors import PhotographError, SurveyFileError
@@ -134,10 +134,10 @@ def match_windows(
                 photographs.grey(j),
                 place[to],
                 seen.xy[to] + moved[some],
-                window_px=window_px,
                 start=warp[some],
-                max_shift_px=limits.shift_px,
-                min_correlation=limits.correlation,
+                settings=LsmSettings(
+                    window_px=window_px, max_shift_px=limits.shift_px, min_correlation=limits.correlation
+                ),
             )
             flag[to] = match.flag
             good = match.good

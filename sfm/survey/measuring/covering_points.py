@@ -20,7 +20,7 @@ from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
-from sfm.matching.lsm.two_photo import LsmMatches, match_lsm
+from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
 from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
@@ -247,13 +247,15 @@ def match_squares(
             photographs[j],
             squares.xy[rows[fits]],
             at[fits],
-            model=windows.model,
-            window_px=windows.side_px,
             start=warp[fits],
             along=along,
-            max_shift_px=max_shift_px,
-            min_correlation=MIN_CORRELATION,
-            blur=True,
+            settings=LsmSettings(
+                model=windows.model,
+                window_px=windows.side_px,
+                max_shift_px=max_shift_px,
+                min_correlation=MIN_CORRELATION,
+                blur=True,
+            ),
         )
         good = match.good
         if both_ways:
@@ -320,12 +322,11 @@ def _returning(
         template,
         match.xy[rows],
         xy[rows],
-        model=windows.model,
-        window_px=windows.side_px,
         start=np.asarray(np.linalg.inv(linear)),
         along=np.einsum("kab,kb->ka", linear, along[rows]),
-        min_correlation=MIN_CORRELATION,
-        blur=True,
+        settings=LsmSettings(
+            model=windows.model, window_px=windows.side_px, min_correlation=MIN_CORRELATION, blur=True
+        ),
     )
     off = back.xy - xy[rows]
     square = np.einsum("ka,kab,kb->k", off, np.linalg.inv(back.covariance), off)

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm.matching.correlation import MAX_R, ambiguous, independent_pixels
 from sfm.matching.lsm.coverage import CoveredPixels, Windows
-from sfm.matching.lsm.depth_search import search_depths
+from sfm.matching.lsm.depth_search import SearchedRay, search_depths
 from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, planes_at
 from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
@@ -160,11 +160,7 @@ def _along_rays(
             others,
             estimate,
             camera,
-            i,
-            place,
-            normal=across,
-            nearest=NEAREST * float(depth.min()),
-            farthest=FARTHEST * float(depth.max()),
+            SearchedRay(i, place, across, NEAREST * float(depth.min()), FARTHEST * float(depth.max())),
             window_px=window_px,
         )
         for place, across in zip(xy, normal, strict=True)

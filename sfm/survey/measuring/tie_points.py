@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.radiometry import full_scale, grey_of
-from sfm.matching.tracks.feature_tracks import Matches, TiePoints, find_tie_points
+from sfm.matching.tracks.feature_tracks import Matches, TiePoints, TrackSettings, find_tie_points
 from sfm.matching.tracks.features import MIN_PAIR_MATCHES, PARTNERS
 from sfm.matching.tracks.interest import NaturalPoints, natural_points
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -108,12 +108,14 @@ def tie_photographs(
         tied = find_tie_points(
             pictures,
             natural,
-            window_px=settings.window_px,
-            min_rays=min(MIN_RAYS, len(read)),
-            min_image_points=min_image_points,
             threads=jobs,
             known=matches,
             neighbours=neighbours,
+            settings=TrackSettings(
+                window_px=settings.window_px,
+                min_rays=min(MIN_RAYS, len(read)),
+                min_image_points=min_image_points,
+            ),
         )
         shown = masks.visible_points(names, [one.size_px for one in metadata], tied.image, tied.xy)
         return tied if shown.all() else _shown_tie_points(tied, shown)

@@ -20,7 +20,7 @@ from sfm.model.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_n
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.incremental.growth import residual_lengths
 from sfm.orientation.incremental.sequence import Orientation
-from sfm.orientation.intersection import intersect
+from sfm.orientation.intersection import RayLimits, intersect
 from sfm.runtime.progress import reported
 from sfm.survey.circles import check_circles
 from sfm.survey.diagnosis.contradicting_codes import (
@@ -139,7 +139,7 @@ def _without_contested(
             position,
             rotation,
             n_points=1,
-            tolerance=MIN_TOLERANCE_PX / c_px,
+            limits=RayLimits(tolerance=MIN_TOLERANCE_PX / c_px),
         ).points[0]
     return replace(estimate, points=points)
 
