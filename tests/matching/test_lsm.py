@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -235,6 +236,9 @@ def test_bad_input_is_refused_in_one_line() -> None:
     photograph, at = np.full((60, 60), MEAN), np.array([[30.0, 30.0]])
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(window_px=20))
+    wrong: dict[str, Any] = {"window_px": "21"}
+    with pytest.raises(GeometryError, match="LsmSettings: window_px is .*, expected a whole number"):
+        LsmSettings(**wrong)
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="helmert"))
     with pytest.raises(GeometryError, match=r"epipolar lines of shape \(0,\), needed \(1, 2\) for a tilt"):

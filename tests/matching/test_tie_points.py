@@ -407,9 +407,9 @@ def test_a_photograph_that_has_enough_points_needs_none_of_two_rays() -> None:
     """Of a point of three and one of two, photographs 0 and 1 see both."""
     image, point = np.array([0, 1, 2, 0, 1]), np.array([0, 0, 0, 1, 1])
     for fewest, kept in ((0, 3), (1, 3), (2, 5)):
-        assert _needed(image, point, 3, 3, fewest).sum() == kept
+        assert _needed(image, point, 3, TrackSettings(min_image_points=fewest)).sum() == kept
     image = np.array([0, 1, 2, 2, 3])  # photograph 3 has no other
-    assert _needed(image, point, 4, 3, 1).all()
+    assert _needed(image, point, 4, TrackSettings(min_image_points=1)).all()
 
 
 def test_matches_that_do_not_come_back_are_refused() -> None:
