@@ -237,7 +237,7 @@ def test_bad_input_is_refused_in_one_line() -> None:
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(window_px=20))
     wrong: dict[str, Any] = {"window_px": "21"}
-    with pytest.raises(GeometryError, match="LsmSettings: window_px is .*, expected a whole number"):
+    with pytest.raises(GeometryError, match=r"LsmSettings: window_px is .*, expected a whole number"):
         LsmSettings(**wrong)
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="helmert"))
