@@ -22,7 +22,8 @@ from benchmarks import textured_scenes
 from benchmarks.textured_scenes import PIXEL_MM, RIPPLES, TexturedScene, intensities, surface_at
 from datasets.textured import render
 from sfm.matching import conjugate
-from sfm.matching.conjugate import MatchSettings, affinities_around, match_points
+from sfm.matching.conjugate import affinities_around, match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.model.camera import camera_from_values, project
 from sfm.model.conventions import AnyArray, FloatArray
 

@@ -20,8 +20,8 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
-from sfm.matching.conjugate import MatchSettings, match_points
-from sfm.matching.conjugate_patches import METHODS
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import METHODS, MatchSettings
 from sfm.matching.lsm.coverage import points_apart
 from sfm.matching.tracks.correspondence import match_targets
 from sfm.matching.tracks.feature_tracks import link_features

@@ -303,7 +303,7 @@ def read_peak(
 
 
 @compiled
-def _second_peak(surface: AnyArray, highest: AnyArray, bi: int, bj: int) -> float:
+def _second_peak(surface: AnyArray, highest: AnyArray, bi: int, bj: int) -> np.float32:
     """Return the highest r of a surface at a peak away from the best one, -1 if there is none.
 
     Args:

@@ -112,7 +112,7 @@ def checked_fields(cls: type[R]) -> type[R]:
                 _checked(f"{cls.__name__}: {name}", value, allowed[name])
         make(self, *args, **kwargs)
 
-    cls.__init__ = checked  # type: ignore[assignment]
+    cls.__init__ = checked  # type: ignore[method-assign]
     return cls
 
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import MatchSettings, difference_of_blur, match_points
+from sfm.matching.conjugate import difference_of_blur, match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.epipolar import epipolar_distance, essential_matrices
 from sfm.matching.lsm.surface_planes import on_surface
 from sfm.matching.tracks.correspondence import match_targets

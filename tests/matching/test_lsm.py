@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import MatchSettings, match_points
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.correlation import LsmFlag, match_ncc
 from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
 from sfm.model.conventions import AnyArray, FloatArray

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.conjugate import MatchSettings, match_points
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.correlation import NccFlag, NccLimits, ambiguous, independent_pixels, match_ncc
 from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.radiometry import (

@@ -10,8 +10,8 @@ import pytest
 from benchmarks.wide_matching import count_matches, photograph, points_and_truth, wide_scene
 from datasets.textured import render
 from sfm.matching import conjugate
-from sfm.matching.conjugate import MatchSettings, affinities_around, match_points
-from sfm.matching.conjugate_patches import ConjugatePoints
+from sfm.matching.conjugate import affinities_around, match_points
+from sfm.matching.conjugate_patches import ConjugatePoints, MatchSettings
 from sfm.matching.lsm.surface_planes import match_where_plane
 from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.tracks import feature_tracks

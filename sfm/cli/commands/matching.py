@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from sfm.files.csv_tables import read_table
-from sfm.matching.conjugate import MatchSettings, match_points
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.correlation import MIN_CORRELATION
 from sfm.model.camera import camera_from_values, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray, pixel_from_image

@@ -102,7 +102,7 @@ def match(
     """
     with loading():
         from sfm.cli.commands.matching import match_command
-        from sfm.matching.conjugate import BACK_PX
+        from sfm.matching.conjugate_patches import BACK_PX
 
     with working_on(f"{left} and {right}"):
         text, matched = match_command(

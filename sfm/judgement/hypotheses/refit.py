@@ -209,8 +209,8 @@ def shifts_of(
             zip(before.estimate.cameras, other.estimate.cameras, strict=True)
         ):
             sigma = plain.interior_sigma(k)
-            known = np.isfinite(sigma) & (sigma > 0)
-            change = np.abs((changed.parameters - camera.parameters)[known] / sigma[known])
+            determined = np.isfinite(sigma) & (sigma > 0)
+            change = np.abs((changed.parameters - camera.parameters)[determined] / sigma[determined])
             largest = max(largest, float(change.max(initial=0.0)))
         return largest, float("nan")
     sigma = np.sqrt(np.diagonal(plain.covariance.points, axis1=1, axis2=2))

@@ -97,15 +97,15 @@ def sift_features(
     sift, picture, shrink, points = _detect(eight_bit, of_shown, shrink, max_features, least)
     xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
     kept = _strongest_per_cell(xy, np.array([p.response for p in points]), picture.shape, max_features)
-    points, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
+    described, descriptor = sift.compute(picture, [points[k] for k in kept.tolist()])
     if descriptor is None:
         descriptor = np.zeros((0, 128), np.float32)
     norm = np.maximum(descriptor.sum(axis=1, keepdims=True), 1e-12)
-    xy = np.array([p.pt for p in points], dtype=float).reshape(-1, 2)
+    xy = np.array([p.pt for p in described], dtype=float).reshape(-1, 2)
     return Features(
         shrink * (xy + 0.5) - 0.5 + (shown[1].start, shown[0].start),
-        shrink * np.array([p.size for p in points], dtype=float),
-        np.radians([p.angle for p in points]),
+        shrink * np.array([p.size for p in described], dtype=float),
+        np.radians([p.angle for p in described]),
         np.sqrt(descriptor / norm),
     )
 
