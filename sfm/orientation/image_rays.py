@@ -50,7 +50,7 @@ def intersect_image_points(
     """
     uv, image = image_tangents(seen, camera, estimate.cameras), seen.image
     position, rotation = estimate.position, estimate.rotation
-    wide = np.array([of_estimate.wide_angle for of_estimate in estimate.cameras])[camera[image]]
+    wide = np.array([lens.wide_angle for lens in estimate.cameras])[camera[image]]
     if wide.any():
         position = np.concatenate([position, position[image[wide]]])
         # rotations with axis -z along the rays
@@ -72,7 +72,7 @@ def intersect_image_points(
         position,
         rotation,
         n_points=n_points,
-        limits=RayLimits(tolerance=tolerance_px / min(of_estimate.c_px for of_estimate in estimate.cameras)),
+        limits=RayLimits(tolerance=tolerance_px / min(lens.c_px for lens in estimate.cameras)),
     )
 
 

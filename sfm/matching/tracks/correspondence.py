@@ -265,7 +265,7 @@ def _scene(
     uv, kind, size = np.zeros((total, 2)), np.zeros(total, dtype=np.int64), np.zeros(total)
     unusable = np.ones(total, dtype=bool)
     c = np.array([estimate.cameras[k].c_px for k in camera])
-    windows = [_window(used) for used in estimate.cameras]
+    windows = [_window(lens) for lens in estimate.cameras]
     area, corner, cell = np.ones(m), np.zeros((m, 2)), np.ones(m)
     columns, cells = np.ones((m, 2), dtype=np.int64), np.zeros(m + 1, dtype=np.int64)
     cell_of = np.zeros(total, dtype=np.int64)

@@ -308,7 +308,7 @@ def _support(
     """
     seen = network.image_points
     determined = np.asarray(np.isfinite(start.points).all(axis=1))
-    rows = [of_one[determined[seen.point[of_one]]][:SCREEN_POINTS] for of_one in of_photograph]
+    rows = [measured[determined[seen.point[measured]]][:SCREEN_POINTS] for measured in of_photograph]
     sharing = sorted(range(len(of_photograph)), key=lambda i: (-len(rows[i]), i))
     position, rotation = start.position.copy(), start.rotation.copy()
     for i in [i for i in sharing if i not in (start.pair or ())][:SCREEN_PHOTOGRAPHS]:
