@@ -53,14 +53,14 @@ def assemble_result(
     for name, reason in (*start.failures, *matched.left_out, *solution.dropped_images):
         if name not in is_in:
             reasons.setdefault(name, reason)
-    failed = (*measured.failed, *(measured.not_in_result(*one) for one in reasons.items()))
+    failed = (*measured.failed, *(measured.not_in_result(image, reason) for image, reason in reasons.items()))
     before = (*measured.left_out, *matched.left_out_image_points)
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)
     result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
-        images_total=len(measured.images) - sum(not one.is_counted for one in failed),
+        images_total=len(measured.images) - sum(not photograph.is_counted for photograph in failed),
         failed=failed,
         adjustment=adjustment,
         code=code,
@@ -83,18 +83,18 @@ def assemble_result(
         settings=settings_by_table(survey),
         given_tests=solution.given_tests,
         other_solutions=solution.others,
-        unused_image_points=solution.unused_image_points + sum(one.image_points for one in before),
+        unused_image_points=solution.unused_image_points + sum(point.image_points for point in before),
         reject=survey.reject,
         weights=survey.adjust.weights,
         plates=_plates(survey, code),
         check_points=_check_points(survey),
         equipment=survey.equipment,
         balance_radius_mm=tuple(
-            (one.name, dict(one.balanced)["R0"]) for one in survey.cameras if one.balanced
+            (camera.name, dict(camera.balanced)["R0"]) for camera in survey.cameras if camera.balanced
         ),
         exterior_correlations=correlations,
         orientation_correlations=strong_correlations(correlations),
-        seconds=tuple(StageTime(*one) for one in clock.seconds),
+        seconds=tuple(StageTime(stage, seconds) for stage, seconds in clock.seconds),
     )
     return judge_survey(result)
 
@@ -104,8 +104,8 @@ def _plates(survey: Survey, code: IntArray) -> tuple[SeenPlate, ...]:
     plates = points_of_plates(survey.family, code)
     if not plates:
         return ()
-    sigma = [one.plate_sigma or 0.0 for one in (survey.targets, *survey.plates)]
-    return tuple(SeenPlate(*one) for one in zip(plates, sigma, strict=True))
+    sigma = [plate.plate_sigma or 0.0 for plate in (survey.targets, *survey.plates)]
+    return tuple(SeenPlate(*plate) for plate in zip(plates, sigma, strict=True))
 
 
 def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
@@ -125,7 +125,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
     Args:
         survey: the survey that was run.
     """
-    sections: list[tuple[str, Section]] = [(f"camera {one.name}", one) for one in survey.cameras]
+    sections: list[tuple[str, Section]] = [(f"camera {camera.name}", camera) for camera in survey.cameras]
     sections += [section for _, source in sources_of(survey) for section in source.settings(survey)]
     sections += [("datum", survey.datum), ("adjust", survey.adjust), ("compare", survey.compare)]
     rows = [(name, _format_values(section.model_dump())) for name, section in sections]
@@ -153,7 +153,7 @@ def _format_values(values: dict[str, Any]) -> str:
 
 def _format_value(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"[{', '.join(_format_value(one) for one in value)}]"
+        return f"[{', '.join(_format_value(part) for part in value)}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

@@ -97,7 +97,7 @@ def agree_on_turns(survey: Survey, measured: Measurements, estimate: Estimate) -
             (pairs, _common_rig(plate, measured, estimate, pairs, level))
             for pairs in _pairings(measured, int(cameras[0]), camera)
         ]
-        pairs, rig = max(tried, key=lambda one: 0 if one[1] is None else int(one[1].agrees.sum()))
+        pairs, rig = max(tried, key=lambda trial: 0 if trial[1] is None else int(trial[1].agrees.sum()))
         if rig is None:
             unsure |= np.isin(measured.network.camera, [cameras[0], camera])
             continue
@@ -132,11 +132,11 @@ def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair
         [name for name, k in zip(files.names, files.camera.tolist(), strict=True) if k == camera]
         for camera in (first, second)
     ]
-    numbers = [_numbered(some) for some in names]
+    numbers = [_numbered(of_camera) for of_camera in names]
     ways = [[(numbers[0][k], numbers[1][k]) for k in sorted(numbers[0].keys() & numbers[1].keys())]]
     if len(names[0]) == len(names[1]):
         ways.append(list(zip(*names, strict=True)))
-    return [_pairs_in(row, some) for some in ways]
+    return [_pairs_in(row, way) for way in ways]
 
 
 def _pairs_in(row: dict[str, int], names: Iterable[tuple[str, str]]) -> list[Pair]:
@@ -146,12 +146,12 @@ def _pairs_in(row: dict[str, int], names: Iterable[tuple[str, str]]) -> list[Pai
 
 def _numbered(names: Sequence[str]) -> dict[int, str]:
     """Return the names by the last number in them, without numbers that two names share."""
-    found: dict[int, list[str]] = {}
+    by_number: dict[int, list[str]] = {}
     for name in names:
         digits = re.findall(r"\d+", PurePosixPath(name).stem)
         if digits:
-            found.setdefault(int(digits[-1]), []).append(name)
-    return {number: same[0] for number, same in found.items() if len(same) == 1}
+            by_number.setdefault(int(digits[-1]), []).append(name)
+    return {number: same[0] for number, same in by_number.items() if len(same) == 1}
 
 
 def _common_rig(
@@ -173,7 +173,7 @@ def _common_rig(
             turns = rig.turn.tobytes()
             if turns not in rigs or rig.rank < rigs[turns].rank:
                 rigs[turns] = rig
-    best, *others = sorted(rigs.values(), key=lambda one: one.rank)
+    best, *others = sorted(rigs.values(), key=lambda rig: rig.rank)
     return best if _is_certain(best, others, len(seen), level) else None
 
 
@@ -198,8 +198,8 @@ class _Views:
         self.estimate = estimate
         self.cameras: list[Camera] = [estimate.cameras[k] for k in network.camera]
         rows = rows_of(network.image_points.image, len(network.images))
-        self.number = [naming.code[network.image_points.point[some]] for some in rows]
-        self.xy = [network.image_points.xy[some] for some in rows]
+        self.number = [naming.code[network.image_points.point[of_photograph]] for of_photograph in rows]
+        self.xy = [network.image_points.xy[of_photograph] for of_photograph in rows]
         # the exact plate: the approximate points do not look exactly alike turned
         plane, known = plate.plane(1.0), estimate.determined
         self.points = fit_similarity(plane[naming.code[known]], estimate.points[known]).apply(plane)
@@ -214,7 +214,7 @@ class _Views:
 
     def compare(self, pairs: Sequence[Pair], rows: IntArray, rotation: FloatArray, base: FloatArray) -> _Rig:
         """Return how the selected pairs, each in its best turn, agree with a relative orientation."""
-        found = _Rig.none(len(pairs))
+        rig = _Rig.none(len(pairs))
         R, X0 = self.estimate.rotation, self.estimate.position
         for k in rows.tolist():
             left, right = pairs[k]
@@ -222,8 +222,8 @@ class _Views:
             placed[~np.isfinite(placed)] = np.inf  # behind the camera
             away = np.linalg.norm(self.xy[right][:, None] - placed, axis=2)
             places = [(np.arange(len(away)), number[self.number[right]]) for number in self.turns]
-            misfit = [float(np.sqrt((away[one] ** 2).mean())) for one in places]
+            misfit = [float(np.sqrt((away[place] ** 2).mean())) for place in places]
             turn = int(np.argmin(misfit))
-            found.turn[k], found.misfit[k] = turn, misfit[turn]
-            found.agrees[k] = bool((away.argmin(axis=1) == places[turn][1]).all())
-        return found
+            rig.turn[k], rig.misfit[k] = turn, misfit[turn]
+            rig.agrees[k] = bool((away.argmin(axis=1) == places[turn][1]).all())
+        return rig

@@ -127,7 +127,9 @@ def _seen_twice(
     """Return which image points belong to targets with outlines in two or more oriented photographs, (k,)."""
     seen = network.image_points
     rows = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    rows &= _values_of_image_points(naming, [(found.flag & NO_CIRCLE) == 0 for found in photographs.targets])
+    rows &= _values_of_image_points(
+        naming, [(targets.flag & NO_CIRCLE) == 0 for targets in photographs.targets]
+    )
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
 
@@ -152,7 +154,7 @@ def _remark_on_unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> 
 
 
 def _remarks_on_diameters(
-    survey: Survey, points: tuple[str, ...], stated: FloatArray, found: FloatArray
+    survey: Survey, points: tuple[str, ...], stated: FloatArray, measured: FloatArray
 ) -> tuple[Remark, ...]:
     """Return remarks on stated diameters that the ellipses contradict.
 
@@ -163,7 +165,7 @@ def _remarks_on_diameters(
         survey: states which diameters apply to single targets.
         points: names of the targets, (n,).
         stated: stated radii, NaN where not stated, object unit, (n,).
-        found: radii from the ellipses, object unit, (n,).
+        measured: radii from the ellipses, object unit, (n,).
     """
     single = np.zeros(len(points), dtype=bool)
     if survey.diameters is not None:
@@ -171,7 +173,7 @@ def _remarks_on_diameters(
     remarks = []
     common = ~single & np.isfinite(stated)
     if common.any():
-        given, seen = 2 * stated[common][0], 2 * float(np.median(found[common]))
+        given, seen = 2 * stated[common][0], 2 * float(np.median(measured[common]))
         if abs(np.log(given / seen)) > np.log1p(OTHER_SIZE):
             remarks.append(
                 remark(
@@ -181,15 +183,15 @@ def _remarks_on_diameters(
                     found=(seen, survey.unit),
                 )
             )
-    differs = single & (np.abs(np.log(stated / found)) > np.log1p(OTHER_SIZE))
+    differs = single & (np.abs(np.log(stated / measured)) > np.log1p(OTHER_SIZE))
     if differs.any() and survey.diameters is not None:
-        worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / found)), np.nan)))
+        worst = int(np.nanargmax(np.where(differs, np.abs(np.log(stated / measured)), np.nan)))
         remarks.append(
             remark(
                 "diameters_differ",
                 target=points[worst],
                 stated=(2 * stated[worst], survey.unit),
-                found=(2 * found[worst], survey.unit),
+                found=(2 * measured[worst], survey.unit),
                 differing=int(differs.sum()),
                 total=int(single.sum()),
             )
@@ -215,7 +217,7 @@ def _circle_views(
     point: IntArray,
 ) -> CircleViews:
     """Return the ellipses of the selected image points, with their rays."""
-    shapes = [ellipse_shape(found.semi_axes, found.angle) for found in photographs.targets]
+    shapes = [ellipse_shape(targets.semi_axes, targets.angle) for targets in photographs.targets]
     shape = _values_of_image_points(naming, shapes)[rows]
     seen = network.image_points.select(rows)
     rotation = estimate.rotation[seen.image]

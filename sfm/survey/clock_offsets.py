@@ -47,10 +47,10 @@ def agree_on_clocks(
     if min(count, of_other) < MIN_MOMENTS or not now > then * f_isf(level, dof, dof):
         return None
     said = tuple(
-        replace(one, subjects={role: names for role, names in one.subjects.items() if role != "unsure"})
-        if one.kind == "clock_differs"
-        else one
-        for one in measured.remarks
+        replace(remark, subjects={role: names for role, names in remark.subjects.items() if role != "unsure"})
+        if remark.kind == "clock_differs"
+        else remark
+        for remark in measured.remarks
     )
     return other, replace(measured, network=network, remarks=said)
 

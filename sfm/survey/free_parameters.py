@@ -73,12 +73,12 @@ def choose_free_parameters(
         The settings with the free parameters of each camera, and the estimate. Both are unchanged if the
         survey states the free parameters of every camera.
     """
-    silent = [a for a, one in enumerate(survey.cameras) if not one.states_free]
+    silent = [a for a, camera in enumerate(survey.cameras) if not camera.states_free]
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
     alarm = survey.adjust.false_alarm
     names: Chosen = [
-        _candidates(survey, one) if a in silent else None for a, one in enumerate(survey.cameras)
+        _candidates(survey, camera) if a in silent else None for a, camera in enumerate(survey.cameras)
     ]
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
@@ -88,7 +88,7 @@ def choose_free_parameters(
     )  # fmt: skip
     settings = survey.cameras
     if images.sum() < (1 if datum == "control" else MIN_PHOTOGRAPHS):
-        names = [one if one is None else set() for one in names]
+        names = [chosen if chosen is None else set() for chosen in names]
     else:
         part, start = reduce_network(network, estimate, images, points, everything)
         alone = None
@@ -97,10 +97,12 @@ def choose_free_parameters(
         elif datum != "control":
             seen = set(silent) & set(part.camera.tolist())
             settings = tuple(
-                _with_observed_c(one, camera) if a in seen else one
-                for a, (one, camera) in enumerate(zip(settings, start.cameras, strict=True))
+                _with_observed_c(stated, camera) if a in seen else stated
+                for a, (stated, camera) in enumerate(zip(settings, start.cameras, strict=True))
             )
-            of_part = [one if a in seen else CameraSettings(name=one.name) for a, one in enumerate(settings)]
+            of_part = [
+                stated if a in seen else CameraSettings(name=stated.name) for a, stated in enumerate(settings)
+            ]
             part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
             alone = _determined_parameters(part, start, names, "free", alarm, extend=extend)
         if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
@@ -108,17 +110,17 @@ def choose_free_parameters(
             if alone is None or _has_each_c(start, names, with_control):
                 alone = with_control
         names = [
-            chosen if chosen is None else chosen - set(dict(one.weighted))
-            for one, chosen in zip(settings, alone, strict=True)
+            chosen if chosen is None else chosen - set(dict(stated.weighted))
+            for stated, chosen in zip(settings, alone, strict=True)
         ]
     cameras = tuple(
-        one if chosen is None else one.model_copy(update={"free": _in_order(one, chosen)})
-        for one, chosen in zip(settings, names, strict=True)
+        stated if chosen is None else stated.model_copy(update={"free": _in_order(stated, chosen)})
+        for stated, chosen in zip(settings, names, strict=True)
     )
     remarks = [
-        one
+        said
         for a in silent
-        for one in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
+        for said in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
     return FreeParameters(cameras, _with_free(estimate, names), tuple(remarks))
 
@@ -188,15 +190,16 @@ def _hold_undetermined(
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
-            free = [one for one in chosen or () if (a, index(one)) not in observed]
-            for name in sorted(free, key=lambda one: (_rank(one), -index(one))):
+            free = [name for name in chosen or () if (a, index(name)) not in observed]
+            for name in sorted(free, key=lambda name: (_rank(name), -index(name))):
                 now = np.inf if adjusted is None else _corner_shift(adjusted, a, name)
                 if now > reach:
                     worst, reach = (a, name), now
         if worst is None:
             return names, adjusted
         names = [
-            None if one is None else one - {worst[1]} if a == worst[0] else one for a, one in enumerate(names)
+            None if chosen is None else chosen - {worst[1]} if a == worst[0] else chosen
+            for a, chosen in enumerate(names)
         ]
     return names, None
 
@@ -204,18 +207,20 @@ def _hold_undetermined(
 def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: float) -> Adjustment | None:
     """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
-        found = adjust(part, start, datum=Datum(datum), false_alarm=false_alarm, redundancy_numbers=False)
+        adjustment = adjust(
+            part, start, datum=Datum(datum), false_alarm=false_alarm, redundancy_numbers=False
+        )
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    allowed = found.expected_defect + _defect_of_points(part, found)
-    return found if found.converged and found.defect <= allowed else None
+    allowed = adjustment.expected_defect + _defect_of_points(part, adjustment)
+    return adjustment if adjustment.converged and adjustment.defect <= allowed else None
 
 
-def _defect_of_points(part: Network, found: Adjustment) -> int:
+def _defect_of_points(part: Network, adjustment: Adjustment) -> int:
     """Return the rank defect that points with rejected rays add; it is not a defect of the cameras."""
-    rays = np.bincount(part.image_points.point[~found.rejected], minlength=len(part.points))
+    rays = np.bincount(part.image_points.point[~adjustment.rejected], minlength=len(part.points))
     known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
-    if found.datum == "control":
+    if adjustment.datum == "control":
         variance = np.diagonal(part.control.covariance, axis1=1, axis2=2)
         np.maximum.at(known, part.control.point, np.isfinite(variance).sum(axis=1))
     left = np.where(rays == 0, 3, np.where(rays == 1, 1, 0))
@@ -232,8 +237,10 @@ def _corner_shift(adjusted: Adjustment, a: int, name: str) -> float:
 def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
     """Return the estimate with the chosen parameters free; other cameras stay as they are."""
     cameras = tuple(
-        camera if one is None else replace(camera, free=np.array([name in one for name in camera.names]))
-        for camera, one in zip(estimate.cameras, names, strict=True)
+        camera
+        if chosen is None
+        else replace(camera, free=np.array([name in chosen for name in camera.names]))
+        for camera, chosen in zip(estimate.cameras, names, strict=True)
     )
     return replace(estimate, cameras=cameras)
 
@@ -249,7 +256,7 @@ def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
 
 def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int) -> list[Remark]:
     """Return the remarks on the parameters chosen for a camera."""
-    found = []
+    remarks = []
     for name, (value, sigma) in settings.weighted[:1]:
         unit = units[MODELS[settings.model].names.index(name)]
         observed = remark(
@@ -260,10 +267,10 @@ def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int)
             given=(value, unit),
             sigma=(sigma, unit),
         )
-        found.append(observed)
+        remarks.append(observed)
     if settings.free:
         freed = settings.free
-        found.append(
+        remarks.append(
             remark("parameters_chosen", camera=settings.name, parameters=freed, photographs=photographs)
         )
-    return found or [remark("interior_held", camera=settings.name, photographs=photographs)]
+    return remarks or [remark("interior_held", camera=settings.name, photographs=photographs)]

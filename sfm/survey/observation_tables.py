@@ -186,47 +186,47 @@ def bars_of(table: ObservationTable, number: int) -> list[ScaleBar]:
 def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network:
     """Return the network with those observations of tables whose points or photographs it contains."""
     added: list[TableKind] = []
-    for one, labels in zip(tables, _labels(tables), strict=True):
-        known = _known(one, network)
+    for table, labels in zip(tables, _labels(tables), strict=True):
+        known = _known(table, network)
         rows = np.flatnonzero(known)
-        number = {name: k for k, name in enumerate(_names(one, network))}
-        named = one.named
+        number = {name: k for k, name in enumerate(_names(table, network))}
+        named = table.named
         indices = [np.array([number[column[row]] for row in rows], dtype=np.int64) for column in named]
-        if issubclass(one.of, Group):
+        if issubclass(table.of, Group):
             for group, label in labels.items():
-                of_group = np.array([name == group for name in one.table.texts[0]], dtype=bool)
-                some = of_group & known
-                if some.any():
-                    points = np.stack(indices[-(len(one.of.texts) - 1) :], axis=1)[of_group[rows]]
-                    value, sigma = one.value[some], one.sigma[some]
-                    made = one.of.of_group(group, points, value, sigma, number)
+                of_group = np.array([name == group for name in table.table.texts[0]], dtype=bool)
+                usable = of_group & known
+                if usable.any():
+                    points = np.stack(indices[-(len(table.of.texts) - 1) :], axis=1)[of_group[rows]]
+                    value, sigma = table.value[usable], table.sigma[usable]
+                    made = table.of.of_group(group, points, value, sigma, number)
                     if isinstance(made, RigidFrames):
                         rest = np.flatnonzero(of_group & ~known)
                         made = replace(
                             made,
-                            hidden=tuple(one.table.texts[1][row] for row in rest),
-                            hidden_value=one.value[rest],
-                            hidden_sigma=one.sigma[rest],
+                            hidden=tuple(table.table.texts[1][row] for row in rest),
+                            hidden_value=table.value[rest],
+                            hidden_sigma=table.sigma[rest],
                         )
                     added.append(replace(made, group=label))
         elif len(rows):
-            assert issubclass(one.of, RowKind)
-            added.append(one.of.of_table(tuple(indices), one.value[rows], one.sigma[rows]))
+            assert issubclass(table.of, RowKind)
+            added.append(table.of.of_table(tuple(indices), table.value[rows], table.sigma[rows]))
     added = [kind for kind in added if len(kind)]
     return replace(network, observations=(*network.observations, *added)) if added else network
 
 
 def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
     """Return the labels of the groups of each table: "S1", and "S1 (2)" if a second table has the name."""
-    count, found = Counter[tuple[str, str]](), []
-    for one in tables:
+    count, all_labels = Counter[tuple[str, str]](), []
+    for table in tables:
         labels = {}
-        for name in dict.fromkeys(one.table.texts[0]) if issubclass(one.of, Group) else ():
-            count[one.kind, name] += 1
-            before = count[one.kind, name] > 1
-            labels[name] = f"{name} ({count[one.kind, name]})" if before else name
-        found.append(labels)
-    return found
+        for name in dict.fromkeys(table.table.texts[0]) if issubclass(table.of, Group) else ():
+            count[table.kind, name] += 1
+            before = count[table.kind, name] > 1
+            labels[name] = f"{name} ({count[table.kind, name]})" if before else name
+        all_labels.append(labels)
+    return all_labels
 
 
 def unused_observations(
@@ -236,15 +236,15 @@ def unused_observations(
     frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
-    for one, labels in zip(tables, _labels(tables), strict=True):
-        for row in np.flatnonzero(~_known(one, network)):
-            names = tuple(column[row] for column in one.table.texts)
+    for table, labels in zip(tables, _labels(tables), strict=True):
+        for row in np.flatnonzero(~_known(table, network)):
+            names = tuple(column[row] for column in table.table.texts)
             if (labels.get(names[0]), *names[1:]) not in hidden:
-                unused.append(one.name(int(row)))
+                unused.append(table.name(int(row)))
     usable = with_tables(tables, replace(network, observations=())).observations
-    for one, labels in zip(tables, _labels(tables), strict=True):
-        there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is one.of}
-        unused += [f"{one.kind} {label}" for label in labels.values() if label not in there]
+    for table, labels in zip(tables, _labels(tables), strict=True):
+        there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is table.of}
+        unused += [f"{table.kind} {label}" for label in labels.values() if label not in there]
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
     return (
         *([remark("names_missing", of="observations", names=unused)] if unused else []),
@@ -253,13 +253,13 @@ def unused_observations(
     )
 
 
-def _names(one: ObservationTable, network: Network) -> tuple[str, ...]:
+def _names(table: ObservationTable, network: Network) -> tuple[str, ...]:
     """Return the names of photographs or points that a table refers to."""
-    return network.images if one.of.texts_of == PHOTOGRAPH else network.points
+    return network.images if table.of.texts_of == PHOTOGRAPH else network.points
 
 
-def _known(one: ObservationTable, network: Network) -> BoolArray:
+def _known(table: ObservationTable, network: Network) -> BoolArray:
     """Return which observations of a table have all their points or photographs in a network, (n,)."""
-    names = set(_names(one, network))
-    known: BoolArray = np.array([[name in names for name in column] for column in one.named], dtype=bool)
+    names = set(_names(table, network))
+    known: BoolArray = np.array([[name in names for name in column] for column in table.named], dtype=bool)
     return np.asarray(known.all(axis=0))

@@ -105,20 +105,20 @@ def orient_survey(survey: Survey, measured: Measurements) -> Oriented:
     return replace(oriented, orientation=replace(start, remarks=(*start.remarks, uncertain)))
 
 
-def _models_by_other_clocks(found: Present) -> Iterator[Model]:
+def _models_by_other_clocks(present: Present) -> Iterator[Model]:
     """Yield the model with the second offset of clocks, if the cameras keep their mounts better by it."""
-    if found is not None:
-        other = agree_on_clocks(found.survey, found.measured, found.orientation.estimate)
+    if present is not None:
+        other = agree_on_clocks(present.survey, present.measured, present.orientation.estimate)
         if other is not None:
             yield other
 
 
-def _models_with_other_turns(found: Present) -> Iterator[Model]:
+def _models_with_other_turns(present: Present) -> Iterator[Model]:
     """Yield the model with the image points of plates renamed as the first camera sees them."""
-    if found is not None:
-        renamed = agree_on_turns(found.survey, found.measured, found.orientation.estimate).measured
+    if present is not None:
+        renamed = agree_on_turns(present.survey, present.measured, present.orientation.estimate).measured
         if renamed is not None:
-            yield found.survey, renamed
+            yield present.survey, renamed
 
 
 CLOCKS = Choice[Model, Present](_models_by_other_clocks)
@@ -135,27 +135,27 @@ def _orient_model(model: Model) -> Oriented:
     network = replace(
         measured.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=()
     )
-    found, wrong_c = _orient_with_best_c(survey, measured, network)
-    chosen = choose_free_parameters(survey, network, found.estimate, extend=False)
-    found, held = _hold_cameras_of_two(survey, network, replace(found, estimate=chosen.estimate))
+    orientation, wrong_c = _orient_with_best_c(survey, measured, network)
+    chosen = choose_free_parameters(survey, network, orientation.estimate, extend=False)
+    orientation, held = _hold_cameras_of_two(survey, network, replace(orientation, estimate=chosen.estimate))
     if held and len(network.images) > 2:
         held += (remark("pair_contradicted", others=len(network.images) - 2),)
     elif held:
         of_pair = {"pair": ("c",)}
-        wrong_c = tuple(replace(one, subjects={**one.subjects, **of_pair}) for one in wrong_c)
-    found = replace(found, remarks=(*found.remarks, *wrong_c, *held))
+        wrong_c = tuple(replace(said, subjects={**said.subjects, **of_pair}) for said in wrong_c)
+    orientation = replace(orientation, remarks=(*orientation.remarks, *wrong_c, *held))
     if not network.named.all():
-        moving = find_second_motion(network, found, _orient_strongest)
-        found = replace(found, remarks=(*found.remarks, *moving))
+        moving = find_second_motion(network, orientation, _orient_strongest)
+        orientation = replace(orientation, remarks=(*orientation.remarks, *moving))
     if not wrong_c:
-        second = find_second_objects(network, found, partial(orient, refine=refine))
-        failures = tuple((image, second.get(image, reason)) for image, reason in found.failures)
-        found = replace(found, failures=failures)
-    estimate = mount_cameras(survey, network, found.estimate)
+        second = find_second_objects(network, orientation, partial(orient, refine=refine))
+        failures = tuple((image, second.get(image, reason)) for image, reason in orientation.failures)
+        orientation = replace(orientation, failures=failures)
+    estimate = mount_cameras(survey, network, orientation.estimate)
     if survey.datum.kind != "control":
         estimate = place_on_observations(measured.network, estimate)
-    found = replace(found, estimate=estimate)
-    return Oriented(survey, measured, explain_lost_photographs(network, found))
+    orientation = replace(orientation, estimate=estimate)
+    return Oriented(survey, measured, explain_lost_photographs(network, orientation))
 
 
 def _orient_with_best_c(
@@ -168,23 +168,23 @@ def _orient_with_best_c(
     exact = all(source.is_exact for source in network.sources)
     orient_from = partial(_orient_on_control, measured, network, given=exact)
 
-    found, failure = None, None
+    orientation, failure = None, None
     try:
-        found = orient_from(estimate)
+        orientation = orient_from(estimate)
     except GeometryError as error:
         failure = error
         if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
             raise GeometryError(describe_codes(survey, measured.photographs)) from error
     wrong_c: tuple[Remark, ...] = ()
     if not given:
-        found, wrong_c = try_other_principal_distances(
-            network, estimate, found, orient_from, survey.adjust.false_alarm
+        orientation, wrong_c = try_other_principal_distances(
+            network, estimate, orientation, orient_from, survey.adjust.false_alarm
         )
-    if found is None:
+    if orientation is None:
         hint = " (correct or complete [approximate], or leave it out)" if given else ""
-        hint += "".join(f"; {one.text}" for one in wrong_c)
+        hint += "".join(f"; {said.text}" for said in wrong_c)
         raise GeometryError(f"{failure}{hint}") from failure
-    return found, wrong_c
+    return orientation, wrong_c
 
 
 def _orient_on_control(
@@ -205,8 +205,8 @@ def _orient_on_control(
             values.points[network.control.point] = np.nan
         return _orient_strongest(part, values, measured=measured, contradicting=given)
 
-    def without_control(found: Orientation | None) -> Iterator[Network]:
-        if len(network.control) and (found is None or not _fits(network, found)[named].all()):
+    def without_control(before: Orientation | None) -> Iterator[Network]:
+        if len(network.control) and (before is None or not _fits(network, before)[named].all()):
             yield replace(network, control=ObjectPoints())
 
     def more_fit(before: Orientation | None, after: Orientation | None) -> float:
@@ -214,26 +214,26 @@ def _orient_on_control(
             return math.inf
         return float(_fits(network, after)[named].sum() - _fits(network, before)[named].sum())
 
-    def placed(_: Orientation | None, found: Orientation | None) -> Orientation | None:
+    def placed(_: Orientation | None, after: Orientation | None) -> Orientation | None:
         with suppress(GeometryError):  # fewer than three control points, or on a line
-            if found is not None:
+            if after is not None:
                 control = network.control.complete
-                known = found.estimate.determined[control.point]
-                placing = fit_similarity(found.estimate.points[control.point[known]], control.xyz[known])
-                return replace(found, estimate=placing.apply_estimate(found.estimate))
-        return found
+                known = after.estimate.determined[control.point]
+                placing = fit_similarity(after.estimate.points[control.point[known]], control.xyz[known])
+                return replace(after, estimate=placing.apply_estimate(after.estimate))
+        return after
 
     row = Choice[Network, Orientation | None](without_control, more_fit, report=placed)
     return solve_likeliest(network, (row,), orient_part)
 
 
-def _fits(network: Network, found: Orientation) -> BoolArray:
+def _fits(network: Network, orientation: Orientation) -> BoolArray:
     """Return which image points fit an orientation within the final tolerance, (k,)."""
-    return np.asarray(residual_lengths(network, found.estimate) <= FINAL_TOLERANCE_PX)
+    return np.asarray(residual_lengths(network, orientation.estimate) <= FINAL_TOLERANCE_PX)
 
 
 def _hold_cameras_of_two(
-    survey: Survey, network: Network, found: Orientation
+    survey: Survey, network: Network, orientation: Orientation
 ) -> tuple[Orientation, tuple[Remark, ...]]:
     """Hold the free interior parameters if only two photographs are oriented, and report it.
 
@@ -243,10 +243,10 @@ def _hold_cameras_of_two(
     the stated precision. The parameters are also held where the survey does not state what is free, as in a
     drafted survey.
     """
-    estimate = found.estimate
+    estimate = orientation.estimate
     fixed = len(network.control) if survey.datum.kind == "control" else 0
     if estimate.oriented.sum() != 2 or fixed >= CONTROL_OF_CAMERA:
-        return found, ()
+        return orientation, ()
     used = np.unique(network.camera[estimate.oriented])
     remarks = []
     cameras = list(estimate.cameras)
@@ -258,7 +258,7 @@ def _hold_cameras_of_two(
         if names:
             cameras[index] = replace(camera, free=np.zeros_like(camera.free))
             remarks.append(remark("interior_held_of_pair", camera=camera.name, parameters=names))
-    return replace(found, estimate=replace(estimate, cameras=tuple(cameras))), tuple(remarks)
+    return replace(orientation, estimate=replace(estimate, cameras=tuple(cameras))), tuple(remarks)
 
 
 def _circle_judge(measured: Measurements, network: Network) -> Judge | None:
@@ -301,22 +301,22 @@ def _orient_strongest(
     if not network.named.all():
         part, start = reduce_network(network, estimate, images, _strongest(network), image_points)
     judge = None if measured is None else _circle_judge(measured, part)
-    found = orient(part, start, refine=refine, contradicting=contradicting, judge=judge)
+    orientation = orient(part, start, refine=refine, contradicting=contradicting, judge=judge)
     if part is network:
-        return found
+        return orientation
     rays = intersect_image_points(
         network.image_points,
         network.camera,
-        found.estimate,
+        orientation.estimate,
         n_points=len(network.points),
-        tolerance_px=float(found.tolerance_px.max()),
+        tolerance_px=float(orientation.tolerance_px.max()),
     )
-    estimate = replace(found.estimate, points=rays.points)
-    limit = found.tolerance_px[network.camera[network.image_points.image]]
+    estimate = replace(orientation.estimate, points=rays.points)
+    limit = orientation.tolerance_px[network.camera[network.image_points.image]]
     fits = residual_lengths(network, estimate) <= limit  # the RMS is that of the strongest points
     undetermined = set(np.array(network.points, dtype=object)[network.named & ~estimate.determined])
-    failures = tuple(failure for failure in found.point_failures if failure[0] in undetermined)
-    return replace(found, estimate=estimate, fits=fits, point_failures=failures)
+    failures = tuple(failure for failure in orientation.point_failures if failure[0] in undetermined)
+    return replace(orientation, estimate=estimate, fits=fits, point_failures=failures)
 
 
 def _strongest(network: Network) -> BoolArray:
@@ -344,15 +344,15 @@ def refine(network: Network, estimate: Estimate) -> Estimate:
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
 
 
-def _models_with_fisheyes(survey: Survey, measured: Measurements, found: Present) -> Iterator[Model]:
+def _models_with_fisheyes(survey: Survey, measured: Measurements, present: Present) -> Iterator[Model]:
     """Yield the model with fisheyes where the survey states no model, if it may be likelier."""
     wide = [a for a, camera in enumerate(survey.cameras) if not camera.states_model]
-    if found is not None and _likelihood(found)[1] >= MIN_FITTING_FRACTION * len(
+    if present is not None and _likelihood(present)[1] >= MIN_FITTING_FRACTION * len(
         measured.network.image_points
     ):
-        wide = [a for a in wide if _is_wide(found.orientation.estimate.cameras[a])]
+        wide = [a for a in wide if _is_wide(present.orientation.estimate.cameras[a])]
     if wide:
-        known = measured.cameras if found is None else found.orientation.estimate.cameras
+        known = measured.cameras if present is None else present.orientation.estimate.cameras
         yield _with_fisheyes(survey, measured, known, wide)
 
 
@@ -416,9 +416,9 @@ def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
     return camera_from_values(camera.name, FISHEYE, camera.size_px, pixel, c_mm=c_mm, free=free)
 
 
-def _likelihood(found: Oriented) -> tuple[float, int]:
+def _likelihood(oriented: Oriented) -> tuple[float, int]:
     """Return the log-likelihood of all image points, and how many of them fit."""
-    network, estimate = found.measured.network, found.orientation.estimate
+    network, estimate = oriented.measured.network, oriented.orientation.estimate
     length = residual_lengths(network, estimate)
     fits = length <= FINAL_TOLERANCE_PX
     areas = areas_of_photographs(network, estimate.cameras)

@@ -70,9 +70,11 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
     turns = np.abs(rows[:, 3:6]).max() > rounding
     attitudes = _attitudes() if turns else [np.eye(3)]  # undetermined by distances and frames
     turned = [Similarity(1.0, R, np.zeros(3)).apply_estimate(start) for R in attitudes]
-    tried = [_fitted(kinds, one, ROUGH_ROUNDS, scaled=scaled) for one in turned]
-    best = sorted(tried, key=lambda one: one[1])[:BEST]
-    return min((_fitted(kinds, one, ROUNDS, scaled=scaled) for one, _ in best), key=lambda one: one[1])[0]
+    tried = [_fitted(kinds, candidate, ROUGH_ROUNDS, scaled=scaled) for candidate in turned]
+    best = sorted(tried, key=lambda fit: fit[1])[:BEST]
+    return min(
+        (_fitted(kinds, candidate, ROUNDS, scaled=scaled) for candidate, _ in best), key=lambda fit: fit[1]
+    )[0]
 
 
 def scale_sigma(network: Network, estimate: Estimate) -> float:
@@ -112,7 +114,7 @@ def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
     """Return scale bars and tabulated observations whose points and photographs have start values."""
     tables = (kind for kind in network.observations if isinstance(kind, TableKind))
     kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
-    return [one for one in (_usable(kind, estimate) for kind in kinds) if len(one)]
+    return [usable for usable in (_usable(kind, estimate) for kind in kinds) if len(usable)]
 
 
 def _usable(kind: K, estimate: Estimate) -> K:
@@ -143,7 +145,9 @@ def _fitted(
         step /= size
         R = rotation_from_vector(step[3:6])
         estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
-        away = [_over_sigma(kind, one, estimate) for kind, one in zip(kinds, weighted, strict=True)]
+        away = [
+            _over_sigma(kind, reweighted, estimate) for kind, reweighted in zip(kinds, weighted, strict=True)
+        ]
         weighted = [
             kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over, 1.0)))
             for kind, over in zip(kinds, away, strict=True)
@@ -181,14 +185,14 @@ def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatA
 
 def _attitudes() -> list[FloatArray]:
     """Return the 24 rotations of a cube."""
-    found = []
+    rotations = []
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             R = np.zeros((3, 3))
             R[np.arange(3), list(order)] = signs
             if np.linalg.det(R) > 0:
-                found.append(R)
-    return found
+                rotations.append(R)
+    return rotations
 
 
 def place_on_exterior(network: Network, estimate: Estimate) -> Estimate:
@@ -261,7 +265,7 @@ def _by_angles(
     weight: FloatArray,
 ) -> Similarity:
     """Return the similarity whose rotation is the mean of observed angles (Horn 1987)."""
-    observed = np.stack([rotation_from_angles(*one) for one in angles])
+    observed = np.stack([rotation_from_angles(omega, phi, kappa) for omega, phi, kappa in angles])
     R = nearest_rotation(np.einsum("eab,ecb->ac", observed, estimate.rotation[image]))
     w = weight / weight.sum()
     centre_s, centre_t = w @ source, w @ target
@@ -317,8 +321,8 @@ def object_scale(network: Network, estimate: Estimate) -> float:
     known = estimate.determined[control.point]
     if known.sum() < 2:
         return float("nan")
-    given, found = control.xyz[known], estimate.points[control.point[known]]
-    spread = np.linalg.norm(found - found.mean(axis=0))
+    given, points = control.xyz[known], estimate.points[control.point[known]]
+    spread = np.linalg.norm(points - points.mean(axis=0))
     return float(np.linalg.norm(given - given.mean(axis=0)) / spread) if spread > 0 else float("nan")
 
 
@@ -348,7 +352,7 @@ def has_held_mounts(estimate: Estimate) -> bool:
 
 def mounts_give_scale(network: Network, estimate: Estimate) -> bool:
     """Return whether given mounts, held fixed or observed, contribute to the scale of a network."""
-    observed = any(isinstance(one, MountObservations) for one in network.observations)
+    observed = any(isinstance(kind, MountObservations) for kind in network.observations)
     return observed or has_held_mounts(estimate)
 
 
@@ -383,8 +387,8 @@ def place_on_frame(
     on = frame.determined if carriers is None else frame.determined & carriers
     source, target = estimate.points[on], frame.points[on]
     if on.sum() < MIN_CONTROL:
-        both = frame.oriented & estimate.oriented
-        source, target = estimate.position[both], frame.position[both]
+        oriented = frame.oriented & estimate.oriented
+        source, target = estimate.position[oriented], frame.position[oriented]
     scaled = is_scaled(network, estimate)
     keep = scaled or len(network.control.complete) == MIN_CONTROL - 1
     scale = object_scale(network, estimate) if len(network.control.complete) and not scaled else 1.0

@@ -64,13 +64,13 @@ def with_moments(survey: Survey, network: Network) -> Network:
                 )
             cameras[when].add(a)
             key[i] = (rig.name, when)
-        if moment and max(len(some) for some in cameras.values()) < 2:
-            some = listed([str(when) for when in cameras], most=3)
+        if moment and max(len(of_moment) for of_moment in cameras.values()) < 2:
+            shown = listed([str(when) for when in cameras], most=3)
             raise SurveyFileError(
-                f"{where}: no moment has photographs of two cameras; moments are {some}; correct moment"
+                f"{where}: no moment has photographs of two cameras; moments are {shown}; correct moment"
             )
-    order = {one: k for k, one in enumerate(dict.fromkeys(key))}
-    return replace(network, moment=np.array([order[one] for one in key], dtype=np.int64))
+    order = {moment: k for k, moment in enumerate(dict.fromkeys(key))}
+    return replace(network, moment=np.array([order[moment] for moment in key], dtype=np.int64))
 
 
 def planned_mounts(survey: Survey) -> Mounts:
@@ -131,14 +131,14 @@ def _moments(
                 f"{where}: moment = 'order' needs as many photographs of each camera, found {said}"
             )
         inside = [np.flatnonzero(camera == a).tolist() for a in of_rig]
-        return {i: k for some in inside for k, i in enumerate(sorted(some, key=lambda i: images[i]))}
-    pattern, found = re.compile(rig.moment), {}
+        return {i: k for rows in inside for k, i in enumerate(sorted(rows, key=lambda i: images[i]))}
+    pattern, moments = re.compile(rig.moment), {}
     for i in of_photographs:
         match = pattern.search(images[i])
         if match is None or match.group(1) is None:
             raise SurveyFileError(f"{where}: moment = '{rig.moment}' does not match photograph '{images[i]}'")
-        found[i] = match.group(1)
-    return found
+        moments[i] = match.group(1)
+    return moments
 
 
 def mount_cameras(survey: Survey, network: Network, estimate: Estimate) -> Estimate:
@@ -215,9 +215,9 @@ def split_blocks(survey: Survey, network: Network, estimate: Estimate) -> tuple[
             for a in of_rig:
                 camera = estimate.cameras[a]
                 shared = (camera.name,) * len(camera.names)
-                one = replace(camera, name=f"{camera.name} {glob}", shared=shared)
+                of_block = replace(camera, name=f"{camera.name} {glob}", shared=shared)
                 mounted.append(len(cameras) if g else a)
-                cameras[mounted[-1] : mounted[-1] + 1] = [one]
+                cameras[mounted[-1] : mounted[-1] + 1] = [of_block]
                 owner[[i for i in block if block[i] == g and network.camera[i] == a]] = mounted[-1]
     network, estimate = replace(network, camera=owner), replace(estimate, cameras=tuple(cameras))
     return network, replace(estimate, mounts=mounts_of(rigs, network, estimate))
@@ -226,7 +226,7 @@ def split_blocks(survey: Survey, network: Network, estimate: Estimate) -> tuple[
 def _blocks_of(rig: RigSettings, source: str, network: Network, of_rig: Sequence[int]) -> dict[int, int]:
     """Return the block index of each photograph of a rig, by photograph index."""
     assert network.moment is not None
-    where, found, at = f"{source}: rig {rig.name}", dict[int, int](), dict[int, int]()
+    where, block_of, at = f"{source}: rig {rig.name}", dict[int, int](), dict[int, int]()
     for i in np.flatnonzero(np.isin(network.camera, of_rig)).tolist():
         name, moment = network.images[i], int(network.moment[i])
         blocks = [g for g, glob in enumerate(rig.blocks) if fnmatch.fnmatchcase(name, glob)]
@@ -235,13 +235,13 @@ def _blocks_of(rig: RigSettings, source: str, network: Network, of_rig: Sequence
             raise SurveyFileError(
                 f"{where}: photograph '{name}' is in {many} of {listed(rig.blocks)}, needed 1"
             )
-        found[i] = blocks[0]
-        if at.setdefault(moment, found[i]) != found[i]:
+        block_of[i] = blocks[0]
+        if at.setdefault(moment, block_of[i]) != block_of[i]:
             raise SurveyFileError(f"{where}: the moment of photograph '{name}' is in two blocks, needed 1")
     for g, glob in enumerate(rig.blocks):
-        if g not in found.values():
+        if g not in block_of.values():
             raise SurveyFileError(f"{where}: block '{glob}' has no photographs")
-    return found
+    return block_of
 
 
 def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Estimate) -> Mounts:
@@ -267,8 +267,8 @@ def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Est
         known = [reference]
         names[reference] = rig
         while left:
-            pairs = {b: [(k, one) for k in known for one in _common(at, k, b)] for b in left}
-            b = max(left, key=lambda one: len(pairs[one]))
+            pairs = {b: [(k, pair) for k in known for pair in _common(at, k, b)] for b in left}
+            b = max(left, key=lambda camera: len(pairs[camera]))
             if not pairs[b]:
                 raise GeometryError(
                     f"rig {rig}: camera {cameras[b].name} is oriented at no moment together with "
@@ -321,9 +321,9 @@ def place_by_rigs(network: Network, estimate: Estimate) -> Estimate:
         by_moment.setdefault(int(network.moment[i]), int(i))
     for j in np.flatnonzero(~estimate.oriented):
         if int(network.moment[j]) in by_moment:
-            one = by_moment[int(network.moment[j])]
-            a, b = network.camera[one], network.camera[j]
-            of_rig = rotation[one] @ mounts.rotation[a].T
+            reference = by_moment[int(network.moment[j])]
+            a, b = network.camera[reference], network.camera[j]
+            of_rig = rotation[reference] @ mounts.rotation[a].T
             rotation[j] = of_rig @ mounts.rotation[b]
-            position[j] = position[one] + of_rig @ (mounts.position[b] - mounts.position[a])
+            position[j] = position[reference] + of_rig @ (mounts.position[b] - mounts.position[a])
     return replace(estimate, position=position, rotation=rotation)

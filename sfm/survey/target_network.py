@@ -75,7 +75,7 @@ def min_rays(naming: Naming) -> IntArray:
 
 def name_coded(photographs: MeasuredPhotographs) -> Naming:
     """Name the coded targets by their code; a code read twice in one photograph names nothing there."""
-    codes = [found.code for found in photographs.targets]
+    codes = [targets.code for targets in photographs.targets]
     numbers = np.unique(np.concatenate([code[code >= 0] for code in codes]))
     point = []
     for code in codes:
@@ -84,7 +84,7 @@ def name_coded(photographs: MeasuredPhotographs) -> Naming:
         named = np.full(len(code), UNNAMED)
         named[once] = np.searchsorted(numbers, code[once])
         point.append(named)
-    corners = any(bool((found.flag & Flag.CORNER).any()) for found in photographs.targets)
+    corners = any(bool((targets.flag & Flag.CORNER).any()) for targets in photographs.targets)
     names = tuple(corner_name(int(n)) if corners else str(n) for n in numbers)
     return Naming(names, numbers.astype(np.int64), tuple(point), corners)
 
@@ -94,11 +94,13 @@ def build_network(survey: Survey, photographs: MeasuredPhotographs, naming: Nami
     named = [np.flatnonzero(point != UNNAMED) for point in naming.point]
     image = np.repeat(np.arange(len(named)), [len(rows) for rows in named])
     targets = list(zip(photographs.targets, named, strict=True))
-    covariance = [image_point_covariance(found, survey.adjust.sigma_px)[rows] for found, rows in targets]
+    covariance = [
+        image_point_covariance(of_photograph, survey.adjust.sigma_px)[rows] for of_photograph, rows in targets
+    ]
     image_points = ImagePoints(
         image,
         np.concatenate([point[rows] for point, rows in zip(naming.point, named, strict=True)]),
-        np.concatenate([found.xy[rows] for found, rows in targets]),
+        np.concatenate([of_photograph.xy[rows] for of_photograph, rows in targets]),
         np.concatenate(covariance),
     )
     bars = scale_bars((*survey.scale_bars, *plate_bars(survey, naming)), naming.names)
@@ -142,9 +144,9 @@ def tag_bars(targets: TargetSettings, naming: Naming) -> ScaleBars:
         if first >= 0 and first % len(CORNERS) < 2 and first + 2 in row  # a to c and b to d
     ]
     start, end = np.array(ends, dtype=np.int64).reshape(-1, 2).T
-    one = sigma if sigma is not None else TAG_SIGMA * size
+    size_sigma = sigma if sigma is not None else TAG_SIGMA * size
     n = len(start)
-    return ScaleBars(start, end, np.full(n, np.sqrt(2) * size), np.full(n, np.sqrt(2 * n) * one))
+    return ScaleBars(start, end, np.full(n, np.sqrt(2) * size), np.full(n, np.sqrt(2 * n) * size_sigma))
 
 
 def match_uncoded(
@@ -169,29 +171,29 @@ def match_uncoded(
     known = estimate.points[coded]
     oriented = estimate.oriented
     point = []
-    for i, found in enumerate(photographs.targets):
-        named = np.full(len(found), UNNAMED)
+    for i, targets in enumerate(photographs.targets):
+        named = np.full(len(targets), UNNAMED)
         if oriented[i]:
             camera = estimate.cameras[photographs.camera[i]]
             projected = project(camera, estimate.position[i], estimate.rotation[i], known)
             named = _coinciding_points(
-                found.xy,
+                targets.xy,
                 projected,
-                found.code,
+                targets.code,
                 naming.code[coded],
                 tolerance_px,
-                MAX_SEMI_AXES * found.semi_axes[:, 0],
+                MAX_SEMI_AXES * targets.semi_axes[:, 0],
             )
         point.append(named)
     free = [np.flatnonzero(named == UNNAMED) for named in point]
     matches = match_targets(
         estimate,
         photographs.camera,
-        [found.xy[rows] for found, rows in zip(photographs.targets, free, strict=True)],
+        [targets.xy[rows] for targets, rows in zip(photographs.targets, free, strict=True)],
         tolerance_px=tolerance_px,
         min_rays=MIN_RAYS,
         diameters_px=[
-            2 * found.semi_axes[rows, 0] for found, rows in zip(photographs.targets, free, strict=True)
+            2 * targets.semi_axes[rows, 0] for targets, rows in zip(photographs.targets, free, strict=True)
         ],
     )
     for i, rows in enumerate(free):

@@ -44,7 +44,7 @@ class UnfinishedSurvey:
     @property
     def images_total(self) -> int:
         """Number of photographs of the survey, without copies and files that cannot be read."""
-        return len(self.images) - sum(not one.is_counted for one in self.failed)
+        return len(self.images) - sum(not photograph.is_counted for photograph in self.failed)
 
     @property
     def steps(self) -> tuple[str, ...]:
@@ -98,9 +98,9 @@ def unfinished_survey(
         unit=survey.unit,
         reason=str(error),
         stage=clock.last,
-        seconds=tuple(StageTime(*one) for one in clock.seconds),
+        seconds=tuple(StageTime(stage, seconds) for stage, seconds in clock.seconds),
         images=measured.images,
-        failed=(*measured.failed, *(measured.not_in_result(*one) for one in (*reasons, *left_out))),
+        failed=(*measured.failed, *(measured.not_in_result(*reason) for reason in (*reasons, *left_out))),
         network=network,
         oriented=None if estimate is None else estimate.oriented,
         determined=None if estimate is None else estimate.determined,

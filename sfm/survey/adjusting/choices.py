@@ -57,54 +57,56 @@ def solve_survey(survey: Survey, matched: Correspondences) -> SolvedSurvey:
     return choose(usual, CHOICES, solve_model, false_alarm=survey.adjust.false_alarm)
 
 
-def _models_without_copies(found: SolvedSurvey) -> Iterator[SurveyModel]:
+def _models_without_copies(solved: SolvedSurvey) -> Iterator[SurveyModel]:
     """Yield the model without the photographs whose errors are those of another one."""
-    copies = find_copies(found.adjustment)
+    copies = find_copies(solved.adjustment)
     if copies:
-        matched = found.model.matched
+        matched = solved.model.matched
         network, estimate = without_copies(matched.network, matched.estimate, copies)
         left_out = tuple(
             (name, remark("copies", original=first, same="errors of the image points"))
             for name, (first, _) in copies.items()
         )
         yield replace(
-            found.model,
+            solved.model,
             matched=replace(matched, network=network, estimate=estimate),
-            left_out=found.model.left_out + left_out,
+            left_out=solved.model.left_out + left_out,
         )
 
 
-def _models_with_varying_c(found: SolvedSurvey) -> Iterator[SurveyModel]:
+def _models_with_varying_c(solved: SolvedSurvey) -> Iterator[SurveyModel]:
     """Yield the model in which c, as texture shows, differs among the photographs of a camera."""
-    survey = found.model.survey
-    differs = any(one.kind in OF_CAMERAS and "change" in one.numbers for one in found.remarks)
-    varying = frozenset(one.name for one in survey.cameras if not one.states_free)
-    if differs and varying and found.adjustment.network.has_common_errors and not survey.rigs:
+    survey = solved.model.survey
+    differs = any(said.kind in OF_CAMERAS and "change" in said.numbers for said in solved.remarks)
+    varying = frozenset(camera.name for camera in survey.cameras if not camera.states_free)
+    if differs and varying and solved.adjustment.network.has_common_errors and not survey.rigs:
         report_step("adjusting c of each photograph")
-        yield replace(found.model, varying=varying)
+        yield replace(solved.model, varying=varying)
 
 
-def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
+def _models_free_of_rigs(solved: SolvedSurvey) -> Iterator[SurveyModel]:
     """Yield models in which photographs that contradict their rig, or lost their points to it, are free.
 
     Where all photographs of a moment lost points, the one that lost the smallest share stays. The free
     photographs of a moment keep the mounts among themselves, or each is free. The larger part of a moment
     counts as that of the rig, and of two photographs that of the reference camera.
     """
-    network, estimate = found.model.matched.network, found.model.matched.estimate
+    network, estimate = solved.model.matched.network, solved.model.matched.estimate
     stated, oriented = network.moment, estimate.oriented
     if stated is None:
         return
     seen, m = network.image_points, len(network.images)
-    known = np.isin(network.points, found.adjustment.network.points)[seen.point]
+    known = np.isin(network.points, solved.adjustment.network.points)[seen.point]
     count = np.bincount(seen.image[known], minlength=m)
-    against = np.bincount(seen.image[known & ~found.accepted], minlength=m)
+    against = np.bincount(seen.image[known & ~solved.accepted], minlength=m)
     share = np.where(oriented, against / np.maximum(count, 1), np.inf)
     least = np.full(int(stated.max()) + 1, np.inf)
     np.minimum.at(least, stated, share)
-    names = [name for one in of_kind(found.remarks, "rig_contradicted") for name in one.names("photographs")]
+    names = [
+        name for said in of_kind(solved.remarks, "rig_contradicted") for name in said.names("photographs")
+    ]
     named = np.isin(network.images, names)  # never all of a moment
-    level = found.adjustment.levels.family
+    level = solved.adjustment.levels.family
     free = oriented & (more_than_chance(against, count, level) & (share > least[stated]) | named)
     left = np.bincount(stated[oriented & ~free], minlength=len(least))
     free &= (left[stated] > 0) | named
@@ -113,15 +115,15 @@ def _models_free_of_rigs(found: SolvedSurvey) -> Iterator[SurveyModel]:
         return
     report_step("adjusting photographs free of their rig")
     together = np.where(free, stated + len(least), stated)
-    references = [rig.cameras[0] for rig in found.model.survey.rigs]
+    references = [rig.cameras[0] for rig in solved.model.survey.rigs]
     of_reference = np.isin([camera.name for camera in estimate.cameras], references)[network.camera]
     # photographs of each moment, and half of one more with the reference camera
     size = np.bincount(together, oriented * (1 + of_reference / 2), minlength=2 * len(least))
     smaller = size[: -len(least)] < size[len(least) :]
     together = np.where(smaller[stated], (together + len(least)) % (2 * len(least)), together)
-    yield _with_moments(found.model, together)
+    yield _with_moments(solved.model, together)
     if (np.bincount(together[oriented], minlength=2 * len(least))[len(least) :] > 1).any():
-        yield _with_moments(found.model, np.where(free, len(least) + np.arange(m), stated))
+        yield _with_moments(solved.model, np.where(free, len(least) + np.arange(m), stated))
 
 
 def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
@@ -149,25 +151,25 @@ def _with_moments(model: SurveyModel, moment: IntArray) -> SurveyModel:
 MAX_MOVED = 0.1
 
 
-def _models_with_one_state(found: SolvedSurvey) -> Iterator[SurveyModel]:
+def _models_with_one_state(solved: SolvedSurvey) -> Iterator[SurveyModel]:
     """Yield the model without the image points of another state of points that moved, if these are few.
 
     Of the photographs before a move and those after it, those with the middle of the sequence stay. So the
     coordinates of all points describe one state. Control and ends of bars are left to a person.
     """
-    model, network = found.model, found.model.matched.network
-    moved = tuple(one for one in of_kind(found.remarks, "points_moved") if one not in model.moved)
-    if model.survey.reject == "none" or not any(one.severity == "error" for one in moved):
+    model, network = solved.model, solved.model.matched.network
+    moved = tuple(move for move in of_kind(solved.remarks, "points_moved") if move not in model.moved)
+    if model.survey.reject == "none" or not any(move.severity == "error" for move in moved):
         return
     seen, bars, middle = network.image_points, network.scale_bars, (len(network.images) - 1) // 2
     gone, states = np.zeros(len(seen), dtype=bool), []
-    for one in moved:
-        start = network.image_index(one.names("from")[0])
+    for move in moved:
+        start = network.image_index(move.names("from")[0])
         another = seen.image >= start if middle < start else seen.image < start
-        gone |= another & np.isin(network.points, one.names("points"))[seen.point]
+        gone |= another & np.isin(network.points, move.names("points"))[seen.point]
         state = ("before" if middle < start else "after",)
-        numbers = {**one.numbers, "wrong": Quantity(0.0)}  # they shift the others no longer
-        states.append(replace(one, subjects={**one.subjects, "state": state}, numbers=numbers))
+        numbers = {**move.numbers, "wrong": Quantity(0.0)}  # they shift the others no longer
+        states.append(replace(move, subjects={**move.subjects, "state": state}, numbers=numbers))
     given = np.isin(seen.point, np.concatenate([network.control.point, bars.start, bars.end]))
     unused = model.unused + int(gone.sum())
     if gone.any() and not (gone & given).any() and unused < MAX_MOVED * (len(seen) + model.unused):
@@ -263,12 +265,12 @@ def _c_per_photograph(solved: SolvedSurvey) -> Iterator[tuple[str, list[float], 
     """Yield the name of each camera with c per photograph, the values of c, and their unit."""
     for name in sorted(solved.model.varying):
         cameras = [
-            one
-            for one in solved.adjustment.estimate.cameras
-            if one.name != name and base_name(one.name, [name]) == name
+            camera
+            for camera in solved.adjustment.estimate.cameras
+            if camera.name != name and base_name(camera.name, [name]) == name
         ]
         if cameras:
-            yield name, [float(one.parameters[0]) for one in cameras], cameras[0].units[0]
+            yield name, [float(camera.parameters[0]) for camera in cameras], cameras[0].units[0]
 
 
 FREE_OF_RIGS = Choice(_models_free_of_rigs, _gain_of_free_photographs, _further_poses)

@@ -189,8 +189,10 @@ def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
             rotation=np.where(again[:, None, None], estimate.rotation, values.rotation),
             points=np.where(values.determined[:, None], values.points, estimate.points),
         )
-        found = settle(replace(task, network=changed.network), start)
-        return replace(found, per_photograph=changed, iterations=settled.iterations + found.iterations)
+        resettled = settle(replace(task, network=changed.network), start)
+        return replace(
+            resettled, per_photograph=changed, iterations=settled.iterations + resettled.iterations
+        )
 
     def changed_cameras(settled: StableAdjustment) -> Iterator[PhotographCameras]:
         changed = find_photograph_cameras(
@@ -225,7 +227,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
         return _adjust_with_snooping(task, part, estimate, covariance=True, factor=factor, rejected=rejected)
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
-    weighted = any(is_observed(np.einsum("nii->ni", one.covariance)).any() for one in outer)
+    weighted = any(is_observed(np.einsum("nii->ni", given.covariance)).any() for given in outer)
     others = len(part.scale_bars) or len(part.interior) or len(part.observations) or weighted
     if (others or len(part.sources) > 1) and task.survey.adjust.weights == "components":
         return _adjust_with_components(adjust_part, part, task.factor)
@@ -259,10 +261,12 @@ def _readjust_until_converged(
         )
 
     first_converged = Choice[tuple[Role, ...], Adjustment](
-        lambda _: held, lambda _, found: float(found.converged), suffices=lambda _: True
+        lambda _: held, lambda _, after: float(after.converged), suffices=lambda _: True
     )
-    found = choose(ended, (first_converged,), adjust_holding)
-    return found, () if found is ended else held_to_converge(nearer.cameras, found.estimate.cameras)
+    adjustment = choose(ended, (first_converged,), adjust_holding)
+    return adjustment, () if adjustment is ended else held_to_converge(
+        nearer.cameras, adjustment.estimate.cameras
+    )
 
 
 def _adjust_with_snooping(
@@ -386,27 +390,27 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
     Returns:
         The start values, with the cameras as in `start`; None if no adjustment converges.
     """
-    found = [
-        one
-        for one in (
-            _adjust_with_cameras_held(network, one, datum)
-            for one in _start_candidates(network, start, ended, datum)
+    adjustments = [
+        adjustment
+        for adjustment in (
+            _adjust_with_cameras_held(network, candidate, datum)
+            for candidate in _start_candidates(network, start, ended, datum)
         )
-        if one
+        if adjustment
     ]
-    if not found:
+    if not adjustments:
         return None
-    best = min(found, key=lambda one: one.vPv)
+    best = min(adjustments, key=lambda adjustment: adjustment.vPv)
     return replace(best.estimate, cameras=start.cameras)
 
 
 def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[Remark, ...]:
     """Return a remark for each camera with parameters that were free before and are held now."""
     names: dict[str, tuple[str, ...]] = {}
-    for one, held in zip(before, after, strict=True):
-        lost = np.flatnonzero(one.free & ~held.free)
+    for camera, held in zip(before, after, strict=True):
+        lost = np.flatnonzero(camera.free & ~held.free)
         if len(lost):
-            names[one.owner_of(int(lost[0]))] = tuple(one.names[s] for s in lost)
+            names[camera.owner_of(int(lost[0]))] = tuple(camera.names[s] for s in lost)
     return tuple(
         remark("held_to_converge", camera=camera, parameters=parameters)
         for camera, parameters in names.items()
@@ -425,16 +429,16 @@ def _start_candidates(network: Network, start: Estimate, ended: Estimate, datum:
         centre = ended.points.mean(axis=0)
         position = centre + factor[:, None] * (ended.position - centre)
         back = replace(ended, cameras=start.cameras, position=position)
-    for one in (back, start):
-        yield one
+    for values in (back, start):
+        yield values
         if datum.kind != "control":
-            yield reverse_depth(one)
+            yield reverse_depth(values)
 
 
 def _adjust_with_cameras_held(network: Network, start: Estimate, datum: Datum) -> Adjustment | None:
     """Return the adjustment with all cameras held, damped at first; None if it does not converge."""
     values = replace(
-        start, cameras=tuple(replace(one, free=np.zeros_like(one.free)) for one in start.cameras)
+        start, cameras=tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in start.cameras)
     )
     for method, steps in (("levenberg-marquardt", DAMPED_ITERATIONS), ("gauss-newton", UNDAMPED_ITERATIONS)):
         try:
@@ -478,7 +482,7 @@ def refuse_too_few_observations(network: Network, estimate: Estimate, datum: str
     if datum == "control":
         outer = network.control.covariance, network.exterior.covariance
         variances = [np.einsum("nii->ni", covariance) for covariance in outer]
-        known = sum(int(((one == 0) | is_observed(one)).sum()) for one in variances)
+        known = sum(int(((variance == 0) | is_observed(variance)).sum()) for variance in variances)
     else:
         known = MOTIONS
     given = len(network.scale_bars) + int((network.interior.sigma > 0).sum())

@@ -128,20 +128,20 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     task, given = _with_confirmed_values(start, free, plates)
     settled = _settle_with_given(start, free, task, given)
     report_step("adjusting all observations")
-    found = _finish_from_best_start(start, settled)
-    final, settled, whole = found.adjustment, found.settled, matched.network
-    if whole.has_common_errors:
+    finished = _finish_from_best_start(start, settled)
+    final, settled, network = finished.adjustment, finished.settled, matched.network
+    if network.has_common_errors:
         report_step("estimating the errors that neighbours have in common")
         final = with_neighbours(final)
     left_out = left_out_points(
-        whole,
+        network,
         final.network.points,
         reasons=matched.point_failures,
         accepted_rays=settled.rays,
         needed=matched.min_rays,
     )
     # Natural texture has very many points; only those that had approximate values are worth a line.
-    known = set(np.array(whole.points, dtype=object)[start.estimate.determined | whole.named])
+    known = set(np.array(network.points, dtype=object)[start.estimate.determined | network.named])
     listed = tuple(point for point in left_out if point.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     stated = None if model.stated_moment is None else model.stated_moment[settled.images]
@@ -150,38 +150,38 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     return SolvedSurvey(
         model,
         final,
-        accepted_image_points(whole, final, settled.images, settled.points),
-        found.check,
+        accepted_image_points(network, final, settled.images, settled.points),
+        finished.check,
         (*model.left_out, *_dropped_photographs(start, settled)),
         (
             *start.remarks,
             *(() if settled.per_photograph is None else settled.per_photograph.remarks),
             *given.remarks,
-            *found.remarks,
+            *finished.remarks,
             *settled.held,
-            *remarks_on_solution(start.task.survey, listed, whole, final),
+            *remarks_on_solution(start.task.survey, listed, network, final),
             *posed_by_rigs(final, start.of_its_own[settled.images]),
             *remarks_on_uncalibrated(survey, final.estimate),
-            *handedness_unchecked(whole, checked=given.checks_handedness),
-            *windows_elsewhere(whole, judged.causes),
+            *handedness_unchecked(network, checked=given.checks_handedness),
+            *windows_elsewhere(network, judged.causes),
             *model.moved,
             *judged.unchecked,
             *bump_remarks(final, unit, stated),
-            *windows_elsewhere(whole, explain_rejections(final, unit=unit)),
-            *remarks_on_held_c(found.c_held, judged.causes),
+            *windows_elsewhere(network, explain_rejections(final, unit=unit)),
+            *remarks_on_held_c(finished.c_held, judged.causes),
         ),
         left_out,
         model.unused
-        + unused_image_points(whole, settled.images, np.isin(whole.points, final.network.points)),
+        + unused_image_points(network, settled.images, np.isin(network.points, final.network.points)),
         given.tests,
-        found.others,
+        finished.others,
     )
 
 
 def _points_of_plates(survey: Survey, naming: Naming, network: Network) -> tuple[tuple[str, ...], ...]:
     """Return the names of the points of each plate; empty without plates."""
     plates = points_of_plates(survey.family, naming.codes(network))
-    return tuple(tuple(network.points[j] for j in one) for one in plates)
+    return tuple(tuple(network.points[j] for j in plate) for plate in plates)
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     varying: names of the cameras with c per photograph, if c is adjusted.
     """
     network, estimate = matched.network, matched.estimate
-    tables = tuple(one for one in network.observations if not isinstance(one, MountObservations))
+    tables = tuple(kind for kind in network.observations if not isinstance(kind, MountObservations))
     network = replace(network, observations=tables)  # mounts only take part if photographs confirm them
     datum = survey.datum.kind
     unused: tuple[Remark, ...] = ()
@@ -258,7 +258,9 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     chosen = choose_free_parameters(
         survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum
     )
-    cameras = tuple(_with_c_per_photograph(one) if one.name in varying else one for one in chosen.cameras)
+    cameras = tuple(
+        _with_c_per_photograph(camera) if camera.name in varying else camera for camera in chosen.cameras
+    )
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
@@ -287,7 +289,9 @@ def _needed(network: Network) -> IntArray:
 
 def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
     """Return the settings with c per photograph, if it is adjusted."""
-    focal = tuple(one.name for one in MODELS[settings.model].parameters if one.role is Role.FOCAL)
+    focal = tuple(
+        parameter.name for parameter in MODELS[settings.model].parameters if parameter.role is Role.FOCAL
+    )
     if not set(focal) <= set(settings.free):
         return settings
     return settings.model_copy(update={"per_photograph": focal})
@@ -384,7 +388,7 @@ def _placing(start: _Prepared, free: StableAdjustment, part: Network) -> Similar
     before = scale_to_bars(network, before, start.task.datum)
     placed = reduce_network(network, before, free.images, free.points, free.accepted)[1]
     placed = place_on_observations(part, scale_to_bars(part, placed, datum))
-    places = [np.concatenate([one.points, one.position]) for one in (free.estimate, placed)]
+    places = [np.concatenate([estimate.points, estimate.position]) for estimate in (free.estimate, placed)]
     return fit_similarity(places[0], places[1])
 
 
@@ -471,8 +475,10 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
         final, iterations=settled.iterations + final.iterations, start_sigma0=settled.start_sigma0
     )
     # c that had to be held was not estimated: other values of c give other solutions
-    asked = {one.name for one in start.estimate.cameras if one.free[0]}
-    c_held = tuple(one.name for one in final.estimate.cameras if one.name in asked and not one.free[0])
+    asked = {camera.name for camera in start.estimate.cameras if camera.free[0]}
+    c_held = tuple(
+        camera.name for camera in final.estimate.cameras if camera.name in asked and not camera.free[0]
+    )
     report_step("looking for other solutions")
     starts = _solutions_of_pair(final)
     if before is not None and len(before.network.points) == len(final.network.points):
@@ -480,15 +486,15 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
 
 
-def _free_network_in_frame(before: Estimate, found: Estimate, task: Task, given: JudgedGiven) -> Estimate:
+def _free_network_in_frame(before: Estimate, free: Estimate, task: Task, given: JudgedGiven) -> Estimate:
     """Return the free network in the frame of the given values; single-ray control keeps its start values."""
     if given.placing is not None and task.datum.kind == "control":
-        found = given.placing.apply_estimate(found)
+        free = given.placing.apply_estimate(free)
     elif task.datum.kind == "control":
-        return replace(before, cameras=found.cameras)  # with per-photograph cameras, if any
+        return replace(before, cameras=free.cameras)  # with per-photograph cameras, if any
     lost = task.needed == 1  # control seen by one photograph: its given coordinates determine it
-    points = np.where((lost & ~found.determined)[:, None], before.points, found.points)
-    return replace(found, points=points)
+    points = np.where((lost & ~free.determined)[:, None], before.points, free.points)
+    return replace(free, points=points)
 
 
 def _with_given(settled: StableAdjustment) -> StableAdjustment:
@@ -541,7 +547,7 @@ def _dropped_photographs(start: _Prepared, settled: StableAdjustment) -> tuple[t
 
 def _remark_on_better_start(final: Adjustment, other: OtherSolution) -> Remark:
     """Return the remark that the network was adjusted again from a solution of smaller v'Pv."""
-    first = final.estimate.cameras[[one.name for one in final.estimate.cameras].index(other.camera)]
+    first = final.estimate.cameras[[camera.name for camera in final.estimate.cameras].index(other.camera)]
     return remark(
         "better_solution_taken",
         camera=other.camera,

@@ -36,14 +36,14 @@ MIN_SIDE_DIFFERENCE = (
 
 
 def remarks_on_solution(
-    survey: Survey, left_out: tuple[LeftOutPoint, ...], whole: Network, adjustment: Adjustment
+    survey: Survey, left_out: tuple[LeftOutPoint, ...], network: Network, adjustment: Adjustment
 ) -> tuple[Remark, ...]:
     """Return the remarks on a solution that a person must know beside the numbers.
 
     Args:
         survey: settings of the survey.
         left_out: measured points that are not in the result.
-        whole: network of all measured points.
+        network: all measured points.
         adjustment: the final adjustment.
     """
     sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
@@ -52,7 +52,7 @@ def remarks_on_solution(
     return (
         *adjustment.remarks,
         *remarks_on_left_out(
-            tuple(point for point in left_out if point.point not in missing), whole, _check_points(survey)
+            tuple(point for point in left_out if point.point not in missing), network, _check_points(survey)
         ),
         *([remark("names_missing", of="datum", names=absent)] if absent else []),
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
@@ -133,7 +133,7 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
     if given or mounts_give_scale(network, a.estimate) or not network.observations or not a.has_scale:
         return ()
     sigma = scale_sigma(network, a.estimate)
-    names = list(dict.fromkeys(one.name for one in network.observations))
+    names = list(dict.fromkeys(kind.name for kind in network.observations))
     return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
 
 
@@ -199,7 +199,7 @@ def missing_control(survey: Survey, network: Network, left_out: tuple[LeftOutPoi
 
 
 def left_out_points(
-    whole: Network,
+    network: Network,
     in_result: tuple[str, ...],
     *,
     reasons: tuple[tuple[str, Remark], ...],
@@ -209,16 +209,16 @@ def left_out_points(
     """Return the measured points that are not in a result, each with the reason.
 
     Args:
-        whole: network of all measured points.
+        network: all measured points.
         in_result: names of the points of the result.
         reasons: (name, reason) of points for which the orientation found no coordinates.
         accepted_rays: accepted rays of each point at its removal, (n,).
         needed: rays that each point needs, (n,).
     """
-    known, rays = dict(reasons), whole.rays()
+    known, rays = dict(reasons), network.rays()
     kept = set(in_result)
     out = []
-    for j, name in enumerate(whole.points):
+    for j, name in enumerate(network.points):
         if name in kept or not rays[j]:
             continue
         if rays[j] < needed[j]:
@@ -238,9 +238,9 @@ def left_out_points(
     return tuple(out)
 
 
-def unused_image_points(whole: Network, images: BoolArray, points: BoolArray) -> int:
+def unused_image_points(network: Network, images: BoolArray, points: BoolArray) -> int:
     """Return the number of image points outside the photographs, (m,), and points, (n,), of the result."""
-    seen = whole.image_points
+    seen = network.image_points
     return int((~(images[seen.image] & points[seen.point])).sum())
 
 
@@ -252,24 +252,24 @@ def _check_points(survey: Survey) -> frozenset[str]:
 
 
 def remarks_on_left_out(
-    left_out: tuple[LeftOutPoint, ...], whole: Network, checks: Collection[str] = ()
+    left_out: tuple[LeftOutPoint, ...], network: Network, checks: Collection[str] = ()
 ) -> tuple[Remark, ...]:
     """Return the remarks on points that are not in the result: contradicted, or only not determined.
 
     Args:
         left_out: measured points that are not in the result, with the reason.
-        whole: network of all measured points. A person can correct those that keep their names; those of
-            natural texture are a test.
+        network: all measured points. A person can correct those that keep their names; those of natural
+            texture are a test.
         checks: names of check points.
     """
-    texture = whole.automatic_points
+    texture = network.automatic_points
     automatic = [point for point in left_out if point.point in texture]
     listed = [point for point in left_out if point.point not in texture]
     groups = {
         "points_contradicted": [point.point for point in listed if point.reason.severity != "note"],
         "points_not_determined": [point.point for point in listed if point.reason.severity == "note"],
     }
-    measured = len(whole.points)
+    measured = len(network.points)
     return (
         *([remark("points_left_out", points=len(automatic), measured=measured)] if automatic else []),
         *(
@@ -300,18 +300,18 @@ def remarks_on_principal_distances(
     """
     if _is_calibration(survey):
         return ()
-    given = {one.name: one.c_mm for one in survey.cameras if one.c_mm is not None}
-    assumed = {one.name for one in survey.cameras if one.c_assumed}
+    given = {camera.name: camera.c_mm for camera in survey.cameras if camera.c_mm is not None}
+    assumed = {camera.name for camera in survey.cameras if camera.c_assumed}
     remarks = []
     for camera, s in zip(estimate.cameras, sigma, strict=True):
         start = given.get(camera.name)
         if start is None:
             continue
-        found = camera.c_px * float(np.mean(camera.pixel_mm))
-        if abs(found / start - 1) <= MAX_C_CHANGE:
+        c_mm = camera.c_px * float(np.mean(camera.pixel_mm))
+        if abs(c_mm / start - 1) <= MAX_C_CHANGE:
             continue
         if not camera.free[0]:
-            held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(found, "mm"))
+            held = remark("c_held_elsewhere", camera=camera.name, given=(start, "mm"), found=(c_mm, "mm"))
             remarks.append(held)
         elif camera.name not in assumed:
             remarks.append(
@@ -319,8 +319,8 @@ def remarks_on_principal_distances(
                     "c_far_from_given",
                     camera=camera.name,
                     given=(start, "mm"),
-                    found=(found, "mm"),
-                    change=(100 * (found / start - 1), "%"),
+                    found=(c_mm, "mm"),
+                    change=(100 * (c_mm / start - 1), "%"),
                     share=s / abs(float(camera.parameters[0])),
                 )
             )
@@ -334,7 +334,7 @@ def remarks_on_held_c(held: tuple[str, ...], causes: tuple[Remark, ...]) -> tupl
         held: names of the cameras whose c was held.
         causes: remarks on causes of the residuals.
     """
-    if not held or all(one.severity == "note" for one in causes):
+    if not held or all(cause.severity == "note" for cause in causes):
         return ()
     return (remark("c_held_contradicted", cameras=held),)
 
@@ -349,14 +349,14 @@ def remarks_on_uncalibrated(survey: Survey, estimate: Estimate) -> tuple[Remark,
     """
     if not _is_calibration(survey):
         return ()
-    remarks, names = [], [one.name for one in survey.cameras]
-    for one in survey.cameras:
-        name = MODELS[one.model].names[0]
-        cameras = [camera for camera in estimate.cameras if base_name(camera.name, names) == one.name]
+    remarks, names = [], [camera.name for camera in survey.cameras]
+    for settings in survey.cameras:
+        name = MODELS[settings.model].names[0]
+        cameras = [camera for camera in estimate.cameras if base_name(camera.name, names) == settings.name]
         held = next((camera for camera in cameras if not camera.free[0]), None)
-        if name in one.may_be_free and held is not None:
+        if name in settings.may_be_free and held is not None:
             value = held.c_px * float(np.mean(held.pixel_mm))
-            remarks.append(remark("calibration_failed", camera=one.name, held=(value, "mm")))
+            remarks.append(remark("calibration_failed", camera=settings.name, held=(value, "mm")))
     return tuple(remarks)
 
 
@@ -376,21 +376,21 @@ def remarks_on_pixel_sides(
         cameras: cameras of the solution; a per-photograph camera has the name of its camera followed by that
             of the photograph.
     """
-    names = [one.name for one in settings]
+    names = [stated.name for stated in settings]
     first = {base_name(camera.name, names): camera for camera in reversed(cameras)}
     remarks = []
-    for one in settings:
-        known = "b1" in one.adjusted or {"fx", "fy"} <= set(one.adjusted)
-        if one.name not in first or one.pixel_mm is not None or known:
+    for stated in settings:
+        known = "b1" in stated.adjusted or {"fx", "fy"} <= set(stated.adjusted)
+        if stated.name not in first or stated.pixel_mm is not None or known:
             continue
-        width, height = first[one.name].pixel_mm.tolist()
+        width, height = first[stated.name].pixel_mm.tolist()
         ratio = width / height - 1
         if abs(ratio) >= MIN_SIDE_DIFFERENCE:
             remarks.append(
                 remark(
                     "pixels_not_square",
-                    camera=one.name,
-                    where="sensor_mm" if one.sensor_mm is not None else "EXIF data",
+                    camera=stated.name,
+                    where="sensor_mm" if stated.sensor_mm is not None else "EXIF data",
                     width=(1000 * width, "µm"),
                     height=(1000 * height, "µm"),
                     off=(100 * abs(ratio), "%"),

@@ -47,15 +47,15 @@ def missing_plates(family: TargetFamily | None, photographs: MeasuredPhotographs
         photographs: have the points of the plate as their codes.
     """
     remarks, plates = [], plates_of(family)
-    found = list(zip(photographs.names, photographs.targets, strict=True))
-    nothing = [one for one in found if not (one[1].code >= 0).any()]
+    named_targets = list(zip(photographs.names, photographs.targets, strict=True))
+    nothing = [(name, targets) for name, targets in named_targets if not (targets.code >= 0).any()]
     for plate in plates:
         is_seen = any(
             ((targets.code >= plate.first_point) & (targets.code <= plate.last_point)).any()
-            for _, targets in found
+            for _, targets in named_targets
         )
         # photographs without any plate are listed with the first plate; a plate in none of them lists all
-        without = (nothing if plate is plates[0] else []) if is_seen else found
+        without = (nothing if plate is plates[0] else []) if is_seen else named_targets
         dots = {
             name: int((targets.rejected_flag == Flag.NOT_ON_PLATE.value).sum()) for name, targets in without
         }
@@ -88,13 +88,13 @@ def sides_not_found(family: TargetFamily | None, photographs: MeasuredPhotograph
         codes = [targets.code - plate.first_point for targets in photographs.targets]
         on = [(code >= 0) & (code < plate.count) for code in codes]
         seen = np.zeros(plate.count, dtype=bool)
-        for code, some in zip(codes, on, strict=True):
-            seen[code[some]] = True
+        for code, on_plate in zip(codes, on, strict=True):
+            seen[code[on_plate]] = True
         lost = _missing_sides(plate, seen)
         views = dict.fromkeys(lost, 0)
-        for k, (code, some) in enumerate(zip(codes, on, strict=True)):
+        for k, (code, on_plate) in enumerate(zip(codes, on, strict=True)):
             size = photographs.cameras[photographs.camera[k]].size_px
-            for side in _in_view(plate, lost, code[some], photographs.targets[k].xy[some], size):
+            for side in _in_view(plate, lost, code[on_plate], photographs.targets[k].xy[on_plate], size):
                 views[side] += 1
         sides = [side for side, count in views.items() if count >= MIN_VIEWS]
         if sides:
@@ -117,14 +117,14 @@ def _missing_sides(plate: PlateFamily, seen: BoolArray) -> dict[str, _Line]:
     """Return the innermost of the outer rows and columns of each side without any seen point."""
     step = 2 if plate.name == "aprilgrid" else 1  # rows of corners of a tag
     number = np.arange(plate.count).reshape(plate.rows, plate.columns)
-    found = {}
+    sides = {}
     for name, lines in (("row", number), ("column", number.T)):
         for end, inwards in (("first", lines), ("last", lines[::-1])):
             count = int(seen[inwards].any(axis=1).argmax())
             if count >= step:
                 side = f"{end} {name}" if count == 1 else f"{end} {count} {name}s"
-                found[side] = _Line(inwards[count - step], inwards[count])
-    return found
+                sides[side] = _Line(inwards[count - step], inwards[count])
+    return sides
 
 
 def _in_view(
@@ -138,11 +138,11 @@ def _in_view(
     if H is None:
         return
     for side, (outer, neighbour) in sides.items():
-        found = np.isin(neighbour, code)
+        is_seen = np.isin(neighbour, code)
         beyond = 2 * plane[outer] - plane[neighbour]  # the margin of the plate
         at = cv2.perspectiveTransform(np.concatenate([plane[outer], beyond])[None], H)[0]
         inside = ((at >= 0) & (at < size_px)).all(axis=1).reshape(2, -1).all(axis=0)
-        if 2 * (found & inside).sum() >= len(outer):
+        if 2 * (is_seen & inside).sum() >= len(outer):
             yield side
 
 
@@ -164,8 +164,8 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Describe the targets and codes found where more are needed, and the settings that matter."""
     if plates := missing_plates(survey.family, photographs):
         return _as_error_text(*plates)
-    targets = [len(found) for found in photographs.targets]
-    codes = [int((found.code >= 0).sum()) for found in photographs.targets]
+    targets = [len(of_photograph) for of_photograph in photographs.targets]
+    codes = [int((of_photograph.code >= 0).sum()) for of_photograph in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
     settings = survey.targets
     return (
@@ -185,13 +185,13 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
     Args:
         targets: targets of each photograph.
     """
-    every = [found for found in targets if len(found)]
+    every = [of_photograph for of_photograph in targets if len(of_photograph)]
     if not every:
         return ()
-    unreadable = np.concatenate([(found.flag & Flag.CODE_UNREADABLE) != 0 for found in every])
-    diameter = 2 * np.concatenate([found.semi_axes[:, 1] for found in every])
-    blur = np.concatenate([found.blur for found in every])
-    coded = sum(int((found.code >= 0).sum()) for found in every)
+    unreadable = np.concatenate([(of_photograph.flag & Flag.CODE_UNREADABLE) != 0 for of_photograph in every])
+    diameter = 2 * np.concatenate([of_photograph.semi_axes[:, 1] for of_photograph in every])
+    blur = np.concatenate([of_photograph.blur for of_photograph in every])
+    coded = sum(int((of_photograph.code >= 0).sum()) for of_photograph in every)
     small = unreadable & (diameter < np.maximum(MIN_DOT_PX, MIN_DOT_SIGMAS * blur))
     if small.sum() < max(MIN_POINTS, coded):
         return ()
@@ -208,16 +208,16 @@ def small_codes(targets: Sequence[Targets]) -> tuple[Remark, ...]:
     )
 
 
-def _as_error_text(one: Remark) -> str:
+def _as_error_text(said: Remark) -> str:
     """Return a remark as part of an error message."""
-    return f"{one.text.rstrip('.')}: {one.remedy.rstrip('.')}"
+    return f"{said.text.rstrip('.')}: {said.remedy.rstrip('.')}"
 
 
 def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
     """Report codes too small to read, else candidates below the least diameter, if there are any."""
     if small := small_codes(photographs.targets):
         return f"; {_as_error_text(*small)}"
-    count = sum(int((found.rejected_flag == Flag.TOO_SMALL).sum()) for found in photographs.targets)
+    count = sum(int((targets.rejected_flag == Flag.TOO_SMALL).sum()) for targets in photographs.targets)
     if count < MIN_POINTS * len(photographs.targets):
         return ""
     return (
@@ -241,14 +241,14 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
     They are tried on the photograph with most codes, or if none has codes, with most targets.
     """
     settings = survey.targets
-    read = [len(np.unique(found.code[found.code >= 0])) for found in photographs.targets]
-    order = [(count, len(found)) for count, found in zip(read, photographs.targets, strict=True)]
+    read = [len(np.unique(targets.code[targets.code >= 0])) for targets in photographs.targets]
+    order = [(count, len(targets)) for count, targets in zip(read, photographs.targets, strict=True)]
     fullest = max(range(len(order)), key=order.__getitem__)
     photograph = read_photograph(photographs.paths[fullest], channel=settings.channel)
     known = settings.codes in (*RINGS, "none")
     families = RINGS if known else ()
-    polarities = [one for one in POLARITIES if settings.polarity in (one, "auto")]
-    others = [one for one in POLARITIES if one not in polarities]
+    polarities = [polarity for polarity in POLARITIES if settings.polarity in (polarity, "auto")]
+    others = [polarity for polarity in POLARITIES if polarity not in polarities]
     tried: list[tuple[str | Family | None, str]]
     tried = [(family, settings.polarity) for family in families if family != settings.codes]
     tried += [
@@ -259,13 +259,13 @@ def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:
     ]
     best, words = read[fullest], ""
     for family, polarity in tried:
-        found = find_targets(
+        targets = find_targets(
             photograph,
             polarity=polarity,
             codes=family if family is not None else "none",
             min_diameter_px=settings.min_diameter_px,
         )
-        count = len(np.unique(found.code[found.code >= 0]))
+        count = len(np.unique(targets.code[targets.code >= 0]))
         if count >= MIN_POINTS and count > best:
             best, differ = count, []
             if polarity != settings.polarity:

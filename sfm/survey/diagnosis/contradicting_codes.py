@@ -48,8 +48,8 @@ def find_contested_codes(
         naming: point of each target in the adjusted network.
         family: codes of the survey; points of a plate have no codes, but are named like them.
     """
-    whole, shown = _points_by_code(photographs, naming)
-    contested = {code: places for code, places in whole.items() if _is_contested(code, places, naming)}
+    by_code, shown = _points_by_code(photographs, naming)
+    contested = {code: places for code, places in by_code.items() if _is_contested(code, places, naming)}
     groups = _groups(contested)
     largest = groups[0] if groups else frozenset()
     accepted = _points_of_group(contested, largest)
@@ -65,7 +65,7 @@ def find_contested_codes(
     }
     left_out = {}
     for image, codes in foreign.items():
-        group = next(one for one in groups if image in one)
+        group = next(group for group in groups if image in group)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
         left_out[image] = _reason_for_other_object(codes, others, plate=bool(plates_of(family)))
     main = {
@@ -78,14 +78,14 @@ def find_contested_codes(
 
 
 def plates_elsewhere(
-    found: ContestedCodes, photographs: MeasuredPhotographs, family: TargetFamily | None
+    contested: ContestedCodes, photographs: MeasuredPhotographs, family: TargetFamily | None
 ) -> dict[PlateFamily, frozenset[int]]:
     """Return plates that were moved relative to the others, with the photographs that show them elsewhere.
 
     A photograph shows a plate elsewhere if it shows most of the plate's points elsewhere.
 
     Args:
-        found: codes that are read at several positions.
+        contested: codes that are read at several positions.
         photographs: all measured targets.
         family: codes of the survey.
     """
@@ -95,7 +95,7 @@ def plates_elsewhere(
         of_plate = range(plate.first_point, plate.last_point + 1)
         images = frozenset(
             image
-            for image, codes in found.elsewhere.items()
+            for image, codes in contested.elsewhere.items()
             if 2 * len(codes.intersection(of_plate))
             > np.isin(photographs.targets[image].code, of_plate).sum()
         )
@@ -105,7 +105,7 @@ def plates_elsewhere(
 
 
 def remarks_on_contested(
-    found: ContestedCodes,
+    contested: ContestedCodes,
     photographs: MeasuredPhotographs,
     naming: Naming,
     moved: Mapping[PlateFamily, frozenset[int]],
@@ -124,9 +124,9 @@ def remarks_on_contested(
     of_plates = {
         code for plate in plates_of(family) for code in range(plate.first_point, plate.last_point + 1)
     }
-    apart = sorted((found.places.keys() & of_plates) - of_moved)
+    apart = sorted((contested.places.keys() & of_plates) - of_moved)
     if apart:
-        images = {image for code in apart for image in found.places[code]}
+        images = {image for code in apart for image in contested.places[code]}
         remarks.append(
             remark(
                 "plate_points_apart",
@@ -134,11 +134,11 @@ def remarks_on_contested(
                 photographs=[photographs.names[i] for i in sorted(images)],
             )
         )
-    codes = sorted(found.places.keys() - of_plates)
+    codes = sorted(contested.places.keys() - of_plates)
     away: set[int] = set()
     points: set[str] = set()
     for code in codes:
-        places, main = found.places[code], found.main.get(code, UNNAMED)
+        places, main = contested.places[code], contested.main.get(code, UNNAMED)
         elsewhere = {image for image, at in places.items() if main not in at or len(at) > 1}
         away |= elsewhere or places.keys()
         if main != UNNAMED:
@@ -159,7 +159,7 @@ def _points_by_code(
     photographs: MeasuredPhotographs, naming: Naming
 ) -> tuple[dict[int, dict[int, frozenset[int]]], Counter[int]]:
     """Return the points of each code, by code and photograph, and the number of codes of each photograph."""
-    found: dict[int, dict[int, frozenset[int]]] = {}
+    by_code: dict[int, dict[int, frozenset[int]]] = {}
     shown: Counter[int] = Counter()
     for image, (targets, point) in enumerate(zip(photographs.targets, naming.point, strict=True)):
         if not (point != UNNAMED).any():
@@ -168,9 +168,9 @@ def _points_by_code(
         numbers = {_number(code, naming) for code in targets.code[coded].tolist()}
         shown[image] = len(numbers)
         for code, place in zip(targets.code[coded].tolist(), point[coded].tolist(), strict=True):
-            before = found.setdefault(code, {}).get(image, frozenset())
-            found[code][image] = before | {place}
-    return found, shown
+            before = by_code.setdefault(code, {}).get(image, frozenset())
+            by_code[code][image] = before | {place}
+    return by_code, shown
 
 
 def _is_contested(code: int, places: dict[int, frozenset[int]], naming: Naming) -> bool:
@@ -209,7 +209,7 @@ def _groups(contested: dict[int, dict[int, frozenset[int]]]) -> list[frozenset[i
             group = frozenset(agreeing)
         groups.append(group)
         left -= group
-    return sorted(groups, key=lambda one: (-len(one), min(one)))
+    return sorted(groups, key=lambda group: (-len(group), min(group)))
 
 
 def _points_of_group(

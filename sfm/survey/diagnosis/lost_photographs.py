@@ -84,32 +84,32 @@ class LostGroup:
     connected: bool  # whether one of them shows enough of these points to be oriented
 
 
-def explain_lost_photographs(network: Network, found: Orientation) -> Orientation:
+def explain_lost_photographs(network: Network, orientation: Orientation) -> Orientation:
     """Return the orientation with remarks on groups of photographs that are not connected to the others.
 
     Photographs with fewer points than any orientation needs get no remark: their failure reason states it.
 
     Args:
         network: has the named image points.
-        found: orientation of this network.
+        orientation: that of this network.
     """
     groups = [
-        one
-        for one in lost_groups(network, found.estimate)
-        if not one.connected and len(_points_of(network, one.images)) >= MIN_POINTS
+        group
+        for group in lost_groups(network, orientation.estimate)
+        if not group.connected and len(_points_of(network, group.images)) >= MIN_POINTS
     ]
     if not groups:
-        return found
-    oriented = found.estimate.oriented
-    reasons = dict(found.failures)
+        return orientation
+    oriented = orientation.estimate.oriented
+    reasons = dict(orientation.failures)
     for group in groups:
         for i in group.images:
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
             reasons[network.images[i]] = remark("photograph_with_few_points", seen=count, needed=MIN_POINTS)
-    groups.sort(key=lambda one: -len(one.images))
+    groups.sort(key=lambda group: -len(group.images))
     remarks = (_remark_on_unconnected(network, oriented, group) for group in groups)
-    failures = tuple((image, reasons[image]) for image, _ in found.failures)
-    return replace(found, failures=failures, remarks=(*found.remarks, *remarks))
+    failures = tuple((image, reasons[image]) for image, _ in orientation.failures)
+    return replace(orientation, failures=failures, remarks=(*orientation.remarks, *remarks))
 
 
 def lost_groups(network: Network, estimate: Estimate) -> list[LostGroup]:
@@ -137,7 +137,7 @@ def lost_groups(network: Network, estimate: Estimate) -> list[LostGroup]:
 def try_other_principal_distances(
     network: Network,
     estimate: Estimate,
-    found: Orientation | None,
+    orientation: Orientation | None,
     orient: Callable[[Estimate], Orientation],
     false_alarm: float = FALSE_ALARM,
 ) -> tuple[Orientation | None, tuple[Remark, ...]]:
@@ -155,7 +155,7 @@ def try_other_principal_distances(
     Args:
         network: has the named image points.
         estimate: start values.
-        found: the orientation with the given principal distance; None if there was none.
+        orientation: the orientation with the given principal distance; None if there was none.
         orient: returns the orientation from start values.
         false_alarm: probability that a right result is called wrong.
 
@@ -165,11 +165,11 @@ def try_other_principal_distances(
     """
     m, seen = len(network.images), network.image_points
     if not len(seen):
-        return found, ()
-    lost = m if found is None else _count_unexplained(network, found)
+        return orientation, ()
+    lost = m if orientation is None else _count_unexplained(network, orientation)
     free = all(camera.free[0] for camera in estimate.cameras)
     single = lost < 2  # a single lost photograph has another cause
-    least = _count_oriented(found) + (0 if single else int(MAJORITY_FRACTION * lost) + 1)
+    least = _count_oriented(orientation) + (0 if single else int(MAJORITY_FRACTION * lost) + 1)
     limit = MISFIT * seen.median_sigma_px
 
     def starts(before: Orientation | None) -> list[Estimate]:
@@ -191,10 +191,10 @@ def try_other_principal_distances(
         )
 
     row = Choice(starts, gain, lambda _, __: [(1, len(seen))], suffices=all_fits)
-    best = choose(found, (row,), orient, false_alarm=false_alarm)
-    if best is None or best is found:
-        return found, ()
-    taken = _with_original_freedom(best, estimate) if free else found
+    best = choose(orientation, (row,), orient, false_alarm=false_alarm)
+    if best is None or best is orientation:
+        return orientation, ()
+    taken = _with_original_freedom(best, estimate) if free else orientation
     if single:
         return taken, ()
     remarks = tuple(
@@ -205,38 +205,44 @@ def try_other_principal_distances(
             better=(better.c_px * float(np.mean(given.pixel_mm)), "mm"),
             oriented=_count_oriented(best),
             total=m,
-            before=_count_oriented(found),
+            before=_count_oriented(orientation),
         )
         for given, better in zip(estimate.cameras, best.estimate.cameras, strict=True)
     )
     return taken, remarks
 
 
-def _count_oriented(found: Orientation | None) -> int:
+def _count_oriented(orientation: Orientation | None) -> int:
     """Return the number of oriented photographs."""
-    return 0 if found is None else int(found.estimate.oriented.sum())
+    return 0 if orientation is None else int(orientation.estimate.oriented.sum())
 
 
-def _with_original_freedom(found: Orientation, estimate: Estimate) -> Orientation:
+def _with_original_freedom(orientation: Orientation, estimate: Estimate) -> Orientation:
     """Return the orientation with the same free parameters as the start values."""
     cameras = tuple(
-        replace(new, free=old.free) for new, old in zip(found.estimate.cameras, estimate.cameras, strict=True)
+        replace(new, free=old.free)
+        for new, old in zip(orientation.estimate.cameras, estimate.cameras, strict=True)
     )
-    return replace(found, estimate=replace(found.estimate, cameras=cameras))
+    return replace(orientation, estimate=replace(orientation.estimate, cameras=cameras))
 
 
-def _count_unexplained(network: Network, found: Orientation) -> int:
+def _count_unexplained(network: Network, orientation: Orientation) -> int:
     """Return how many photographs are lost although they show enough points and are not mirrored."""
-    mirrored = [image for image, reason in found.failures if reason.kind == "photograph_mirrored"]
-    lost = [i for one in lost_groups(network, found.estimate) if one.connected for i in one.images.tolist()]
+    mirrored = [image for image, reason in orientation.failures if reason.kind == "photograph_mirrored"]
+    lost = [
+        i
+        for group in lost_groups(network, orientation.estimate)
+        if group.connected
+        for i in group.images.tolist()
+    ]
     return sum(network.images[i] not in mirrored for i in lost)
 
 
-def _likelihood(network: Network, cameras: tuple[Camera, ...], found: Orientation | None) -> float:
+def _likelihood(network: Network, cameras: tuple[Camera, ...], orientation: Orientation | None) -> float:
     """Return the log-likelihood of all image points; without an orientation all are misfits."""
     areas = areas_of_photographs(network, cameras)
-    fits = np.zeros(len(areas), dtype=bool) if found is None else found.fits
-    squares = 0.0 if found is None else found.rms_px**2 * 2 * float(fits.sum())
+    fits = np.zeros(len(areas), dtype=bool) if orientation is None else orientation.fits
+    squares = 0.0 if orientation is None else orientation.rms_px**2 * 2 * float(fits.sum())
     return log_likelihood(squares, fits, areas)
 
 
@@ -317,11 +323,11 @@ def _conjugate_points(network: Network) -> list[tuple[IntArray, IntArray]]:
     """Return the conjugate image points of the pairs of photographs in the strongest connecting tree."""
     seen, m = network.image_points, len(network.images)
     every = np.ones(len(seen), dtype=bool)
-    found = [
+    links = [
         (i[common >= MIN_COMMON], j[common >= MIN_COMMON], common[common >= MIN_COMMON])
         for i, j, common in network.common_points(every)
     ]
-    first, second, common = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    first, second, common = (np.concatenate(parts) for parts in zip(*links, strict=True))
     if not len(first):
         return []
     tree = minimum_spanning_tree(csr_matrix((1.0 / common, (first, second)), shape=(m, m))).tocoo()
@@ -339,7 +345,7 @@ def _least_parallax(
     """Return the parallax of each pair, px, minimised over c and distortion; None at the search limit."""
     seen = network.image_points
     given = image_tangents(seen, network.camera, cameras)
-    c_px = np.array([one.c_px for one in cameras])[network.camera[seen.image]]
+    c_px = np.array([camera.c_px for camera in cameras])[network.camera[seen.image]]
 
     def parallax(x: FloatArray) -> FloatArray:
         uv = given / np.exp(x[0])
@@ -375,37 +381,37 @@ def _parallax(first: FloatArray, second: FloatArray) -> float:
 
 
 def find_second_objects(
-    network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
+    network: Network, orientation: Orientation, orient: Callable[[Network, Estimate], Orientation]
 ) -> dict[str, Remark]:
     """Return the failure reasons, by name, of lost photographs that can be oriented among themselves.
 
     Args:
         network: its points with lasting names show whether photographs see the same object.
-        found: its orientation, in which some photographs are missing.
+        orientation: its orientation, in which some photographs are missing.
         orient: returns the orientation of a network from start values; raises GeometryError if there is none.
     """
     lasting = network.named[network.image_points.point]
     network = replace(network, image_points=network.image_points.select(lasting))
-    found = replace(found, fits=found.fits[lasting])
+    orientation = replace(orientation, fits=orientation.fits[lasting])
     seen, names = network.image_points, np.array(network.images, dtype=object)
-    left = ~found.estimate.oriented
+    left = ~orientation.estimate.oriented
     left &= np.array([len(rows) for rows in rows_of(seen.image, len(names))]) >= MIN_POINTS
     reasons: dict[str, Remark] = {}
     while left.sum() >= 2:
         points = np.isin(np.arange(len(network.points)), seen.point[left[seen.image]])
         every = np.ones(len(seen), dtype=bool)
-        start = empty_estimate(network, found.estimate.cameras)
+        start = empty_estimate(network, orientation.estimate.cameras)
         part = reduce_network(network, start, left, points, every)[0]
         part = replace(part, control=type(part.control)(), exterior=type(part.exterior)())
         try:
-            other = orient(part, empty_estimate(part, found.estimate.cameras))
+            other = orient(part, empty_estimate(part, orientation.estimate.cameras))
         except GeometryError:
             break
         images = np.flatnonzero(left)[other.estimate.oriented]
         left[images] = False
         try:
             reason = _reason_for_misfit(
-                _adjust_fitting(network, found), _adjust_fitting(part, other), tuple(names[images])
+                _adjust_fitting(network, orientation), _adjust_fitting(part, other), tuple(names[images])
             )
         except (GeometryError, np.linalg.LinAlgError):  # too little is determined to compare
             continue
@@ -414,13 +420,13 @@ def find_second_objects(
     return reasons
 
 
-def _adjust_fitting(network: Network, found: Orientation) -> Solution | None:
+def _adjust_fitting(network: Network, orientation: Orientation) -> Solution | None:
     """Adjust the image points that fit an orientation by themselves; None without a solution."""
     alone = Network(network.images, network.camera, network.points, network.image_points)
     images, points = select_supported(
-        alone, found.estimate, found.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS
+        alone, orientation.estimate, orientation.fits, min_points=MIN_POINTS, min_rays=MIN_RAYS
     )
-    part, start = reduce_network(alone, found.estimate, images, points, found.fits)
+    part, start = reduce_network(alone, orientation.estimate, images, points, orientation.fits)
     a = adjust(part, start, datum=Datum("free"), reject="tau")
     if not a.converged or a.undetermined:
         return None
@@ -433,37 +439,37 @@ def _reason_for_misfit(
     """Return why photographs do not fit the others; None if they show the same object or too little of it."""
     if others is None or group is None:
         return None
-    both = compare_results(others, group)
-    cause, size = both.cause, mean_distance(others.estimate.points[both.pairing.points[:, 0]])
+    compared = compare_results(others, group)
+    cause, size = compared.cause, mean_distance(others.estimate.points[compared.pairing.points[:, 0]])
     if cause is not None and cause.row.mirror:
-        return remark("photograph_of_mirror_image", photographs=images, points=len(both.points))
-    if both.majority if cause is None else cause.row.strain or cause.row.bending:
+        return remark("photograph_of_mirror_image", photographs=images, points=len(compared.points))
+    if compared.majority if cause is None else cause.row.strain or cause.row.bending:
         return None
-    rms = float(np.sqrt((both.point_difference**2).sum(axis=1).mean()))
+    rms = float(np.sqrt((compared.point_difference**2).sum(axis=1).mean()))
     return remark(
-        "photograph_of_second_object", photographs=images, points=len(both.points), misfit=rms / size
+        "photograph_of_second_object", photographs=images, points=len(compared.points), misfit=rms / size
     )
 
 
 def find_second_motion(
-    network: Network, found: Orientation, orient: Callable[[Network, Estimate], Orientation]
+    network: Network, orientation: Orientation, orient: Callable[[Network, Estimate], Orientation]
 ) -> tuple[Remark, ...]:
     """Return the remark on tie points whose orientation differs from that of the others, if there are any.
 
     Args:
         network: has the tie points.
-        found: its orientation.
+        orientation: its orientation.
         orient: returns the orientation of a network from start values; raises GeometryError if there is none.
     """
-    images = found.estimate.oriented
+    images = orientation.estimate.oriented
     on = images[network.image_points.image]
-    tolerance_px = TOLERANCE_FACTOR * found.rms_px
-    fits = residual_lengths(network, found.estimate) <= tolerance_px
+    tolerance_px = TOLERANCE_FACTOR * orientation.rms_px
+    fits = residual_lengths(network, orientation.estimate) <= tolerance_px
     rays, fitting = _count_rays(network, on), _count_rays(network, on & fits)
     left = (rays >= MOTION_RAYS) & (fitting < MIN_SHARE * rays)
     if left.sum() < MOTION_POINTS:
         return ()
-    held = tuple(replace(one, free=np.zeros_like(one.free)) for one in found.estimate.cameras)
+    held = tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in orientation.estimate.cameras)
     part, start = reduce_network(network, empty_estimate(network, held), images, left, on)
     try:
         other = orient(part, start)

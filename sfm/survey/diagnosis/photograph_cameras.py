@@ -111,10 +111,10 @@ def find_photograph_cameras(
                 reason = remark("photograph_contradicting", against=int(against[i]), points=int(count[i]))
                 left.append((name, reason))
             continue
-        camera, found = fit
+        camera, adjustment = fit
         owner[i] = len(cameras)
         cameras.append(camera)
-        position[i], rotation[i] = found.estimate.position[0], found.estimate.rotation[0]
+        position[i], rotation[i] = adjustment.estimate.position[0], adjustment.estimate.rotation[0]
         changed.append(name)
         same = np.flatnonzero(network.camera == network.camera[i])
         remarks.append(
@@ -126,7 +126,7 @@ def find_photograph_cameras(
                 points=int(count[i]),
                 parameters=[n for n, group in zip(camera.names, camera.shared, strict=True) if not group],
                 change=(100 * (camera.c_px / before.c_px - 1), "%"),
-                rms=(float(np.sqrt(np.mean(found.residuals[~found.rejected] ** 2))), "px"),
+                rms=(float(np.sqrt(np.mean(adjustment.residuals[~adjustment.rejected] ** 2))), "px"),
                 other=[network.images[k] for k in same if k != i] if len(same) == PAIR else None,
             )
         )
@@ -169,19 +169,19 @@ def _explained_otherwise(
     rows = images[seen.image] & points[seen.point]
     theirs = network.camera != own_network.camera
     start = ~accepted[rows]
-    found = [
+    adjusted = [
         adjust_image_points(
-            *reduce_network(one, values, images, points, rows),
+            *reduce_network(tried, values, images, points, rows),
             rejected,
             np.ones(int(rows.sum())),
             false_alarm=false_alarm,
         )
-        for one, values, rejected in (
+        for tried, values, rejected in (
             (network, estimate, start),
             (own_network, own_estimate, start & ~theirs[seen.image[rows]]),
         )
     ]
-    plain, separate = found
+    plain, separate = adjusted
     other = None if plain is None else best_explanation(plain)
     if plain is None or other is None or other.alternative.kind == "other_camera":
         return False  # the rejected points show best which photographs these are
@@ -233,13 +233,13 @@ def _photograph_camera(
         return _Fit(_adjust_alone(alone, start, points, freed, false_alarm), freed)
 
     def gain(before: _Fit, after: _Fit) -> float:
-        found = after.adjustment
-        if found is None or found.rejected.sum() > MAJORITY_FRACTION * n:
+        adjustment = after.adjustment
+        if adjustment is None or adjustment.rejected.sum() > MAJORITY_FRACTION * n:
             return -np.inf
-        if not SCALES[0] < found.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
+        if not SCALES[0] < adjustment.estimate.cameras[0].c_px / camera.c_px < SCALES[-1]:
             return -np.inf  # not a picture of these points: their names may be wrong
-        sigma = max(sigma_px, found.sigma0_px)
-        return _likelihood(found, camera, n, sigma) - _likelihood(before.adjustment, camera, n, sigma)
+        sigma = max(sigma_px, adjustment.sigma0_px)
+        return _likelihood(adjustment, camera, n, sigma) - _likelihood(before.adjustment, camera, n, sigma)
 
     row = Choice(
         freed_parameters,
@@ -250,18 +250,18 @@ def _photograph_camera(
     best = choose(_Fit(shared, nothing), (row,), adjust_freed, false_alarm=false_alarm)
     if best.adjustment is None or not best.freed.any():
         return None
-    found, freed = best.adjustment, best.freed
+    adjustment, freed = best.adjustment, best.freed
     variant = replace(
         camera,
         name=f"{camera.name} {network.images[image]}",
-        parameters=np.where(freed, found.estimate.cameras[0].parameters, camera.parameters),
+        parameters=np.where(freed, adjustment.estimate.cameras[0].parameters, camera.parameters),
         free=camera.free | freed,
         shared=tuple(
             "" if mine else group
             for mine, group in zip(freed, _with_parameter_groups(camera).shared, strict=True)
         ),
     )
-    return variant, found
+    return variant, adjustment
 
 
 @dataclass(frozen=True)
@@ -285,18 +285,18 @@ def _adjust_alone(
     camera, position, rotation = start
     begin = Estimate((replace(camera, free=free, shared=()),), position[None], rotation[None], points)
     try:
-        found = adjust(alone, begin, datum=Datum("control"), false_alarm=false_alarm)
+        adjustment = adjust(alone, begin, datum=Datum("control"), false_alarm=false_alarm)
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    return found if found.converged and found.redundancy > 0 else None
+    return adjustment if adjustment.converged and adjustment.redundancy > 0 else None
 
 
-def _likelihood(found: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
+def _likelihood(adjustment: Adjustment | None, camera: Camera, count: int, sigma_px: float) -> float:
     """Return the log-likelihood of a photograph, with misfits where that is likelier."""
     areas = np.full(count, float(np.prod(camera.size_px)))
     squares = np.full(count, np.inf)
-    if found is not None:
-        squares = np.nan_to_num((found.residuals**2).sum(axis=1), nan=np.inf)
+    if adjustment is not None:
+        squares = np.nan_to_num((adjustment.residuals**2).sum(axis=1), nan=np.inf)
     fits = squares < 2 * sigma_px**2 * np.log(areas / (2 * np.pi * sigma_px**2))
     return log_likelihood(float(squares[fits].sum()), fits, areas, sigma_px=sigma_px)
 
@@ -312,16 +312,16 @@ def _scaled_resection(
     for scale in scales:
         p = camera.parameters.copy()
         p[camera.parts[0]] *= scale
-        one = camera.with_parameters(p)
-        found = resect_robust(
-            tangents_from_pixel(one, xy), points, tolerance=tolerance_px / one.c_px, max_trials=trials
+        scaled = camera.with_parameters(p)
+        resected = resect_robust(
+            tangents_from_pixel(scaled, xy), points, tolerance=tolerance_px / scaled.c_px, max_trials=trials
         )
-        if not found.found:
+        if not resected.found:
             continue
-        squares = np.sum((found.residuals * one.c_px) ** 2, axis=1)
+        squares = np.sum((resected.residuals * scaled.c_px) ** 2, axis=1)
         cost = float(np.minimum(np.where(np.isnan(squares), np.inf, squares), tolerance_px**2).sum())
         if best is None or cost < best[0]:
-            best = cost, one, found.position, found.rotation
+            best = cost, scaled, resected.position, resected.rotation
     return None if best is None else best[1:]
 
 

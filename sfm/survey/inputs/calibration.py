@@ -107,28 +107,29 @@ def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
         pairs.refuse(rho, np.abs(rho) > 1, ("correlation",), "from -1 to 1")
         for camera, first, second, value in zip(*pairs.texts, rho[:, 0].tolist(), strict=True):
             correlations.setdefault(camera, []).append((first, second, value))
-    found = []
-    for one in summary.cameras:
-        missing = [name for name in MODELS[one.model].names if (one.name, name) not in rows]
+    calibrations = []
+    for stated in summary.cameras:
+        missing = [name for name in MODELS[stated.model].names if (stated.name, name) not in rows]
         if missing:
             raise SurveyFileError(
-                f"{table.path}: camera {one.name} has no {', '.join(missing)}, model {one.model} needs it"
+                f"{table.path}: camera {stated.name} has no {', '.join(missing)}, model {stated.model} needs "
+                "it"
             )
-        of_camera = {name: rows[one.name, name] for name in MODELS[one.model].names}
+        of_camera = {name: rows[stated.name, name] for name in MODELS[stated.model].names}
         adjusted = {name: s for name, (_, s) in of_camera.items() if np.isfinite(s) and s > 0}
-        found.append(
+        calibrations.append(
             Calibration(
-                *(one.name, one.model, one.size_px, one.pixel_mm),
+                *(stated.name, stated.model, stated.size_px, stated.pixel_mm),
                 {name: value for name, (value, _) in of_camera.items()},
                 adjusted,
                 tuple(
                     (p, q, value)
-                    for p, q, value in correlations.get(one.name, ())
+                    for p, q, value in correlations.get(stated.name, ())
                     if p in adjusted and q in adjusted and np.isfinite(value)
                 ),
             )
         )
-    return tuple(found)
+    return tuple(calibrations)
 
 
 def apply_calibration(
@@ -155,34 +156,34 @@ def apply_calibration(
         SurveyFileError: several calibrations but none of the camera's name, photographs of another size, or
             no standard deviations for an observation.
     """
-    named = [one for one in calibrations if one.name == settings.name]
+    named = [calibration for calibration in calibrations if calibration.name == settings.name]
     if not named and len(calibrations) > 1:
         raise SurveyFileError(
             f"{where}: camera {settings.name} is not in {source}, expected one of "
-            f"{', '.join(one.name for one in calibrations)}"
+            f"{', '.join(calibration.name for calibration in calibrations)}"
         )
-    found = (named or list(calibrations))[0]
-    if settings.size_px is not None and settings.size_px != found.size_px:
+    calibration = (named or list(calibrations))[0]
+    if settings.size_px is not None and settings.size_px != calibration.size_px:
         raise SurveyFileError(
             f"{where}: camera {settings.name} has {settings.size_px[0]} x {settings.size_px[1]} px, "
-            f"{found.name} of {source} {found.size_px[0]} x {found.size_px[1]} px"
+            f"{calibration.name} of {source} {calibration.size_px[0]} x {calibration.size_px[1]} px"
         )
-    if weighted and not found.sigma:
+    if weighted and not calibration.sigma:
         raise SurveyFileError(
-            f"{where}: {source} has no standard deviations of camera {found.name}, so it can be "
+            f"{where}: {source} has no standard deviations of camera {calibration.name}, so it can be "
             "held but not weighted"
         )
-    observed = found.sigma if weighted else {}
+    observed = calibration.sigma if weighted else {}
     return CameraSettings(
         name=settings.name,
         images=settings.images,
-        size_px=found.size_px,
-        pixel_mm=found.pixel_mm,
-        model=found.model,
+        size_px=calibration.size_px,
+        pixel_mm=calibration.pixel_mm,
+        model=calibration.model,
         free=(),
-        fixed=tuple((name, value) for name, value in found.values.items() if name not in observed),
-        weighted=tuple((name, (found.values[name], sigma)) for name, sigma in observed.items()),
-        correlations=found.correlations if weighted else (),
+        fixed=tuple((name, value) for name, value in calibration.values.items() if name not in observed),
+        weighted=tuple((name, (calibration.values[name], sigma)) for name, sigma in observed.items()),
+        correlations=calibration.correlations if weighted else (),
     )
 
 
@@ -223,7 +224,7 @@ def plate_group(targets: TargetSettings, others: Sequence[PlateSettings]) -> Pla
     Raises:
         GeometryError: they cannot be used side by side, see `group_plates`.
     """
-    plates = [plate_family(targets), *(plate_family(one) for one in others)]
+    plates = [plate_family(targets), *(plate_family(other) for other in others)]
     return group_plates([plate for plate in plates if plate is not None])
 
 
@@ -235,12 +236,12 @@ def refuse_contradicting_groups(targets: TargetSettings, others: Sequence[PlateS
         raise SurveyFileError(
             f"{where}: plate is given, targets.codes = '{targets.codes}'; needed the first plate in [targets]"
         )
-    for k, one in enumerate(others, 2):
-        if one.codes not in PLATES:
+    for k, other in enumerate(others, 2):
+        if other.codes not in PLATES:
             raise SurveyFileError(
-                f"{where}: plate {k}: codes = '{one.codes}' is not a plate; plates are {', '.join(PLATES)}"
+                f"{where}: plate {k}: codes = '{other.codes}' is not a plate; plates are {', '.join(PLATES)}"
             )
-        refuse_contradicting_plates(one, f"{where}: plate {k}")
+        refuse_contradicting_plates(other, f"{where}: plate {k}")
     try:
         plate_group(targets, others)
     except GeometryError as error:

@@ -100,18 +100,18 @@ def start_cameras(
     """
     index = np.zeros(0, dtype=np.int64) if camera is None else camera
     cameras = []
-    for number, one in enumerate(settings):
+    for number, stated in enumerate(settings):
         photographs = [k for k in range(len(metadata)) if index[k] == number]
-        size = _common_size(one, [(names[k], metadata[k].size_px) for k in photographs])
-        where = f"{source}: camera {one.name}"
+        size = _common_size(stated, [(names[k], metadata[k].size_px) for k in photographs])
+        where = f"{source}: camera {stated.name}"
         if size is None:
             raise SurveyFileError(f"{where}: size_px = [width, height] is needed, there is no photograph")
-        pixel, focal = one.pixel_mm, one.c_mm
-        if one.sensor_mm is not None:
-            pixel = one.sensor_mm[0] / size[0], one.sensor_mm[1] / size[1]
-        known = dict(from_balanced(one.balanced)) if one.balanced else {}
-        known |= {**dict(one.fixed), **{name: value for name, (value, _) in one.weighted}}
-        known |= dict(one.start) | approximate_values(one, one.name, given)
+        pixel, focal = stated.pixel_mm, stated.c_mm
+        if stated.sensor_mm is not None:
+            pixel = stated.sensor_mm[0] / size[0], stated.sensor_mm[1] / size[1]
+        known = dict(from_balanced(stated.balanced)) if stated.balanced else {}
+        known |= {**dict(stated.fixed), **{name: value for name, (value, _) in stated.weighted}}
+        known |= dict(stated.start) | approximate_values(stated, stated.name, given)
         if pixel is None:
             pixel = next((metadata[k].pixel_mm for k in photographs if metadata[k].pixel_mm), None)
         if focal is None:
@@ -137,12 +137,12 @@ def start_cameras(
         _refuse_implausible_view(where, size, pixel, focal)
         cameras.append(
             camera_from_values(
-                one.name,
-                one.model,
+                stated.name,
+                stated.model,
                 size,
                 pixel,
                 c_mm=focal,
-                free=one.may_be_free,
+                free=stated.may_be_free,
                 values=tuple(known.items()),
             )
         )
@@ -208,10 +208,10 @@ def refuse_unknown_cameras(settings: Sequence[CameraSettings], given: StartCamer
         given: start values of [approximate], or None.
     """
     for row, name in enumerate(given.camera if given is not None else ()):
-        if given is not None and not base_name(name, (one.name for one in settings)):
+        if given is not None and not base_name(name, (camera.name for camera in settings)):
             raise SurveyFileError(
                 f"{given.table.place(row)}: camera '{name}' is not in the survey, expected one of "
-                f"{', '.join(one.name for one in settings)}"
+                f"{', '.join(camera.name for camera in settings)}"
             )
 
 
@@ -220,12 +220,12 @@ def _common_size(
 ) -> tuple[int, int] | None:
     """Return the size of all photographs of one camera, px, None if nothing determines it."""
     size, source = settings.size_px, "size_px"
-    for name, found in sizes:
+    for name, size_px in sizes:
         if size is None:
-            size, source = found, f"'{name}'"
-        elif found != size:
+            size, source = size_px, f"'{name}'"
+        elif size_px != size:
             raise PhotographError(
-                f"camera {settings.name}: photograph '{name}' has {found[0]} x {found[1]} px, {source} "
+                f"camera {settings.name}: photograph '{name}' has {size_px[0]} x {size_px[1]} px, {source} "
                 f"{size[0]} x {size[1]} px; photographs of one camera have one size"
             )
     return size
@@ -344,7 +344,8 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) ->
         None if seen.correlation is None else seen.correlation[np.ix_(keep, keep)],
     )
     observations = tuple(
-        one.of_cameras(used) if isinstance(one, MountObservations) else one for one in network.observations
+        kind.of_cameras(used) if isinstance(kind, MountObservations) else kind
+        for kind in network.observations
     )
     mounts = None if estimate.mounts is None else estimate.mounts.select(used)
     cameras = tuple(c for c, on in zip(estimate.cameras, used, strict=True) if on)

@@ -137,16 +137,16 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
         content = EquipmentFile.model_validate(table)
     except ValidationError as error:
         raise SurveyFileError(first_error(path, text, error, EquipmentFile)) from error
-    names = [one.name for one in (*content.bars, *content.frames)]
+    names = [item.name for item in (*content.bars, *content.frames)]
     for name in names:
         if names.count(name) > 1:
             raise SurveyFileError(f"{path}: '{name}' occurs twice; bars and frames need different names")
     tables = {}
     for frame in content.frames:
         file = path_inside(path.parent, frame.file, str(path), allow_outside=allow_outside)
-        found = read_table(file, ("point",), COORDINATES)
-        found.keys("point")
-        tables[frame.name] = found
+        points = read_table(file, ("point",), COORDINATES)
+        points.keys("point")
+        tables[frame.name] = points
     return Equipment(path, content, tables)
 
 
@@ -177,29 +177,29 @@ def given_by(
         raise SurveyFileError(
             f"{where}: [[equipment]] needs survey.temperature, the temperature of {used[0].name} in deg C"
         )
-    known = {one.name: one for one in (*equipment.content.bars, *equipment.content.frames)}
+    known = {item.name: item for item in (*equipment.content.bars, *equipment.content.frames)}
     scale = METRES[equipment.content.unit] / METRES[unit]
-    for one in used:
-        if one.name not in known:
-            some = listed(list(known)) or "none"
+    for placement in used:
+        if placement.name not in known:
+            names = listed(list(known)) or "none"
             raise SurveyFileError(
-                f"{where}: unknown equipment '{one.name}', {equipment.path.name} has {some}"
+                f"{where}: unknown equipment '{placement.name}', {equipment.path.name} has {names}"
             )
-    items = [known[one.name] for one in used]
-    of_item, of_material = Counter(one.name for one in items), Counter(one.material for one in items)
+    items = [known[placement.name] for placement in used]
+    of_item, of_material = Counter(item.name for item in items), Counter(item.material for item in items)
     bars, frames, placed, places_of = [], [], [], dict[str, list[frozenset[str]]]()
-    for one, item in zip(used, items, strict=True):
+    for placement, item in zip(used, items, strict=True):
         assert temperature is not None
-        own = item.points if isinstance(item, Bar) else equipment.tables[one.name].texts[0]
-        points = _points(one, own, 2 if isinstance(item, Bar) else len(own), where)
-        places = places_of.setdefault(one.name, [])
+        own = item.points if isinstance(item, Bar) else equipment.tables[placement.name].texts[0]
+        points = _points(placement, own, 2 if isinstance(item, Bar) else len(own), where)
+        places = places_of.setdefault(placement.name, [])
         if frozenset(points) in places:
             raise SurveyFileError(
-                f"{where}: equipment '{one.name}' is given twice on the points {listed(sorted(points))}, "
-                "needed other points for each position"
+                f"{where}: equipment '{placement.name}' is given twice on the points "
+                f"{listed(sorted(points))}, needed other points for each position"
             )
         places.append(frozenset(points))
-        factor, calibration = scale * item.factor(temperature), scale * of_item[one.name] ** 0.5
+        factor, calibration = scale * item.factor(temperature), scale * of_item[placement.name] ** 0.5
         relative = PPM * float(
             np.hypot(
                 item.expansion * temperature_sigma * len(used) ** 0.5,
@@ -211,25 +211,27 @@ def given_by(
             bars.append(ScaleBar(points[0], points[1], factor * item.length, sigma))
             given_as = f"scale bar {points[0]} - {points[1]}"
         else:
-            group = one.name if len(places) == 1 else f"{one.name} {len(places)}"
-            frames.append(_frame(group, points, equipment.tables[one.name], factor, calibration, relative))
+            group = placement.name if len(places) == 1 else f"{placement.name} {len(places)}"
+            frames.append(
+                _frame(group, points, equipment.tables[placement.name], factor, calibration, relative)
+            )
             given_as = f"{FRAME} {group}"
         placed.append(
             PlacedEquipment(
-                *(one.name, given_as, item.calibrated, item.temperature, *item.material),
+                *(placement.name, given_as, item.calibrated, item.temperature, *item.material),
                 *(temperature, temperature_sigma, (item.factor(temperature) - 1) / PPM),
             )
         )
     return GivenEquipment(tuple(bars), tuple(frames), tuple(placed))
 
 
-def _points(one: EquipmentSettings, names: Names, count: int, where: str) -> Names:
+def _points(placement: EquipmentSettings, names: Names, count: int, where: str) -> Names:
     """Return the names of the points of an item in the survey."""
-    points = one.points or names
+    points = placement.points or names
     if len(points) != count or len(set(points)) < count:
         raise SurveyFileError(
-            f"{where}: equipment '{one.name}': points = {listed(list(points)) or 'none'}, needed {count} "
-            "different names, in the order of the equipment file"
+            f"{where}: equipment '{placement.name}': points = {listed(list(points)) or 'none'}, needed "
+            f"{count} different names, in the order of the equipment file"
         )
     return tuple(points)
 

@@ -156,10 +156,10 @@ def mount_observations(
             if name in references and not table.value[k].any() and not table.sigma[k].any():
                 continue
             if name not in mounted:
-                some = listed(sorted(mounted))
+                usable = listed(sorted(mounted))
                 raise SurveyFileError(
                     f"{table.table.place(k)}: camera '{name}' is on no rig, or is the reference camera of "
-                    f"one; needed {some}"
+                    f"one; needed {usable}"
                 )
             sigma = table.sigma[k]
             if not np.isfinite(sigma).all() or ((sigma == 0).any() and (sigma > 0).any()):
@@ -197,8 +197,8 @@ def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) ->
     angles = value[:, 3:]
     table.refuse(angles, np.abs(angles) > FULL_TURN, ANGLES, f"degrees, at most {FULL_TURN:g}")
     fixed = sigma[:, 3:] == 0
-    some = fixed & ~fixed.all(axis=1, keepdims=True)
-    table.refuse(sigma[:, 3:], some, SIGMAS_OF_ANGLES, "omega, phi, kappa fixed together or none of them")
+    partly = fixed & ~fixed.all(axis=1, keepdims=True)
+    table.refuse(sigma[:, 3:], partly, SIGMAS_OF_ANGLES, "omega, phi, kappa fixed together or none of them")
     phi = np.abs(np.cos(np.radians(angles[:, 1]))) < MIN_COS_PHI
     table.refuse(
         angles,

@@ -59,7 +59,7 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
             "wrong ones, or give a file"
         )
     origin, exterior = observed_positions(near, survey.exif_sigma_m, survey.unit)
-    found = remark(
+    observed = remark(
         "exif_positions",
         positions=len(near),
         photographs=len(files),
@@ -68,7 +68,7 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
     )
     far = tuple(name for name in positions if name not in near)
     limit = (MAX_DISTANCE_M / METRES[survey.unit], survey.unit)
-    remarks = (found, remark("exif_positions_far", far=far, limit=limit)) if far else (found,)
+    remarks = (observed, remark("exif_positions_far", far=far, limit=limit)) if far else (observed,)
     return replace(survey, exterior=exterior, exif_sigma_m=None), remarks
 
 
@@ -96,7 +96,7 @@ def moments_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, tu
     for rig in survey.rigs:
         if rig.moment != "exif":
             continue
-        cameras = {one.name: one for one in survey.cameras}
+        cameras = {camera.name: camera for camera in survey.cameras}
         of_rig = [_times(cameras[name], files, f"{survey.source}: rig {rig.name}") for name in rig.cameras]
         corrected, otherwise = dict(of_rig[0]), dict(of_rig[0])
         for camera, times in zip(rig.cameras[1:], of_rig[1:], strict=True):
@@ -135,7 +135,7 @@ def named_moments(times: Mapping[str, datetime], tolerance_s: float) -> dict[str
         tolerance_s: photographs later than the first of a moment by more are of the next, s.
     """
     moments, start = {}, datetime.min
-    for name, taken in sorted(times.items(), key=lambda one: one[1]):
+    for name, taken in sorted(times.items(), key=lambda named: named[1]):
         if taken - start > timedelta(seconds=tolerance_s):
             start = taken
         moments[name] = start.isoformat(sep=" ")
@@ -175,20 +175,20 @@ def clock_offsets(reference: list[datetime], times: list[datetime], tolerance_s:
     if not reference or not times:
         return [0.0]
     start = reference[0]
-    a, b = (np.array([(one - start).total_seconds() for one in some]) for some in (reference, times))
+    a, b = (np.array([(taken - start).total_seconds() for taken in series]) for series in (reference, times))
     ahead = np.sort((b[:, None] - a).ravel())
     last = np.searchsorted(ahead, ahead + 2 * tolerance_s, side="right")
     count = last - np.arange(len(ahead))
-    found: list[float] = []
+    offsets: list[float] = []
     for k in np.flatnonzero(count == count.max()):
         middle = float(ahead[k] + ahead[last[k] - 1]) / 2
-        if not found or middle - found[-1] > tolerance_s:
-            found.append(middle)
+        if not offsets or middle - offsets[-1] > tolerance_s:
+            offsets.append(middle)
     if count.max() > (np.abs(ahead) <= tolerance_s).sum():
-        return found
+        return offsets
     if len(reference) == len(times) == count.max():  # every photograph has its partner
         return [0.0]
-    return [0.0, *(one for one in found if abs(one) > 2 * tolerance_s)]
+    return [0.0, *(offset for offset in offsets if abs(offset) > 2 * tolerance_s)]
 
 
 def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str, SatellitePosition]:
@@ -222,7 +222,7 @@ def observed_positions(
         unit: object unit.
     """
     origin, places = local_coordinates(tuple(positions.values()))
-    stated = np.array([one.sigma_m for one in positions.values()])
+    stated = np.array([position.sigma_m for position in positions.values()])
     plane, height = sigma_m
     sigma = np.where(np.isnan(stated), (plane, plane, height), stated)
     nothing = np.full_like(places, np.nan)

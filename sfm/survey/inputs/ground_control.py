@@ -92,8 +92,8 @@ def read_ground_control(path: Path, settings: ControlSettings, unit: str) -> Gro
             positions, or no point that is named as a check point.
     """
     reader = READERS.get(path.suffix.lower())
-    found = GroundControl(read_control(path)) if reader is None else _with_image_points(reader(path), unit)
-    points = found.points
+    control = GroundControl(read_control(path)) if reader is None else _with_image_points(reader(path), unit)
+    points = control.points
     if settings.sigma is not None:
         plane, height = settings.sigma
         points = replace(points, sigma=np.where(points.sigma == 0, [plane, plane, height], points.sigma))
@@ -103,7 +103,7 @@ def read_ground_control(path: Path, settings: ControlSettings, unit: str) -> Gro
     if settings.check:
         check = np.isin(points.names, settings.check)[:, None] & np.isfinite(points.xyz)
         points = replace(points, check=check if points.check is None else points.check | check)
-    return replace(found, points=points)
+    return replace(control, points=points)
 
 
 def _with_image_points(rows: _Rows, unit: str) -> GroundControl:

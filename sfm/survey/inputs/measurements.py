@@ -49,8 +49,8 @@ class PhotographList:
     def by_camera(self) -> tuple[tuple[str, ...], ...]:
         """Return the names of the photographs of each camera that has any."""
         return tuple(
-            tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == one)
-            for one in np.unique(self.camera)
+            tuple(name for name, k in zip(self.names, self.camera, strict=True) if k == camera)
+            for camera in np.unique(self.camera)
         )
 
     def __len__(self) -> int:
@@ -78,17 +78,17 @@ class MeasuredPhotographs:
             PhotographTargets(
                 name,
                 path,
-                found.xy,
-                found.semi_axes,
-                found.angle,
-                found.rejected_xy,
-                found.rejected_flag,
-                found.flag,
+                targets.xy,
+                targets.semi_axes,
+                targets.angle,
+                targets.rejected_xy,
+                targets.rejected_flag,
+                targets.flag,
                 stored,
-                found.blur,
+                targets.blur,
                 self.cameras[camera].name,
             )
-            for name, path, found, stored, camera in zip(
+            for name, path, targets, stored, camera in zip(
                 self.names,
                 self.paths,
                 self.targets,
@@ -186,32 +186,32 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
 
     def matching(camera: str, glob: str) -> list[Path]:
         try:
-            found = find_files(folder, glob, enter=refuse_outside)
+            files = find_files(folder, glob, enter=refuse_outside)
         except ValueError as error:
             raise SurveyFileError(
                 f"{survey.source}: camera {camera}: images = '{glob}' is not a glob relative to {folder}"
             ) from error
-        if not found:
+        if not files:
             raise SurveyFileError(
                 f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_describe_files(folder)}"
             )
-        return found
+        return files
 
     owner: list[tuple[str, Path, int]] = []
     for index, camera in enumerate(survey.cameras):
-        found = sorted({path for glob in camera.images or () for path in matching(camera.name, glob)})
+        matched = sorted({path for glob in camera.images or () for path in matching(camera.name, glob)})
         if not survey.allow_outside:
-            for path in found:
+            for path in matched:
                 refuse_outside(path)
-        for name in (path.relative_to(folder).as_posix() for path in found):
+        for name in (path.relative_to(folder).as_posix() for path in matched):
             if not is_plain(name):
                 raise SurveyFileError(
                     f"{survey.source}: the name of photograph '{as_plain(name)}' has control or invisible "
                     "characters; rename the file"
                 )
-        owner += [(path.relative_to(folder).as_posix(), path, index) for path in found]
+        owner += [(path.relative_to(folder).as_posix(), path, index) for path in matched]
     masks = Masks(survey.masks).beside([name for name, _, _ in owner])
-    owner = [one for one in owner if one[1].resolve() not in masks]
+    owner = [(name, path, index) for name, path, index in owner if path.resolve() not in masks]
     names, paths, cameras = zip(*owner, strict=True)
     _refuse_two_cameras(survey, names, cameras)
     refuse_many(survey.source, names)
@@ -246,11 +246,11 @@ def refuse_many(where: str, images: Sequence[str]) -> None:
 
 def readable_photographs(photographs: PhotographList) -> tuple[IntArray, tuple[Metadata, ...]]:
     """Return the indices of the photographs whose metadata can be read, and these."""
-    found = {}
+    metadata = {}
     for k, path in enumerate(photographs.paths):
         with suppress(PhotographError, OSError):  # the others are reported when they are measured
-            found[k] = read_metadata(path)
-    return np.array(list(found), dtype=np.int64), tuple(found.values())
+            metadata[k] = read_metadata(path)
+    return np.array(list(metadata), dtype=np.int64), tuple(metadata.values())
 
 
 def _describe_files(folder: Path) -> str:
@@ -272,36 +272,36 @@ def refuse_incomplete_cameras(
         photographs: their EXIF data may give missing values.
     """
     lines = []
-    for number, one in enumerate(settings):
-        wanted = _wanted(one)
+    for number, camera in enumerate(settings):
+        wanted = _wanted(camera)
         paths = [photographs.paths[k] for k in np.flatnonzero(photographs.camera == number)]
         metadata = _readable(paths) if wanted else []
         missing = [
             key for key, attribute in wanted if metadata and not any(getattr(m, attribute) for m in metadata)
         ]
         if missing:
-            lines.append(f"camera {one.name}: {' and '.join(missing)}")
+            lines.append(f"camera {camera.name}: {' and '.join(missing)}")
     if lines:
         raise SurveyFileError(
             f"{source}: EXIF data of the photographs lack values that are needed: {'; '.join(lines)}"
         )
 
 
-def _wanted(one: CameraSettings) -> list[tuple[str, str]]:
+def _wanted(camera: CameraSettings) -> list[tuple[str, str]]:
     """Return (key of the survey file, attribute of `Metadata`) of values that a camera does not state."""
-    said = {name for name, _ in (*one.fixed, *one.start, *one.weighted, *one.balanced)}
+    said = {name for name, _ in (*camera.fixed, *camera.start, *camera.weighted, *camera.balanced)}
     wanted = []
-    if one.pixel_mm is None and one.sensor_mm is None:
+    if camera.pixel_mm is None and camera.sensor_mm is None:
         wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
-    if one.c_mm is None and not said & {"c", "fx", "f"}:
+    if camera.c_mm is None and not said & {"c", "fx", "f"}:
         wanted.append(("c_mm", "focal_mm"))
     return wanted
 
 
 def _readable(paths: Sequence[Path]) -> list[Metadata]:
     """Return the metadata of the readable photographs; the others are reported when they are read."""
-    found = []
+    metadata = []
     for path in paths:
         with suppress(PhotographError, OSError):
-            found.append(read_metadata(path))
-    return found
+            metadata.append(read_metadata(path))
+    return metadata

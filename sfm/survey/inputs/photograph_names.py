@@ -123,7 +123,7 @@ def _of_survey(table: Observations, survey: Survey, files: PhotographList) -> Ob
 
     kept = np.array([is_of_survey(name) for name in table.image])
     if not kept.any():
-        names, others = (listed(dict.fromkeys(one), most=1) for one in (table.image, files.names))
+        names, others = (listed(dict.fromkeys(images), most=1) for images in (table.image, files.names))
         raise SurveyFileError(
             f"{table.table.path}: none of its photographs ({names}) is among those of the survey ({others})"
         )

@@ -347,7 +347,7 @@ class CompareSettings(Section):
     baseline: Literal["mapper", "none"] = "none"  # other pipeline for the same photographs: COLMAP's mapper
 
 
-def first_error(path: Path | str, text: str, error: ValidationError, whole: type[Section]) -> str:
+def first_error(path: Path | str, text: str, error: ValidationError, section: type[Section]) -> str:
     """Return the first error of pydantic as one line with file, line, key, found and needed value.
 
     Unknown keys come first: a misspelt key is unknown, and missing under its correct name.
@@ -356,10 +356,10 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
         path: the survey file, or another beginning of the message.
         text: content of the file; empty for settings from Python.
         error: the error of pydantic.
-        whole: the section of the whole file, which declares the known keys.
+        section: the section of the whole file, which declares the known keys.
     """
     errors = error.errors(include_url=False)
-    first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+    first = next((fault for fault in errors if fault["type"] == "extra_forbidden"), errors[0])
     location = first["loc"]
     kind, context = first["type"], first.get("ctx", {})
     line = _line_of(text, location)
@@ -368,13 +368,13 @@ def first_error(path: Path | str, text: str, error: ValidationError, whole: type
     if kind == "extra_forbidden":
         table = _key(location[:-1])
         inside = f"[{table}]" if table else "the file" if text else "it"
-        known = _known_keys(location[:-1], whole)
+        known = _known_keys(location[:-1], section)
         return f"{where}unknown key '{_key(location[-1:])}' in {inside}, known are {known}"
     if kind == "missing" and isinstance(location[-1], int) and isinstance(first["input"], list | tuple):
-        found = _found(list(first["input"]))
-        return f"{where}{_key(location[:-1])}: found {found}, needed {counted(location[-1] + 1, 'value')}"
+        shown = _found(list(first["input"]))
+        return f"{where}{_key(location[:-1])}: found {shown}, needed {counted(location[-1] + 1, 'value')}"
     if kind == "missing":
-        every = [_key(one["loc"]) for one in errors if one["type"] == "missing"]
+        every = [_key(fault["loc"]) for fault in errors if fault["type"] == "missing"]
         return f"{where}{listed(every, most=MAX_LISTED)} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
@@ -416,9 +416,8 @@ def _key(location: tuple[str | int, ...]) -> str:
     return ".".join(words)
 
 
-def _known_keys(location: tuple[str | int, ...], whole: type[Section]) -> str:
+def _known_keys(location: tuple[str | int, ...], section: type[Section]) -> str:
     """Return the keys that the table at a location may have."""
-    section = whole
     for key in (part for part in location if isinstance(part, str)):
         fields = {field.alias or name: field for name, field in section.model_fields.items()}
         section = _section_in(fields[key].annotation) or section

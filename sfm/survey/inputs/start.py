@@ -48,11 +48,11 @@ def start_values(survey: Survey, network: Network, cameras: tuple[Camera, ...]) 
         network: its photographs and points get their values by name.
         cameras: cameras with their start values.
     """
-    found = given_values(survey, network, cameras)
+    estimate = given_values(survey, network, cameras)
     if survey.datum.kind == "control":
         control = network.control.complete
-        found.points[control.point] = control.xyz
-    return found
+        estimate.points[control.point] = control.xyz
+    return estimate
 
 
 def given_values(survey: Survey, network: Network, cameras: tuple[Camera, ...] = ()) -> Estimate:

@@ -140,12 +140,14 @@ class Survey:
         """Convert arguments from Python into settings, and refuse contradictions."""
         where = self.source or as_plain(f"survey {self.name}")
         head = _section(Head, {"name": self.name, "unit": self.unit}, where)
-        cameras = tuple(_section(CameraSettings, one, f"{where}: camera") for one in self.cameras)
+        cameras = tuple(_section(CameraSettings, camera, f"{where}: camera") for camera in self.cameras)
         if not cameras:
             raise SurveyFileError(f"{where}: no cameras, at least one is needed")
         object.__setattr__(self, "targets", _section(TargetSettings, self.targets, f"{where}: targets"))
         if not reads_photographs(self):  # given image points are adjusted with the stated camera
-            said = [one if one.states_free else one.model_copy(update={"free": ()}) for one in cameras]
+            said = [
+                camera if camera.states_free else camera.model_copy(update={"free": ()}) for camera in cameras
+            ]
             cameras = tuple(said)
         datum: object = self.datum
         if isinstance(self.observations, list):
@@ -165,9 +167,9 @@ class Survey:
             "folder": Path(self.folder),
             "masks": None if self.masks is None else Path(self.masks),
             "datum": _section(DatumSettings, datum, f"{where}: datum"),
-            "rigs": tuple(_section(RigSettings, one, f"{where}: rig") for one in self.rigs),
-            "plates": tuple(_section(PlateSettings, one, f"{where}: plate") for one in self.plates),
-            "marks": tuple(_section(PointSettings, one, f"{where}: point") for one in self.marks),
+            "rigs": tuple(_section(RigSettings, rig, f"{where}: rig") for rig in self.rigs),
+            "plates": tuple(_section(PlateSettings, plate, f"{where}: plate") for plate in self.plates),
+            "marks": tuple(_section(PointSettings, mark, f"{where}: point") for mark in self.marks),
             "adjust": _section(AdjustSettings, self.adjust, f"{where}: adjust"),
             "compare": _section(CompareSettings, self.compare, f"{where}: compare"),
         }
@@ -235,7 +237,7 @@ class Survey:
         Raises:
             SurveyFileError: a table gives an incomplete mount, or the mount of a camera on no rig.
         """
-        return mount_observations(self.mounts, self.rigs, [one.name for one in self.cameras])
+        return mount_observations(self.mounts, self.rigs, [camera.name for camera in self.cameras])
 
     def __repr__(self) -> str:
         count = len(self.cameras)
@@ -288,7 +290,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
     return Survey(
         name=file.name,
         unit=file.unit,
-        cameras=tuple(_calibrated_as_named(one, file) for one in file.cameras),
+        cameras=tuple(_calibrated_as_named(camera, file) for camera in file.cameras),
         targets=file.targets,
         plates=file.plates,
         tie_points=file.tie_points,
@@ -311,8 +313,8 @@ def survey_of_file(file: SurveyFile) -> Survey:
         },
         tables=(
             *(
-                read_observation_table(one.kind, file.beside(one.file), file.source)
-                for one in file.observation_tables
+                read_observation_table(table.kind, file.beside(table.file), file.source)
+                for table in file.observation_tables
             ),
             *equipment.frames,
         ),
@@ -348,8 +350,8 @@ def _given_image_points(
             "origins, needed one of them"
         )
     tables = tuple(
-        replace(read_image_points(file.beside(one.file)), sigma_px=one.sigma_px)
-        for one in tables_of(file.observations)
+        replace(read_image_points(file.beside(table.file)), sigma_px=table.sigma_px)
+        for table in tables_of(file.observations)
     )
     if control is not None and control.image_points is not None:
         if isinstance(file.observations, ObservationSettings):
@@ -396,8 +398,8 @@ def with_calibration(
         SurveyFileError: as in `apply_calibration`.
     """
     cameras = (
-        apply_calibration(one, calibrations, survey.source, source, weighted=weighted)
-        for one in survey.cameras
+        apply_calibration(camera, calibrations, survey.source, source, weighted=weighted)
+        for camera in survey.cameras
     )
     return replace(survey, cameras=tuple(cameras))
 

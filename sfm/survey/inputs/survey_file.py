@@ -166,9 +166,9 @@ class SurveyFile(Section):
         names += [table.file for table in (*tables_of(self.observations), *self.observation_tables)]
         if self.head.equipment is not None:
             path = self.beside(self.head.equipment)
-            found = read_equipment(path, allow_outside=self._allow_outside)
+            equipment = read_equipment(path, allow_outside=self._allow_outside)
             folder = Path(self.head.equipment).parent
-            names += [self.head.equipment, *(str(folder / one.file) for one in found.content.frames)]
+            names += [self.head.equipment, *(str(folder / frame.file) for frame in equipment.content.frames)]
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]
@@ -236,7 +236,7 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
             f"{as_plain(str(path))}: the path has control or invisible characters; rename the file or folder"
         )
     fields = SurveyFile.model_fields.items()
-    repeated = {one.alias or name for name, one in fields if get_origin(one.annotation) is tuple}
+    repeated = {field.alias or name for name, field in fields if get_origin(field.annotation) is tuple}
     text, table = read_toml(path, "a survey file", repeated=repeated)
     if isinstance(table.get("observations"), list):
         table[BESIDE] = table.pop("observations")

@@ -122,7 +122,7 @@ def find_covering_points(
     shapes = [estimate.cameras[lens].size_px[::-1] for lens in camera]
     covered = CoveredPixels(shapes)
     grey = GreyPhotographs(photographs.__getitem__)
-    found = [_no_points()]
+    parts = [_no_points()]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
@@ -143,7 +143,7 @@ def find_covering_points(
             *(grey, estimate, camera, squares.select(of), free[:, of], windows, threads), both_ways=not more
         )
         new, used = _points_that_meet(measured.image_points, estimate, camera, rays)
-        found.append(new)
+        parts.append(new)
         covered.cover(new.image_points.image, new.image_points.xy, side_px * measured.scale[used])
 
     in_order = [
@@ -155,7 +155,7 @@ def find_covering_points(
     for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
         cover(i, 2, more=False)
         give_back_memory()
-    return _concatenate_points(found)
+    return _concatenate_points(parts)
 
 
 def seen_squares(
@@ -270,26 +270,26 @@ def match_squares(
     def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
         others = np.flatnonzero(which.any(axis=1))
         others = others[others != i].tolist()
-        for one in in_threads(
+        for rays in in_threads(
             lambda j: matched(j, np.flatnonzero(which[j]), points, max_shift_px), others, threads
         ):
-            if one is not None:
-                in_reference[one.seen.point] += one.in_reference
-                number[one.seen.point] += 1
-                parts.append(one.seen)
-                scales.append(one.scale)
-                correlations.append(one.correlation)
+            if rays is not None:
+                in_reference[rays.seen.point] += rays.in_reference
+                number[rays.seen.point] += 1
+                parts.append(rays.seen)
+                scales.append(rays.scale)
+                correlations.append(rays.correlation)
 
     measure(first, squares.points, FIRST_SHIFT_PX)
     points = intersect_image_points(
         ImagePoints.joined(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
     ).points
     measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
-    some = number > 0
-    parts[0].covariance[some] = in_reference[some] / number[some, None, None]
+    used = number > 0
+    parts[0].covariance[used] = in_reference[used] / number[used, None, None]
     seen = ImagePoints.joined(parts)
-    some = some[seen.point]
-    return SquareRays(seen.select(some), np.concatenate(scales)[some], np.concatenate(correlations)[some])
+    used = used[seen.point]
+    return SquareRays(seen.select(used), np.concatenate(scales)[used], np.concatenate(correlations)[used])
 
 
 def _epipolar_lines(
@@ -350,18 +350,18 @@ def _points_that_meet(
     return CoveringPoints(image_points, met.points[kept], residuals, matched), used
 
 
-def _concatenate_points(found: Sequence[CoveringPoints]) -> CoveringPoints:
+def _concatenate_points(parts: Sequence[CoveringPoints]) -> CoveringPoints:
     """Concatenate points and renumber them consecutively."""
-    first = np.cumsum([0, *(len(one.points) for one in found)])
+    first = np.cumsum([0, *(len(part.points) for part in parts)])
     moved = [
-        replace(one.image_points, point=one.image_points.point + start)
-        for one, start in zip(found, first.tolist(), strict=False)
+        replace(part.image_points, point=part.image_points.point + start)
+        for part, start in zip(parts, first.tolist(), strict=False)
     ]
     return CoveringPoints(
         ImagePoints.joined(moved),
-        np.concatenate([one.points for one in found]),
-        np.concatenate([one.residuals for one in found]),
-        sum(one.matched for one in found),
+        np.concatenate([part.points for part in parts]),
+        np.concatenate([part.residuals for part in parts]),
+        sum(part.matched for part in parts),
     )
 
 

@@ -71,9 +71,9 @@ class MeasuredStore:
             path = self._path(self.folder, key)
             if path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
-            found = _unpacked(path.read_bytes(), kind)
+            measured = _unpacked(path.read_bytes(), kind)
             os.utime(path)  # marks it as used now
-            return found
+            return measured
         except (OSError, ValueError, TypeError, EOFError, KeyError, MemoryError, zipfile.BadZipFile):
             return None
 
@@ -121,9 +121,9 @@ def measured_once(
     if key not in store.held and (kept := store.load(key, kind)) is not None:
         store.held[key] = kept, True
     if key in store.held:
-        found, stored = store.held[key]
-        if isinstance(found, kind.type):
-            return found, stored
+        known, stored = store.held[key]
+        if isinstance(known, kind.type):
+            return known, stored
     measured = measure()
     store.save(key, measured)
     store.held[key] = measured, False
@@ -175,8 +175,8 @@ def _unpacked(data: bytes, kind: Kind[M]) -> M:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > len(data):
             raise ValueError("entries are stored as they are, these are packed")
-    with np.load(io.BytesIO(data), allow_pickle=False) as found:
-        arrays = {f.name: found[f.name] for f in fields(kind.type)}
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        arrays = {f.name: stored[f.name] for f in fields(kind.type)}
     for apart in (True, False):
         if len({len(a) for name, a in arrays.items() if name.startswith(kind.apart) == apart}) != 1:
             raise ValueError("arrays of different length")

@@ -119,7 +119,7 @@ def cover_photographs(
     if targets is not None:
         hidden = _with_targets(hidden, targets, survey.family, network, estimate)
     windows = _best_windows(photographs, network, estimate, surface, settings, jobs, hidden)
-    found = find_covering_points(
+    covered = find_covering_points(
         photographs,
         estimate,
         network.camera,
@@ -129,27 +129,27 @@ def cover_photographs(
         hidden=hidden,
         threads=jobs,
     )
-    found = without_far_points(_visible(hidden, found), estimate)
+    covered = without_far_points(_visible(hidden, covered), estimate)
     apart = points_apart(seen, fits, settings.window_px, n_points=len(network.points))
-    if len(found.image_points) < (fits & apart[seen.point]).sum():
+    if len(covered.image_points) < (fits & apart[seen.point]).sum():
         return _tie_points(measured, estimate, apart)
-    points = tuple(f"t{j + 1:05d}" for j in range(len(found.points)))
-    order = np.argsort(found.image_points.point, kind="stable")
-    covariance = found.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    points = tuple(f"t{j + 1:05d}" for j in range(len(covered.points)))
+    order = np.argsort(covered.image_points.point, kind="stable")
+    covariance = covered.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
     covering = network_of(
         survey,
         network.images,
         network.camera,
         points,
-        replace(found.image_points, covariance=covariance).select(order),
+        replace(covered.image_points, covariance=covariance).select(order),
     )
-    placed = replace(estimate, points=found.points)
-    covering = _with_common_part(covering, placed, found.image_points.covariance[order], survey.adjust)
+    placed = replace(estimate, points=covered.points)
+    covering = _with_common_part(covering, placed, covered.image_points.covariance[order], survey.adjust)
     control = covering.control.complete
     if start.kind != "given" and len(control) >= MIN_CONTROL:  # tie points cannot be placed on control
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
     return Surface(
-        covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(found)
+        covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(covered)
     )
 
 
@@ -160,9 +160,11 @@ def _tie_points(measured: Measurements, estimate: Estimate, kept: BoolArray) -> 
     return Surface(*reduce_network(network, estimate, images, kept, rays), measured.overlays, ())
 
 
-def remarks_on_disagreement(found: CoveringPoints) -> tuple[Remark, ...]:
+def remarks_on_disagreement(covering: CoveringPoints) -> tuple[Remark, ...]:
     """Return the remark that many of the matched windows contradict each other, if they do."""
-    return unless_note(remark("windows_disagree", share=1 - len(found.image_points) / max(found.matched, 1)))
+    return unless_note(
+        remark("windows_disagree", share=1 - len(covering.image_points) / max(covering.matched, 1))
+    )
 
 
 def _with_common_part(
@@ -181,19 +183,19 @@ def _with_common_part(
     """
     seen = network.image_points
     every = max(1, len(seen) // RAYS_OF_NOISE)
-    some = np.arange(len(network.points)) % every == 0
+    chosen = np.arange(len(network.points)) % every == 0
     images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(seen), dtype=bool)
-    part, start = reduce_network(without_given(network), estimate, images, some, rays)
+    part, start = reduce_network(without_given(network), estimate, images, chosen, rays)
 
     def adjust_with(covariance: FloatArray) -> Adjustment:
         nonlocal start
         weighted = replace(part, image_points=replace(part.image_points, covariance=covariance))
-        found = adjust(weighted, start, false_alarm=settings.false_alarm)
-        start = found.estimate
-        return found
+        adjustment = adjust(weighted, start, false_alarm=settings.false_alarm)
+        start = adjustment.estimate
+        return adjustment
 
     try:
-        factor, common_px = estimate_common_part(adjust_with, matching[some[seen.point]], settings.sigma_px)
+        factor, common_px = estimate_common_part(adjust_with, matching[chosen[seen.point]], settings.sigma_px)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     shown = factor**2 * matching + common_px**2 * np.eye(2)
@@ -287,41 +289,41 @@ def _coded_points(seen: Sequence[tuple[int, Targets]], network: Network, estimat
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
-def _visible(hidden: CoveredPixels | None, found: CoveringPoints) -> CoveringPoints:
+def _visible(hidden: CoveredPixels | None, covering: CoveringPoints) -> CoveringPoints:
     """Return the covering points that two photographs show where these are not masked."""
-    seen = found.image_points
+    seen = covering.image_points
     if hidden is None:
-        return found
+        return covering
     kept = hidden.free_positions(seen.image, seen.xy)
-    good = np.bincount(seen.point[kept], minlength=len(found.points)) >= 2
-    return _some_points(found, good, kept)
+    good = np.bincount(seen.point[kept], minlength=len(covering.points)) >= 2
+    return _some_points(covering, good, kept)
 
 
-def without_far_points(found: CoveringPoints, estimate: Estimate) -> CoveringPoints:
+def without_far_points(covering: CoveringPoints, estimate: Estimate) -> CoveringPoints:
     """Return the points without two-ray points that are off the surface of their neighbours.
 
     The windows of these points agree with each other, so they no longer count as matched rays either.
 
     Args:
-        found: covering points.
+        covering: the points.
         estimate: orientation of the photographs.
     """
-    seen, n = found.image_points, len(found.points)
+    seen, n = covering.image_points, len(covering.points)
     two = np.bincount(seen.point, minlength=n) < MIN_RAYS
-    good = on_surface(seen, replace(estimate, points=found.points), two)
-    return _some_points(found, good, np.ones(len(seen), dtype=bool))
+    good = on_surface(seen, replace(estimate, points=covering.points), two)
+    return _some_points(covering, good, np.ones(len(seen), dtype=bool))
 
 
-def _some_points(found: CoveringPoints, points: BoolArray, rays: BoolArray) -> CoveringPoints:
+def _some_points(covering: CoveringPoints, points: BoolArray, rays: BoolArray) -> CoveringPoints:
     """Return some points (n,) and rays (k,) of covering points."""
-    seen = found.image_points
+    seen = covering.image_points
     kept = points[seen.point] & rays
     number = np.cumsum(points) - 1
     return CoveringPoints(
         replace(seen.select(kept), point=number[seen.point[kept]]),
-        found.points[points],
-        found.residuals[kept],
-        found.matched - int((~kept).sum()),
+        covering.points[points],
+        covering.residuals[kept],
+        covering.matched - int((~kept).sum()),
     )
 
 
@@ -344,7 +346,7 @@ def _best_windows(
     most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
     costs: list[tuple[Windows, float]] = []
     given = settings.window_px if "window_px" in settings.model_fields_set else None
-    for windows in dict.fromkeys(replace(one, side_px=given or one.side_px) for one in TRIED_WINDOWS):
+    for windows in dict.fromkeys(replace(tried, side_px=given or tried.side_px) for tried in TRIED_WINDOWS):
         side = _side(estimate, windows.side_px, settings.max_points)
         trial_side = max(TRIAL_SIDES * windows.side_px + 1, side)
         trial = find_covering_points(

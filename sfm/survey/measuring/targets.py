@@ -75,14 +75,16 @@ def measure_photographs(
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
     family = survey.family
-    found, failed = each_photograph(
+    measured, failed = each_photograph(
         photographs,
         lambda path: _read_and_measure(path, survey.targets, family, store),
-        picture=lambda one: one[1].xy.tobytes() if len(one[1]) >= MIN_COMMON else b"",
+        picture=lambda of_photograph: (
+            of_photograph[1].xy.tobytes() if len(of_photograph[1]) >= MIN_COMMON else b""
+        ),
         jobs=jobs,
         progress=progress,
     )
-    order = sorted(found)
+    order = sorted(measured)
     names = tuple(photographs.names[k] for k in order)
     camera = photographs.camera[order]
     return MeasuredPhotographs(
@@ -92,17 +94,19 @@ def measure_photographs(
         start_cameras(
             survey.cameras,
             survey.source,
-            tuple(found[k][0] for k in order),
+            tuple(measured[k][0] for k in order),
             camera,
             names,
             survey.start_cameras,
         ),
         tuple(
-            found[k][1].select(Masks(survey.masks).visible(name, found[k][1].xy, found[k][0].size_px))
+            measured[k][1].select(
+                Masks(survey.masks).visible(name, measured[k][1].xy, measured[k][0].size_px)
+            )
             for k, name in zip(order, names, strict=True)
         ),
         failed,
-        tuple(found[k][2] for k in order),
+        tuple(measured[k][2] for k in order),
     )
 
 
@@ -202,7 +206,7 @@ def each_photograph(
     Raises:
         GeometryError: fewer than two readable photographs.
     """
-    found: dict[int, T] = {}
+    results: dict[int, T] = {}
     failed: dict[int, FailedImage] = {}
     originals = []
     for k, (name, first) in enumerate(zip(photographs.names, find_same_files(photographs), strict=True)):
@@ -223,7 +227,7 @@ def each_photograph(
             for done in as_completed(running):
                 k = running[done]
                 try:
-                    found[k] = done.result()
+                    results[k] = done.result()
                 except PhotographError as error:
                     reason = why_failed(error, photographs.paths[k])
                     failed[k] = FailedImage(
@@ -234,22 +238,22 @@ def each_photograph(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     pictures: dict[bytes, int] = {}
-    for k in sorted(found):
-        shown = b"" if picture is None else picture(found[k])
+    for k in sorted(results):
+        shown = b"" if picture is None else picture(results[k])
         first = pictures.setdefault(shown, k) if shown else k
         if first != k:
             original = photographs.names[first]
             failed[k] = FailedImage(
                 photographs.names[k], remark("copies", original=original, same="pictures")
             )
-            del found[k]
+            del results[k]
     in_order = tuple(failed[k] for k in sorted(failed))
-    if len(found) < MIN_PHOTOGRAPHS:
+    if len(results) < MIN_PHOTOGRAPHS:
         raise GeometryError(
-            f"{counted(len(found), 'readable photograph')}, "
+            f"{counted(len(results), 'readable photograph')}, "
             f"at least {MIN_PHOTOGRAPHS} are needed{in_brackets(in_order)}"
         )
-    return found, in_order
+    return results, in_order
 
 
 def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
@@ -277,7 +281,7 @@ def in_brackets(failed: Sequence[FailedImage]) -> str:
     """Return the first photographs that could not be read and why, in brackets for the end of a message."""
     if not failed:
         return ""
-    named = (f"{one.image}: {one.reason.text.rstrip('.')}" for one in failed)
+    named = (f"{photograph.image}: {photograph.reason.text.rstrip('.')}" for photograph in failed)
     return f" ({listed(named, most=MAX_LISTED, separator='; ')})"
 
 

@@ -122,7 +122,7 @@ def match_templates(
             break
         along = _along_rays(scene, i, xy[lost], normal[lost], neighbours, side_px)
         points = np.vstack([known[lost], on_surface[lost], *along])
-        template = np.concatenate([lost, lost, np.repeat(lost, [len(some) for some in along])])
+        template = np.concatenate([lost, lost, np.repeat(lost, [len(places) for places in along])])
         finite = np.asarray(np.isfinite(points).all(axis=1))
         if not finite.any():
             continue

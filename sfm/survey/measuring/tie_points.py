@@ -82,22 +82,22 @@ def tie_photographs(
     """
     settings, masks = survey.texture, Masks(survey.masks)
     name_of = dict(zip(files.paths, files.names, strict=True))
-    found, failed = each_photograph(
+    detected, failed = each_photograph(
         files,
         lambda path: _read(path, name_of[path], settings, masks, store),
         picture=_picture,
         jobs=jobs,
         progress=progress,
     )
-    read = sorted(found)
+    read = sorted(detected)
     names = tuple(files.names[k] for k in read)
     camera: IntArray = files.camera[read]
-    metadata = [found[k][0] for k in read]
+    metadata = [detected[k][0] for k in read]
     cameras = start_cameras(
         survey.cameras, survey.source, tuple(metadata), camera, names, survey.start_cameras
     )
     pictures = PhotographFiles([files.paths[k] for k in read])
-    natural = [found[k][1] for k in read]
+    natural = [detected[k][1] for k in read]
     neighbours = (
         neighbours_by_position(metadata, PARTNERS),
         neighbours_in_sequence(names, metadata, PARTNERS),
@@ -117,14 +117,16 @@ def tie_photographs(
                 min_image_points=min_image_points,
             ),
         )
-        shown = masks.visible_points(names, [one.size_px for one in metadata], tied.image, tied.xy)
+        shown = masks.visible_points(
+            names, [photograph.size_px for photograph in metadata], tied.image, tied.xy
+        )
         return tied if shown.all() else _shown_tie_points(tied, shown)
 
     tied = tie(0)
     scarce = np.flatnonzero(np.bincount(tied.image, minlength=len(read)) < SCARCE_TIE_POINTS).tolist()
     if "max_features" not in settings.model_fields_set:
         more = settings.model_copy(update={"max_features": MORE_FEATURES * settings.max_features})
-        alike = {a for pair, one in matches.items() if one.candidates >= MIN_PAIR_MATCHES for a in pair}
+        alike = {a for pair, match in matches.items() if match.candidates >= MIN_PAIR_MATCHES for a in pair}
         searched = [a for a in scarce if a in alike]
         for a in reported("photographs searched for more features", searched, len(searched)):
             natural[a] = natural_points_of(files.paths[read[a]], names[a], more, masks, store)[0]
@@ -150,7 +152,7 @@ def tie_photographs(
         files.names,
         needed_rays(network),
         failed,
-        tuple(replace(one, stored=found[k][2]) for k, one in zip(read, drawn, strict=True)),
+        tuple(replace(overlay, stored=detected[k][2]) for k, overlay in zip(read, drawn, strict=True)),
         files,
         remarks=_remarks_on_pairs(len(matches), neighbours) + _remarks_on_still(tied.still, names),
     )
@@ -274,24 +276,26 @@ def neighbours_by_position(metadata: Sequence[Metadata], count: int) -> IntArray
         metadata: metadata of m photographs; some may have no position.
         count: number of neighbours, k.
     """
-    found = np.full((len(metadata), count), NONE)
-    rows = np.array([k for k, one in enumerate(metadata) if one.position is not None], dtype=np.int64)
-    positions = [one.position for one in metadata if one.position is not None]
+    neighbours = np.full((len(metadata), count), NONE)
+    rows = np.array(
+        [k for k, photograph in enumerate(metadata) if photograph.position is not None], dtype=np.int64
+    )
+    positions = [photograph.position for photograph in metadata if photograph.position is not None]
     if len(positions) < 2:
-        return found
+        return neighbours
     _, places = local_coordinates(positions)
-    sigma = np.array([one.sigma_m for one in positions])
+    sigma = np.array([position.sigma_m for position in positions])
     places /= np.median(np.where(np.isnan(sigma), USUAL_SIGMAS_M, sigma), axis=0)
     up = places[:, 2]
     up[np.isnan(up)] = np.median(up[~np.isnan(up)]) if not np.isnan(up).all() else 0.0
     if np.median(np.linalg.norm(places - np.median(places, axis=0), axis=1)) < MIN_SPREAD_SIGMAS:
-        return found
+        return neighbours
     nearest = min(count + 1, len(rows))
     order = np.atleast_2d(cKDTree(places).query(places, nearest)[1])
     for k, others in enumerate(order):
         closest = others[others != k][:count]
-        found[rows[k], : len(closest)] = rows[closest]
-    return found
+        neighbours[rows[k], : len(closest)] = rows[closest]
+    return neighbours
 
 
 def neighbours_in_sequence(names: Sequence[str], metadata: Sequence[Metadata], count: int) -> IntArray:
@@ -306,21 +310,21 @@ def neighbours_in_sequence(names: Sequence[str], metadata: Sequence[Metadata], c
         count: number of neighbours, k, even: half of them before, half after; the nearest first.
     """
     series: dict[tuple[object, ...], list[int]] = {}
-    for k, one in enumerate(metadata):
-        camera = (one.make, one.model, one.serial, PurePosixPath(names[k]).parent)
-        by_name = re.sub(r"\d+", "0", names[k]) if one.taken is None else ""
+    for k, photograph in enumerate(metadata):
+        camera = (photograph.make, photograph.model, photograph.serial, PurePosixPath(names[k]).parent)
+        by_name = re.sub(r"\d+", "0", names[k]) if photograph.taken is None else ""
         series.setdefault((*camera, by_name), []).append(k)
 
     def moment(k: int) -> tuple[datetime, list[int], str]:
         numbers = [int(digits) for digits in re.findall(r"\d+", names[k])]
         return metadata[k].taken or datetime.min, numbers, names[k]
 
-    found = np.full((len(names), count), NONE)
+    neighbours = np.full((len(names), count), NONE)
     for members in series.values():
         ordered = np.array(sorted(members, key=moment))
         for column, offset in enumerate(step for k in range(1, count // 2 + 1) for step in (k, -k)):
             from_, to = (
                 (ordered[:-offset], ordered[offset:]) if offset > 0 else (ordered[-offset:], ordered[:offset])
             )
-            found[from_, column] = to
-    return found
+            neighbours[from_, column] = to
+    return neighbours

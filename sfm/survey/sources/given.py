@@ -215,14 +215,14 @@ def _in_pixels(
     xy_px = xy.copy()
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
     if given.unit == "of the longer side":
-        size = np.array([one.size_px for one in cameras], dtype=float)[camera]
+        size = np.array([lens.size_px for lens in cameras], dtype=float)[camera]
         xy_px = xy * size.max(axis=1, keepdims=True) + (size - 1) / 2
     if given.unit == "mm":
-        for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
-            xy_px[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
+        for lens, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+            xy_px[rows] = pixel_from_image(xy[rows], lens.size_px, lens.pixel_mm)
             if sigma is not None:
-                s[rows] = sigma[rows] / one.pixel_mm
-                between[rows] /= -one.pixel_mm.prod()  # y is up in the image frame, down in px
+                s[rows] = sigma[rows] / lens.pixel_mm
+                between[rows] /= -lens.pixel_mm.prod()  # y is up in the image frame, down in px
     s = np.where(np.isnan(s), sigma_px, s)
     covariance = np.zeros((len(xy), 2, 2))
     covariance[:, range(2), range(2)] = s**2
@@ -255,7 +255,7 @@ def refuse_outside(
         SurveyFileError: so many are outside that a setting is wrong, or all are inside with x and y
             exchanged.
     """
-    size = np.array([one.size_px for one in cameras], dtype=float)[camera]
+    size = np.array([lens.size_px for lens in cameras], dtype=float)[camera]
     outside = outside_photograph(xy, size)
     count, allowed = int(outside.sum()), MAX_OUTSIDE * len(xy)
     if not count:
@@ -291,8 +291,8 @@ def _alternatives(
         yield "read as px in place of mm they are inside", given.xy, size
         return
     read = xy.copy()
-    for one, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
-        read[rows] = pixel_from_image(xy[rows], one.size_px, one.pixel_mm)
+    for lens, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
+        read[rows] = pixel_from_image(xy[rows], lens.size_px, lens.pixel_mm)
     yield "read as mm in place of px they are inside", read, size
 
 

@@ -66,7 +66,7 @@ def measure_sources(
     """
     measured = {}
     sources = sources_of(survey)
-    listed_first = sorted(sources, key=lambda one: not one[0].is_listed)  # faults of files show first
+    listed_first = sorted(sources, key=lambda pair: not pair[0].is_listed)  # faults of files show first
     several = sum(source.measure_one is not None for _, source in sources) > 1
     for row, source in listed_first:
         if several and source.measure_one is not None:
@@ -216,10 +216,10 @@ class _Repeated:
 
     def after(self, measured: Measurements) -> _Repeated:
         """Return what was not yet known before the photographs were oriented."""
-        known = {one.names("sources") for one in measured.remarks if one.kind == "sources_contradict"}
+        known = {said.names("sources") for said in measured.remarks if said.kind == "sources_contradict"}
         before = {point.point for point in measured.left_out}
         return _Repeated(
-            tuple(one for one in self.of_sources if one.names("sources") not in known),
+            tuple(said for said in self.of_sources if said.names("sources") not in known),
             tuple(name for name in self.contradicting if name not in before),
         )
 
@@ -253,12 +253,15 @@ def _joined(
 
 
 def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
-    table = [some.table if len(some.table) else np.zeros(len(some), dtype=np.int64) for some in bars]
+    table = [
+        of_source.table if len(of_source.table) else np.zeros(len(of_source), dtype=np.int64)
+        for of_source in bars
+    ]
     return ScaleBars(
-        np.concatenate([some.start for some in bars]),
-        np.concatenate([some.end for some in bars]),
-        np.concatenate([some.length for some in bars]),
-        np.concatenate([some.sigma for some in bars]),
+        np.concatenate([of_source.start for of_source in bars]),
+        np.concatenate([of_source.end for of_source in bars]),
+        np.concatenate([of_source.length for of_source in bars]),
+        np.concatenate([of_source.sigma for of_source in bars]),
         np.concatenate(table),
     )
 
@@ -266,7 +269,7 @@ def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
 def _joined_overlays(overlays: Sequence[Sequence[PhotographTargets]]) -> tuple[PhotographTargets, ...]:
     """Return one overlay of each photograph, in the order of their first source."""
     by_name: dict[str, PhotographTargets] = {}
-    for drawn in (drawn for some in overlays for drawn in some):
+    for drawn in (drawn for of_source in overlays for drawn in of_source):
         before = by_name.get(drawn.image)
         by_name[drawn.image] = drawn if before is None else before.with_more(drawn)
     return tuple(by_name.values())
@@ -386,12 +389,12 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
     for k in range(len(network.sources)):
         of_source = network.source == k
         step[seen.point[of_source]] = max(1, int(of_source.sum()) // RAYS_OF_NOISE)
-    some = estimate.determined & (np.arange(len(step)) % step == 0)
+    chosen = estimate.determined & (np.arange(len(step)) % step == 0)
     rays = np.ones(len(seen), dtype=bool)
     try:
         images, points = select_determined(
             network,
-            replace(estimate, points=np.where(some[:, None], estimate.points, np.nan)),
+            replace(estimate, points=np.where(chosen[:, None], estimate.points, np.nan)),
             rays,
             min_rays,
         )
@@ -400,7 +403,7 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
         def adjust_with(factor: FloatArray) -> Adjustment:
             nonlocal start
             # rejection with weights that are far off would lose the image points of the less precise source
-            found = adjust(
+            adjustment = adjust(
                 part,
                 start,
                 sigma_px=settings.sigma_px,
@@ -408,8 +411,8 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
                 false_alarm=settings.false_alarm,
                 reject="huber",
             )
-            start = found.estimate
-            return found
+            start = adjustment.estimate
+            return adjustment
 
         present, group = np.unique(part.source, return_inverse=True)
         names = tuple(network.sources[k].name for k in present)
@@ -419,10 +422,11 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
         common = np.array([source.has_common_errors for source in network.sources])
         effect = 1.0
         if common.any() and not common.all():
-            some = common[part.source]
-            if not some.any():  # no natural point fits the orientation by the others
+            natural = common[part.source]
+            if not natural.any():  # no natural point fits the orientation by the others
                 return network
-            effect = design_effect_of_neighbours(balanced, density=common[network.source].sum() / some.sum())
+            density = common[network.source].sum() / natural.sum()
+            effect = design_effect_of_neighbours(balanced, density=density)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
     factors = np.ones(len(network.sources))

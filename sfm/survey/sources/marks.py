@@ -116,9 +116,9 @@ def match_marks(
     known[point] = start.estimate.points
     seen = part.image_points
     by_hand = replace(seen, image=image[seen.image], point=point[seen.point], source=None)
-    found = _match_all(oriented, scene, points, known, jobs)
-    used = _without_contradictions(scene, found.image_points, by_hand, survey.adjust.levels)
-    lost = np.setdiff1d(np.arange(len(points)), found.image_points.point)
+    rays = _match_all(oriented, scene, points, known, jobs)
+    used = _without_contradictions(scene, rays.image_points, by_hand, survey.adjust.levels)
+    lost = np.setdiff1d(np.arange(len(points)), rays.image_points.point)
     matched = _with_pointing(survey, whole, points, used.matched)
     key, by_hand_key = (rows.image * len(points) + rows.point for rows in (matched, used.by_hand))
     everything = ImagePoints.joined([matched, used.by_hand.select(~np.isin(by_hand_key, key))])
@@ -138,7 +138,7 @@ def match_marks(
     contradicting = tuple(f"{points[j]} in {whole.images[i]}" for i, j in used.contradicting)
     remarks = []
     if len(lost):
-        alike = [points[j] for j in np.intersect1d(found.alike, lost)]
+        alike = [points[j] for j in np.intersect1d(rays.alike, lost)]
         remarks.append(remark("marks_unmatched", points=[points[j] for j in lost], alike=alike or None))
     return Correspondences(
         network,
@@ -211,15 +211,15 @@ def _without_contradictions(
 
 
 def _with_pointing(
-    survey: Survey, whole: Network, points: Sequence[str], matched: ImagePoints
+    survey: Survey, network: Network, points: Sequence[str], matched: ImagePoints
 ) -> ImagePoints:
     """Return matched image points with the noise of image points, and that of pointing where it matters.
 
     A table that has the point too means it by its name: the template is beside it by the error of pointing.
     """
     noise = np.full(len(points), survey.adjust.sigma_px**2)
-    given = np.array([source == GIVEN for source in whole.sources])[whole.source]
-    by_tables = {whole.points[j] for j in whole.image_points.point[given].tolist()}
+    given = np.array([source == GIVEN for source in network.sources])[network.source]
+    by_tables = {network.points[j] for j in network.image_points.point[given].tolist()}
     pointing = {mark.name: mark.sigma_px for mark in reversed(survey.marks)}
     for j, name in enumerate(points):
         if name in by_tables:
@@ -264,9 +264,9 @@ def _match_all(
         with_template, i = cast(tuple[TemplateScene, int], scenes[name])
         xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
         point = np.array([points.index(mark.name) for mark in marks])
-        found = match_templates(with_template, i, xy, known[point], windows, survey.adjust.levels, jobs)
-        parts.append(replace(found.image_points, point=point[found.image_points.point]))
-        alike.append(point[found.alike])
+        rays = match_templates(with_template, i, xy, known[point], windows, survey.adjust.levels, jobs)
+        parts.append(replace(rays.image_points, point=point[rays.image_points.point]))
+        alike.append(point[rays.alike])
     return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))
 
 
@@ -298,9 +298,9 @@ def _with_earlier(scene: TemplateScene, photograph: AnyArray) -> TemplateScene |
         shown = seen.select(seen.image == i)
         if len(shown):
             shown = shown.select(np.arange(0, len(shown), -(-len(shown) // MOST_RESECTED)))
-            found = match_points(scene.grey[i].pixels, photograph, shown.xy)
-            there = replace(shown, image=np.full(len(shown), m), xy=found.right)
-            parts.append(there.select(found.good))
+            matches = match_points(scene.grey[i].pixels, photograph, shown.xy)
+            there = replace(shown, image=np.full(len(shown), m), xy=matches.right)
+            parts.append(there.select(matches.good))
     matched = ImagePoints.joined(parts)
     resected = resect_robust(
         tangents_from_pixel(lens, matched.xy),

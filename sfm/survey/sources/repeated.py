@@ -62,7 +62,7 @@ def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
     of_group = rows_of(group, len(count))
     for g in np.flatnonzero(count > 1):
         rows = of_group[g]
-        one = rows[0]
+        row = rows[0]
         different = np.unique(seen.xy[rows], axis=0, return_index=True)[1]
         kind = 0
         if len(different) > 1:
@@ -72,11 +72,11 @@ def merge_repeated(seen: ImagePoints) -> MergedImagePoints:
             d = seen.xy[rows[different]] - mean
             chi2 = float(np.einsum("na,nab,nb->", d, P, d))
             kind = 1 if chi2 <= chi2_ppf(1 - LEVEL, 2 * (len(different) - 1)) else 2
-            xy[one], covariance[one] = mean, Q
+            xy[row], covariance[row] = mean, Q
         if kind == 2:
-            keep[one] = False
+            keep[row] = False
             dropped += len(rows)
-        kinds[kind].append((int(seen.image[one]), int(seen.point[one])))
+        kinds[kind].append((int(seen.image[row]), int(seen.point[row])))
     merged = replace(seen, xy=xy, covariance=covariance).select(keep)
     same, averaged, contradicting = (tuple(pairs) for pairs in kinds)
     return MergedImagePoints(merged, same, averaged, contradicting, dropped)
@@ -135,7 +135,7 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
             # the variance of a median is pi / 2 of that of a mean; what is below one sigma does not matter
             together = _squares(offset[None], np.median(C, axis=0)[None])[0]
             if together > max(1.0, np.pi / 2 * chi2_isf(LEVEL, 2) / len(of_a)):
-                x, y = (Quantity(float(one), "px") for one in offset)
+                x, y = (Quantity(float(component), "px") for component in offset)
                 remarks.append(said(offset=Quantity(float(np.linalg.norm(offset)), "px"), x=x, y=y))
         wrong = _squares(difference - offset, C) > chi2_isf(LEVEL / len(of_a), 2)
         keep[of_a[wrong]] = False

@@ -103,28 +103,32 @@ def _without_other_objects(
         several positions.
     """
     matched = _match_and_adjust(survey, photographs, naming, start)
-    found = find_contested_codes(photographs, matched.naming, survey.family)
-    moved = plates_elsewhere(found, photographs, survey.family)
-    reasons = tuple((photographs.names[i], reason) for i, reason in sorted(found.left_out.items()))
-    if found.left_out or found.main.keys() - matched.naming.code[list(found.main.values())]:
-        estimate = _without_contested(photographs, matched.naming, matched.estimate, found)
+    contested = find_contested_codes(photographs, matched.naming, survey.family)
+    moved = plates_elsewhere(contested, photographs, survey.family)
+    reasons = tuple((photographs.names[i], reason) for i, reason in sorted(contested.left_out.items()))
+    if contested.left_out or contested.main.keys() - matched.naming.code[list(contested.main.values())]:
+        estimate = _without_contested(photographs, matched.naming, matched.estimate, contested)
         matched = _match_and_adjust(survey, photographs, matched.naming, replace(start, estimate=estimate))
-        found = find_contested_codes(photographs, matched.naming, survey.family)
-        for plate, images in plates_elsewhere(found, photographs, survey.family).items():
+        contested = find_contested_codes(photographs, matched.naming, survey.family)
+        for plate, images in plates_elsewhere(contested, photographs, survey.family).items():
             moved[plate] = images | moved.get(plate, frozenset())
-    return matched, reasons, remarks_on_contested(found, photographs, matched.naming, moved, survey.family)
+    return (
+        matched,
+        reasons,
+        remarks_on_contested(contested, photographs, matched.naming, moved, survey.family),
+    )
 
 
 def _without_contested(
-    photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, found: ContestedCodes
+    photographs: MeasuredPhotographs, naming: Naming, estimate: Estimate, contested: ContestedCodes
 ) -> Estimate:
     """Return the estimate without left-out photographs, and with contested codes intersected again."""
     position, rotation, points = estimate.position.copy(), estimate.rotation.copy(), estimate.points.copy()
-    out = list(found.left_out)
+    out = list(contested.left_out)
     position[out], rotation[out] = np.nan, np.nan
     estimate = replace(estimate, position=position, rotation=rotation)
     kept = np.flatnonzero(estimate.oriented).tolist()
-    for code in found.places:
+    for code in contested.places:
         of_code = [photographs.targets[i].xy[photographs.targets[i].code == code] for i in kept]
         image = np.repeat(kept, [len(xy) for xy in of_code])
         uv = [
@@ -212,8 +216,8 @@ def _match_by_photograph_cameras(
     if per_photograph is None or not per_photograph.photographs:
         return matched
     separate = replace(photographs, camera=per_photograph.network.camera)
-    naming, found = match_uncoded(
+    naming, values = match_uncoded(
         separate, matched.naming, per_photograph.estimate, tolerance_px=tolerance_px
     )
     network = build_network(survey, photographs, naming)
-    return _Matched(naming, network, replace(found, cameras=estimate.cameras), per_photograph.photographs)
+    return _Matched(naming, network, replace(values, cameras=estimate.cameras), per_photograph.photographs)

@@ -325,8 +325,8 @@ def _of_exterior(survey: Described) -> Iterator[str]:
     """Yield unless exterior orientation is observed in exactly one way."""
     table = survey.exterior.file if isinstance(survey.exterior, ExteriorSettings) else survey.exterior
     if survey.exterior is not None and (table is None) == (survey.exif_sigma_m is None):
-        found = "neither is" if table is None else "both are"
-        yield f"[exterior]: file and exif_sigma_m, {found} given, one is needed"
+        given = "neither is" if table is None else "both are"
+        yield f"[exterior]: file and exif_sigma_m, {given} given, one is needed"
     if survey.exif_sigma_m is not None and not reads_photographs(survey):
         yield "exterior.exif_sigma_m needs photographs, the survey has [observations]; give exterior.file"
 
