@@ -76,22 +76,22 @@ class CsvTable:
 
     def part(self, names: tuple[str, ...]) -> FloatArray:
         """Return columns of numbers, NaN for columns that the file does not have, (rows, columns)."""
-        found = np.full((len(self.line), len(names)), np.nan)
+        columns = np.full((len(self.line), len(names)), np.nan)
         for k, name in enumerate(names):
             if name in self.numbers:
-                found[:, k] = self.values[:, self.numbers.index(name)]
-        return found
+                columns[:, k] = self.values[:, self.numbers.index(name)]
+        return columns
 
     @property
     def copies(self) -> BoolArray:
         """Which rows have the names and numbers of an earlier row, (rows,)."""
         rows = zip(zip(*self.texts, strict=True), map(tuple, self.values.tolist()), strict=True)
         seen: set[object] = set()
-        found = []
+        repeated = []
         for row in rows:
-            found.append(row in seen)
+            repeated.append(row in seen)
             seen.add(row)
-        return np.array(found, dtype=bool)
+        return np.array(repeated, dtype=bool)
 
     def select(self, rows: BoolArray) -> CsvTable:
         """Return the table with some of its rows."""
@@ -387,8 +387,8 @@ def write_ply(
         *("ply", "format ascii 1.0", f"comment kolinear, {words}" if words else "comment kolinear"),
         *(f"comment name {names[j]}" for j in kept if names),
         f"element vertex {len(kept)}",
-        *(f"property double {one}" for one in ("x", "y", "z", *(() if sigma is None else SIGMAS))),
-        *(f"property uchar {one}" for one in (COLOURS if colours else ())),
+        *(f"property double {name}" for name in ("x", "y", "z", *(() if sigma is None else SIGMAS))),
+        *(f"property uchar {name}" for name in (COLOURS if colours else ())),
         "end_header",
     ]
     for j in kept:

@@ -208,8 +208,8 @@ def _owner(handle: int) -> Owner | None:
     """Return the owner of a lock; None if it is not stated."""
     try:
         os.lseek(handle, TEXT_AT, os.SEEK_SET)
-        found = json.loads(os.read(handle, MAX_OWNER_BYTES))
-        return Owner(int(found["process"]), str(found["computer"]), str(found["since"]))
+        stated = json.loads(os.read(handle, MAX_OWNER_BYTES))
+        return Owner(int(stated["process"]), str(stated["computer"]), str(stated["since"]))
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
@@ -277,9 +277,9 @@ def read_manifest(folder: Path) -> dict[str, list[str]]:
         handle = open_regular_file(folder / MANIFEST, os.O_RDONLY)
         with os.fdopen(handle, "rb") as file:
             data = file.read(MAX_MANIFEST_BYTES)
-        found: Any = json.loads(data)
-        files = found["files"]
-        if found["written_by"] == WRITER and all(isinstance(hashes, list) for hashes in files.values()):
+        manifest: Any = json.loads(data)
+        files = manifest["files"]
+        if manifest["written_by"] == WRITER and all(isinstance(hashes, list) for hashes in files.values()):
             return {**files, MANIFEST: [hashlib.sha256(data).hexdigest()]}  # a readable manifest is ours
     except (OSError, OutputError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         pass
@@ -296,13 +296,13 @@ def names_below(folder: Path) -> list[str]:
     def fail(error: OSError) -> None:
         raise error
 
-    found = []
+    names = []
     for where, below, files in os.walk(folder, onerror=fail):
         for name in (*below, *files):
             path = Path(where, name)
             if (path.is_symlink() or not path.is_dir()) and name not in LITTER:
-                found.append(path.relative_to(folder).as_posix())
-    return sorted(found)
+                names.append(path.relative_to(folder).as_posix())
+    return sorted(names)
 
 
 def sha256_of(path: Path) -> str:

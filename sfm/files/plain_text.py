@@ -140,7 +140,7 @@ def shorten(text: str) -> str:
 
 def as_plain(text: str) -> str:
     r"""Return a text with its characters that are not plain written as escapes, such as \xff or \n."""
-    return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1].replace("\\udc", "\\x"), text)
+    return _HIDDEN.sub(lambda hidden: ascii(hidden[0])[1:-1].replace("\\udc", "\\x"), text)
 
 
 def _column(values: Sequence[object]) -> list[str]:
@@ -226,10 +226,10 @@ def _first_error(path: Path, error: ValidationError, what: str) -> str:
     place = as_plain(place[:MAX_NAME])
     if first["type"] == "missing":
         return f"{path}: {place} is missing, which {what} needs"
-    found = " ".join(as_plain(repr(first["input"])[: SHOWN + 1]).split())
-    found = found if len(found) <= SHOWN else found[:SHOWN] + "..."
+    given = " ".join(as_plain(repr(first["input"])[: SHOWN + 1]).split())
+    given = given if len(given) <= SHOWN else given[:SHOWN] + "..."
     needed = message.removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"{path}: {place or 'the content'} is {found}, needed {needed}"
+    return f"{path}: {place or 'the content'} is {given}, needed {needed}"
 
 
 def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple[str, dict[str, Any]]:
@@ -271,8 +271,8 @@ def read_toml(path: Path, what: str, *, repeated: Collection[str] = ()) -> tuple
 
 def _advice_on_mistake(text: str, message: str, repeated: Collection[str]) -> str:
     """Return position and advice for a usual mistake; for others the message of the parser."""
-    found = re.search(r"\(at line (\d+), column \d+\)$", message)
-    number = int(found[1]) if found else 0
+    position = re.search(r"\(at line (\d+), column \d+\)$", message)
+    number = int(position[1]) if position else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
     if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
         return f", line {number}: {_advice_on_duplicate(text.splitlines(), number, section[1], repeated)}"
@@ -286,8 +286,8 @@ def _advice_on_mistake(text: str, message: str, repeated: Collection[str]) -> st
 
 def _advice_on_duplicate(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
     """Return where a duplicate section occurs first, with advice."""
-    found = (_SECTION.match(one) for one in lines[: number - 1])
-    first = next((k for k, section in enumerate(found, 1) if section and section[1] == name), None)
+    sections = (_SECTION.match(line) for line in lines[: number - 1])
+    first = next((k for k, section in enumerate(sections, 1) if section and section[1] == name), None)
     shown = as_plain(name[:MAX_SAID])
     where = "" if first is None else f", first in line {first}"
     write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"

@@ -63,7 +63,7 @@ class ResultTable:
 
     def names_of(self, *kinds: str) -> tuple[str, ...]:
         """Return the names of the columns of the given kinds; of all kinds if none is given."""
-        return tuple(one for kind, names in self.groups if kind in (kinds or KINDS) for one in names)
+        return tuple(name for kind, names in self.groups if kind in (kinds or KINDS) for name in names)
 
     def read(self, folder: Path) -> CsvTable:
         """Read the names and numbers of the table of a result.
@@ -76,14 +76,14 @@ class ResultTable:
         flags, labels = self.names_of("flag"), self.names_of("label")
         if flags or optional[1:]:
             header = read_header(path)
-            flags = tuple(one for one in flags if one in header)
+            flags = tuple(flag for flag in flags if flag in header)
             optional = optional[:1] + [names for names in optional[1:] if {*names, *optional[0]} <= {*header}]
         numbers = (*self.names_of("number"), *self.names_of("blank"), *flags)
         return read_table(
             path,
-            (*self.names_of("name"), *(one for one in labels if one in read_header(path))),
+            (*self.names_of("name"), *(label for label in labels if label in read_header(path))),
             numbers,
-            tuple(one for names in optional for one in names),
+            tuple(name for names in optional for name in names),
             ignored=None,
             blank=blank,
         )
@@ -136,7 +136,7 @@ EXTERIOR = "X0 Y0 Z0 omega phi kappa"
 def _covariance_table(stem: str, what: str, parts: str) -> ResultTable:
     """Return a table for the upper triangles of covariance matrices."""
     names = parts.split()
-    pairs = (f"{one}_{other}" for k, one in enumerate(names) for other in names[k:])
+    pairs = (f"{first}_{other}" for k, first in enumerate(names) for other in names[k:])
     return ResultTable(stem, f"name: {what}", f"further: {' '.join(pairs)}")
 
 
@@ -187,7 +187,7 @@ INTERIOR_CORRELATIONS = ResultTable("interior_correlations", "further: camera fi
 EXTERIOR_CORRELATIONS = ResultTable("exterior_correlations", f"further: camera parameter image {EXTERIOR}")
 POINT_COVARIANCES = _covariance_table("point_covariances", "id", "X Y Z")
 IMAGE_COVARIANCES = _covariance_table("image_covariances", "image", EXTERIOR)
-TABLES = tuple(one for one in list(globals().values()) if isinstance(one, ResultTable))
+TABLES = tuple(table for table in list(globals().values()) if isinstance(table, ResultTable))
 
 
 def write_solution(
@@ -225,7 +225,7 @@ def write_solution(
         *(network.images, np.hstack([estimate.position, angles]), position),
         *(None if exterior is None else np.degrees(exterior[:, 3:]), names, of_images),
     )
-    sigmas = solution.interior_sigma or [np.full(len(one.names), np.nan) for one in estimate.cameras]
+    sigmas = solution.interior_sigma or [np.full(len(camera.names), np.nan) for camera in estimate.cameras]
     CAMERAS.write_rows(
         folder,
         (
@@ -239,7 +239,7 @@ def write_solution(
     IMAGE_POINTS.write(
         folder,
         *((images, points), seen.xy, known(seen.stated_sigma)),
-        [one or None for one in between.tolist()] if every or between.any() else None,
+        [covariance or None for covariance in between.tolist()] if every or between.any() else None,
         residuals,
         rejected.astype(int) if every or rejected.any() else None,
         None if seen.source is None else [network.sources[k].name for k in seen.source.tolist()],
@@ -341,8 +341,8 @@ def _read_moments(path: Path, cameras: Sequence[str], network: Network, mounts: 
             )
     order = list(dict.fromkeys((of[name],) if name in of else ("", name) for name in network.images))
     number = {key: t for t, key in enumerate(order)}
-    found = [number[(of[name],) if name in of else ("", name)] for name in network.images]
-    moment = np.array(found, dtype=np.int64)
+    moments = [number[(of[name],) if name in of else ("", name)] for name in network.images]
+    moment = np.array(moments, dtype=np.int64)
     refuse_moments(str(path), cameras, network, mounts, moment)
     return moment
 

@@ -241,9 +241,9 @@ def local_coordinates(positions: Sequence[SatellitePosition]) -> tuple[LocalSyst
     Returns:
         The system, and east, north and up, m, (k, 3); up is NaN if no height is stated.
     """
-    latitude = np.array([one.latitude_deg for one in positions])
-    longitude = np.array([one.longitude_deg for one in positions])
-    height = np.array([one.height_m for one in positions])
+    latitude = np.array([position.latitude_deg for position in positions])
+    longitude = np.array([position.longitude_deg for position in positions])
+    height = np.array([position.height_m for position in positions])
     x, y, z = np.median(_normals(latitude, longitude), axis=0)  # not affected by the date line
     origin = LocalSystem(
         round(math.degrees(math.atan2(z, math.hypot(x, y))), ORIGIN_DECIMALS) + 0.0,  # no -0
@@ -283,7 +283,7 @@ def satellite_position(gps: Mapping[int, Any], xmp: bytes = b"") -> SatellitePos
     stated = {axis: _number(value.decode()) for axis, value in STATED_IN_XMP.findall(xmp)}
     of_plane = _sigma(_number(gps.get(tag.GPSHPositioningError)))
     sigma = [_sigma(stated.get(axis, math.nan)) for axis in (b"Lon", b"Lat", b"Hgt")]
-    east, north = (of_plane if math.isnan(one) else one for one in sigma[:2])
+    east, north = (of_plane if math.isnan(of_axis) else of_axis for of_axis in sigma[:2])
     return SatellitePosition(latitude, longitude, height, (east, north, sigma[2]))
 
 
@@ -304,12 +304,12 @@ def _normals(latitude_deg: FloatArray, longitude_deg: FloatArray) -> FloatArray:
 def _degrees(value: Any, hemisphere: Any, letters: str, most: float) -> float:
     """Return degrees from degrees, minutes and seconds, NaN if they are invalid or beyond +-most."""
     parts = value if isinstance(value, tuple | list) else (value,)
-    numbers = [_number(one) for one in parts]
-    if not 1 <= len(numbers) <= 3 or not all(one >= 0 for one in numbers):
+    numbers = [_number(part) for part in parts]
+    if not 1 <= len(numbers) <= 3 or not all(number >= 0 for number in numbers):
         return math.nan
-    if not all(one <= 60 for one in numbers[1:]):  # 60 is what rounding makes of 59.9999
+    if not all(number <= 60 for number in numbers[1:]):  # 60 is what rounding makes of 59.9999
         return math.nan
-    degrees = sum(one / 60**k for k, one in enumerate(numbers))
+    degrees = sum(number / 60**k for k, number in enumerate(numbers))
     sign = {letters[0]: 1, letters[1]: -1}.get(_letter(hemisphere))
     return sign * degrees if sign and degrees <= most else math.nan
 

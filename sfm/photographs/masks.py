@@ -200,16 +200,16 @@ class _HeldMasks:
             raise PhotographError(f"{path.name}: {error.strerror}") from error
         key = path, state.st_mtime_ns, state.st_size
         with self._lock:
-            found = self._of_file.get(key)
-        if found is None:
+            held = self._of_file.get(key)
+        if held is None:
             _refuse_size(path, read_metadata(path).size_px, size_px)  # before so many pixels are decoded
             mask = read_mask(path)
-            found = *mask.shape, zlib.compress(np.packbits(mask == 0).tobytes(), 1)
+            held = *mask.shape, zlib.compress(np.packbits(mask == 0).tobytes(), 1)
             with self._lock:
-                self._of_file[key] = found
+                self._of_file[key] = held
                 while sum(len(bits) for _, _, bits in self._of_file.values()) > HELD_BYTES:
                     del self._of_file[next(iter(self._of_file))]
-        return found
+        return held
 
 
 _HELD = _HeldMasks()

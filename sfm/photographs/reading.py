@@ -113,8 +113,8 @@ def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray
     if image is None:
         raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
     if image.shape[1::-1] != size:
-        found = f"{image.shape[1]} x {image.shape[0]}"
-        raise PhotographError(f"{path.name}: {found} px, its header states {size[0]} x {size[1]}")
+        decoded = f"{image.shape[1]} x {image.shape[0]}"
+        raise PhotographError(f"{path.name}: {decoded} px, its header states {size[0]} x {size[1]}")
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
     if image.ndim == 3:
