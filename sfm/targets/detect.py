@@ -87,7 +87,7 @@ class Targets:
         """Return some of the targets, with all rejected candidates."""
         if rows.all():
             return self
-        of_targets = (one.name for one in fields(self) if not one.name.startswith("rejected"))
+        of_targets = (field.name for field in fields(self) if not field.name.startswith("rejected"))
         return replace(self, **{name: getattr(self, name)[rows] for name in of_targets})
 
     def __repr__(self) -> str:
@@ -160,10 +160,10 @@ def find_targets(
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     boards = [plate for plate in plates_of(codes) if plate.name in BOARDS]
-    found = find_boards(photograph, boards, scale=scale, noise=noise) if boards else []
+    crossings = find_boards(photograph, boards, scale=scale, noise=noise) if boards else []
     parts = [
         _of_crossings(saddles, plate.first_point + number)
-        for plate, (saddles, number) in zip(boards, found, strict=True)
+        for plate, (saddles, number) in zip(boards, crossings, strict=True)
     ]
     if isinstance(codes, PlateGroup):
         find_dots = partial(
@@ -174,7 +174,7 @@ def find_targets(
             min_diameter_px=min_diameter_px,
             max_diameter_px=max_diameter_px,
         )
-        return _joined([*parts, *(find_dots(codes=one) for one in codes.plates if one not in boards)])
+        return _joined([*parts, *(find_dots(codes=plate) for plate in codes.plates if plate not in boards)])
     if parts:
         return parts[0]
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
@@ -258,7 +258,7 @@ def find_targets(
 def _joined(parts: list[Targets]) -> Targets:
     """Return the targets of several plates in one photograph."""
     return Targets(
-        *(np.concatenate([getattr(one, field.name) for one in parts]) for field in fields(Targets))
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Targets))
     )
 
 
@@ -281,12 +281,12 @@ def _measure_centres(
     return measure_centroids(grey, fit.xy, fit.shape, sign, noise=noise, weights=centres)
 
 
-def _of_crossings(found: Saddles, code: IntArray) -> Targets:
+def _of_crossings(saddles: Saddles, code: IntArray) -> Targets:
     """Return the crossings of a board as targets; attributes of circles are nan or fixed values."""
-    k = len(found.xy)
+    k = len(saddles.xy)
     return Targets(
-        xy=found.xy,
-        covariance=found.covariance,
+        xy=saddles.xy,
+        covariance=saddles.covariance,
         axes_covariance=np.full((k, 3, 3), np.nan),
         edge_covariance=np.full((k, 3, 3), np.nan),
         semi_axes=np.full((k, 2), DRAWN_PX),
@@ -294,9 +294,9 @@ def _of_crossings(found: Saddles, code: IntArray) -> Targets:
         code=code,
         confidence=np.ones(k),
         polarity=np.ones(k, dtype=np.int64),
-        contrast=found.contrast,
+        contrast=saddles.contrast,
         background=np.full(k, np.nan),
-        blur=found.blur,
+        blur=saddles.blur,
         noise=np.full(k, np.nan),
         flag=np.full(k, Flag.CROSSING.value),
         rejected_xy=np.zeros((0, 2)),

@@ -146,21 +146,21 @@ def fit_ellipse_model(
     )
     theta, cofactor, statistics, flag = fits[:4]
     harmonics = outline_shape(fits.shape)
-    found = statistics.T
+    columns = statistics.T
     covariance = np.full((k, GAIN_X, GAIN_X), np.nan)
     failed = Flag.NO_CONVERGENCE | Flag.CUT_BY_BORDER | Flag.NOT_ELLIPTIC
     good = np.flatnonzero((flag & failed) == 0)
     if len(good):
         theta[good], covariance[good], shaded = _shrink_gain(
-            theta[good], cofactor[good], variance[good], found[goodness.LENGTH][good]
+            theta[good], cofactor[good], variance[good], columns[goodness.LENGTH][good]
         )
         flag[good[shaded]] |= Flag.SHADED.value
         covariance[good] *= outlines.factor[good, None, None]
         covariance[good, :2, :2] += outlines.gap_covariance[good]
-    gain = theta[:, GAIN_X:] / found[goodness.LENGTH][:, None]
-    halo = found[goodness.HALO]
-    flag[(halo > HALO) & (halo > HALO_SIGMAS * found[goodness.HALO_SIGMA])] |= Flag.HALO.value
-    glare = (found[goodness.SATURATED] > FLARE_SATURATED) | (found[goodness.GLARING] > FLARE_AROUND)
+    gain = theta[:, GAIN_X:] / columns[goodness.LENGTH][:, None]
+    halo = columns[goodness.HALO]
+    flag[(halo > HALO) & (halo > HALO_SIGMAS * columns[goodness.HALO_SIGMA])] |= Flag.HALO.value
+    glare = (columns[goodness.SATURATED] > FLARE_SATURATED) | (columns[goodness.GLARING] > FLARE_AROUND)
     flag[glare | _changes(theta, gain)] |= Flag.FLARE.value
     return EllipseFit(
         xy=theta[:, :2],
@@ -171,12 +171,12 @@ def fit_ellipse_model(
         blur=theta[:, BLUR],
         gain=gain,
         noise=np.sqrt(variance),
-        unevenness=found[goodness.UNEVENNESS],
+        unevenness=columns[goodness.UNEVENNESS],
         lobes=harmonics.lobes,
         lobes_sigma=noise * np.sqrt(harmonics.lobes_cofactor),
-        strokes=found[goodness.STROKES],
-        pixels=found[goodness.PIXELS].astype(np.int64),
-        iterations=found[goodness.STEPS].astype(np.int64),
+        strokes=columns[goodness.STROKES],
+        pixels=columns[goodness.PIXELS].astype(np.int64),
+        iterations=columns[goodness.STEPS].astype(np.int64),
         flag=flag,
     )
 

@@ -99,10 +99,10 @@ def find_outlines(
         kept_signs.append(np.full(int(good.sum()), sign))
         rejected_xy.append(ellipse[~good, :2])
         rejected_flag.append(reason[~good])
-    found = np.concatenate(ellipses)
+    candidates = np.concatenate(ellipses)
     return Outlines(
-        xy=found[:, :2],
-        shape=found[:, 2:],
+        xy=candidates[:, :2],
+        shape=candidates[:, 2:],
         sign=np.concatenate(kept_signs),
         rejected_xy=np.concatenate(rejected_xy),
         rejected_flag=np.concatenate(rejected_flag),
@@ -159,7 +159,7 @@ def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: An
     height, width = image.shape
     last = len(mean) - 1
     column, row_mean = np.zeros(width, np.int16), np.zeros(width, np.int16)
-    limit, direction, one = np.int16(16 * step), np.int16(sign), np.int16(1)
+    limit, direction, bit = np.int16(16 * step), np.int16(sign), np.int16(1)
     band[0] = 0
     band[height - 1] = 0
     for i in range(1, height - 1):
@@ -171,9 +171,9 @@ def _mark_band(image: AnyArray, mean: AnyArray, step: float, sign: int, band: An
         for j in range(width):
             row_mean[j] = near * np.int16(mean_here[j]) + far * np.int16(mean_next[j])
         for j in range(width):
-            column[j] = np.int16(above[j]) + (np.int16(here[j]) << one) + np.int16(below[j])
+            column[j] = np.int16(above[j]) + (np.int16(here[j]) << bit) + np.int16(below[j])
         for j in range(1, width - 1):
-            smooth = np.int16(column[j - 1] + column[j + 1]) + np.int16(column[j] << one)
+            smooth = np.int16(column[j - 1] + column[j + 1]) + np.int16(column[j] << bit)
             out[j] = np.int16(direction * np.int16(np.int16(smooth) - row_mean[j])) > limit
         out[0] = 0
         out[width - 1] = 0
@@ -298,7 +298,7 @@ def _trimmed_ellipse(contour: FloatArray, hull: FloatArray) -> FloatArray | None
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) / np.hypot(*ahead.T)[:, None]
     inside = np.abs(np.einsum("eb,neb->ne", across, contour[:, None] - hull[None])).min(axis=1)
     chosen = contour[inside < 1.5]
-    found = None
+    ellipse = None
     for _ in range(BRIDGE_ROUNDS):
         if len(chosen) < MIN_OUTLINE_POINTS / 2:
             return None
@@ -309,7 +309,7 @@ def _trimmed_ellipse(contour: FloatArray, hull: FloatArray) -> FloatArray | None
         cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
         p, q = cos * cos / a + sin * sin / b, cos * sin * (1 / a - 1 / b)
         r = sin * sin / a + cos * cos / b
-        found = np.array([x, y, p, q, r])
+        ellipse = np.array([x, y, p, q, r])
         dx, dy = (contour - (x, y)).T
         u, v = p * dx + q * dy, q * dx + r * dy
         tolerance = BRIDGED_TOLERANCE + BRIDGED_GRID_PX / min(a, b)
@@ -318,7 +318,7 @@ def _trimmed_ellipse(contour: FloatArray, hull: FloatArray) -> FloatArray | None
             break
         chosen = contour[on_it]
     direction = np.floor((np.arctan2(v, u)[on_it] / (2 * math.pi) + 0.5) * DIRECTIONS).astype(int)
-    return found if len(np.unique(direction % DIRECTIONS)) >= MIN_AROUND * DIRECTIONS else None
+    return ellipse if len(np.unique(direction % DIRECTIONS)) >= MIN_AROUND * DIRECTIONS else None
 
 
 class Flag(IntFlag):

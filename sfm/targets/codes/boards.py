@@ -85,7 +85,7 @@ def find_boards(
     grey = as_bytes(photograph, scale)
     grids = {plate.dictionary for plate in plates if plate.name == "aprilgrid"}
     tags = {dictionary: read_april_tags(grey, dictionary) for dictionary in grids}
-    found = []
+    crossings = []
     for plate in plates:
         if plate.name == "aprilgrid":
             xy, code = name_corners(*tags[plate.dictionary], plate)
@@ -98,8 +98,8 @@ def find_boards(
             half = MAX_HALF_SPACINGS * _spacing(xy)
         saddles = measure_saddles(photograph, xy, half, noise=noise)
         good = np.isfinite(saddles.xy[:, 0])
-        found.append((saddles.select(good), code[good]))
-    return found
+        crossings.append((saddles.select(good), code[good]))
+    return crossings
 
 
 def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
@@ -110,17 +110,17 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
     """
     size = plate.columns, plate.rows
     small, scale = reduce_photograph(grey, REDUCED_PX)
-    found, corners = cv2.findChessboardCornersSB(small, size, flags=FLAGS)
-    if not found:
+    is_found, corners = cv2.findChessboardCornersSB(small, size, flags=FLAGS)
+    if not is_found:
         xy, code = name_cut_board(grey, plate.rows, plate.columns)
         if len(code):
             return xy, code
         scale = 1.0
         if small is not grey:
-            found, corners = cv2.findChessboardCornersSB(grey, size, flags=FLAGS)
-    if not found:
-        found, corners = cv2.findChessboardCorners(grey, size, flags=OLDER_FLAGS)
-    if not found:
+            is_found, corners = cv2.findChessboardCornersSB(grey, size, flags=FLAGS)
+    if not is_found:
+        is_found, corners = cv2.findChessboardCorners(grey, size, flags=OLDER_FLAGS)
+    if not is_found:
         return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
     xy = ((np.asarray(corners, dtype=float) + 0.5) / scale - 0.5).reshape(plate.rows, plate.columns, 2)
     across, down = xy[0, -1] - xy[0, 0], xy[-1, 0] - xy[0, 0]
@@ -128,7 +128,7 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
         xy = xy[:, ::-1]
     ways = [np.rot90(xy, k) for k in ((0, 2) if plate.rows != plate.columns else range(4))]
     step = len(ways) // (1 + len(plate.turns))  # between ways in which the first square has the same colour
-    alike = min((ways[k::step] for k in range(step)), key=lambda some: _first_squares(grey, some))
+    alike = min((ways[k::step] for k in range(step)), key=lambda turns: _first_squares(grey, turns))
     xy = max(alike, key=lambda way: float((way[:, -1] - way[:, 0]).mean(axis=0)[0]))
     return xy.reshape(-1, 2), np.arange(plate.count)
 
@@ -203,7 +203,7 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
     dark = _dark_squares(grey, lattice)
     if dark is None:
         return none
-    found: list[tuple[int, IntArray]] = []
+    numberings: list[tuple[int, IntArray]] = []
     for turn in range(4):
         turned = quarter_turn(lattice.place, turn)
         turned = turned - turned.min(axis=0)
@@ -214,10 +214,12 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
             continue
         moved = turned + np.array(offsets)
         if (moved[dark].min(axis=1).sum(axis=1) % 2 == 0).all():  # the first square of the board is dark
-            found.append((turn, moved[:, 0] * columns + moved[:, 1]))
-    if len(found) == 2 and (found[0][0] - found[1][0]) % 4 == 2:  # it looks alike upside down
-        found = [one for one in found if _is_upright(lattice.xy, one[1] % columns)]
-    return (lattice.xy, found[0][1]) if len(found) == 1 else none
+            numberings.append((turn, moved[:, 0] * columns + moved[:, 1]))
+    if len(numberings) == 2 and (numberings[0][0] - numberings[1][0]) % 4 == 2:  # it looks alike upside down
+        numberings = [
+            (turn, number) for turn, number in numberings if _is_upright(lattice.xy, number % columns)
+        ]
+    return (lattice.xy, numberings[0][1]) if len(numberings) == 1 else none
 
 
 def find_filled_board(grey: AnyArray) -> Lattice | None:
@@ -271,7 +273,7 @@ def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
             value[(r + c) % 2].append(float(grey[round(y), round(x)]))
     if not value[0] or not value[1]:
         return None
-    even, odd = (float(np.median(one)) for one in value)
+    even, odd = (float(np.median(values)) for values in value)
     return None if abs(even - odd) < MIN_CONTRAST_SHARE * np.ptp(grey) else np.array(squares[int(even > odd)])
 
 
@@ -279,9 +281,9 @@ def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[
     """Return for rows and columns whether the board ends before the first and after the last of them."""
     height, width = shape[:2]
     at = {(int(r), int(c)): k for k, (r, c) in enumerate(place)}
-    found = []
+    ends = []
     for axis in range(2):
-        both = []
+        of_axis = []
         for outermost, inwards in ((0, 1), (int(place[:, axis].max()), -1)):
             inside = []
             for k in np.flatnonzero(place[:, axis] == outermost):
@@ -293,19 +295,19 @@ def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[
                     inside.append(
                         BORDER_PX < x < width - 1 - BORDER_PX and BORDER_PX < y < height - 1 - BORDER_PX
                     )
-            both.append(bool(inside) and float(np.mean(inside)) > SHARE_INSIDE)
-        found.append((both[0], both[1]))
-    return found
+            of_axis.append(bool(inside) and float(np.mean(inside)) > SHARE_INSIDE)
+        ends.append((of_axis[0], of_axis[1]))
+    return ends
 
 
-def _offset(seen: int, whole: int, ends: tuple[bool, bool]) -> int | None:
+def _offset(seen: int, of_board: int, ends: tuple[bool, bool]) -> int | None:
     """Return the index of the first visible row or column of the board; None if it is ambiguous."""
     before, behind = ends
-    if seen == whole:
+    if seen == of_board:
         return 0
-    if seen > whole or before == behind:
+    if seen > of_board or before == behind:
         return None
-    return 0 if before else whole - seen
+    return 0 if before else of_board - seen
 
 
 def _is_upright(xy: FloatArray, column: IntArray) -> bool:
@@ -336,7 +338,7 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
         tags = [(number, np.roll(quad, turn, axis=0))
                 for quad, (number, turn) in zip(quads, read, strict=True) if number >= 0]  # fmt: skip
         best = max(best, tags, key=len)
-    number = np.array([one for one, _ in best], dtype=np.int64)
+    number = np.array([tag for tag, _ in best], dtype=np.int64)
     values, first, times = np.unique(number, return_index=True, return_counts=True)
     corners = np.array([quad for _, quad in best]).reshape(-1, 4, 2)
     return values[times == 1], corners[first[times == 1]]
@@ -397,8 +399,8 @@ def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, bo
     if bright <= dark or white[~inner].mean() > WRONG_IN_BORDER:
         return -1, 0
     bits = white[border:-border, border:-border].astype(np.uint8)
-    found, number, turn = dictionary.identify(bits, CORRECTED)
-    return (int(number), int(turn)) if found else (-1, 0)
+    is_read, number, turn = dictionary.identify(bits, CORRECTED)
+    return (int(number), int(turn)) if is_read else (-1, 0)
 
 
 def name_corners(number: IntArray, quads: FloatArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:

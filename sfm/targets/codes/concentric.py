@@ -149,15 +149,15 @@ def find_concentric(
     read = []
     for k in np.flatnonzero(_resembles_rings(grey, outlines, least)):
         start = np.concatenate([outlines.xy[k], outlines.shape[k], [0.0, 0.0]])
-        one = _read(grey, start, float(outlines.sign[k]), table, family, noise=noise, scale=scale)
-        if one is not None:
-            read.append(one)
-    read.sort(key=lambda one: -one[1])
+        tag = _read(grey, start, float(outlines.sign[k]), table, family, noise=noise, scale=scale)
+        if tag is not None:
+            read.append(tag)
+    read.sort(key=lambda tag: -tag[1])
     kept: list[tuple[int, float, ConcentricFit]] = []
-    for one in read:
+    for tag in read:
         tags = ConcentricTags(np.zeros(0, np.int64), np.zeros(0), tuple(fit for _, _, fit in kept))
-        if not tags.inside(one[2].theta[None, :2])[0]:
-            kept.append(one)
+        if not tags.inside(tag[2].theta[None, :2])[0]:
+            kept.append(tag)
     code = np.array([number for number, _, _ in kept], dtype=np.int64)
     confidence = np.array([sure for _, sure, _ in kept], dtype=float)
     return ConcentricTags(code, confidence, tuple(fit for _, _, fit in kept))
@@ -213,11 +213,9 @@ def _read(
 ) -> tuple[int, float, ConcentricFit] | None:
     """Return id, confidence and fit of the tag with about this outer edge; None without one."""
     least = max(STEP_SIGMAS * noise, MIN_STEP * scale)
-    length = mean_radius(start)
-    found = _edges_on_rays(grey, start, sign, family)
-    if found is None:
+    geometry = _edges_on_rays(grey, start, sign, family)
+    if geometry is None:
         return None
-    geometry = found
     length = mean_radius(geometry)
     angle = np.linspace(0, 2 * math.pi, RAYS, endpoint=False)
     rho = (np.arange(PROFILE) + 0.5) / PROFILE * SURROUNDINGS
@@ -281,8 +279,8 @@ def _edges_on_rays(
     level = (value - paper) / (ink - paper) - 0.5
     crossing = (level[:, 1:] > 0) != (level[:, :-1] > 0)
     complete = (crossing.sum(axis=1) == edges) & (level[:, 0] < 0)
-    some = crossing.any(axis=1) & (level[:, 0] < 0)
-    if some.mean() < MIN_RAYS:
+    outer_edge = crossing.any(axis=1) & (level[:, 0] < 0)
+    if outer_edge.mean() < MIN_RAYS:
         return None
     ray, at = np.nonzero(crossing)
     ring = (np.cumsum(crossing, axis=1) - 1)[ray, at]
@@ -296,7 +294,7 @@ def _edges_on_rays(
     elif family.narrow * shortest > RESOLVED_PX:
         return None
     if geometry is None:
-        of = some[ray] & (ring == 0)
+        of = outer_edge[ray] & (ring == 0)
         geometry = fit_edges(start, xy[of], ring[of], 1)
     return geometry
 

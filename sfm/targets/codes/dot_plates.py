@@ -91,8 +91,8 @@ def placements(lattice: Lattice, plate: PlateFamily) -> list[IntArray]:
     """
     if not plate.is_shifted:
         return [quarter_turn(lattice.place, turn) for turn in range(4)]
-    steps = [np.array(one) for one in ((1, 1), (1, -1), (0, 2), (2, 0))]
-    steps += [-one for one in steps]
+    steps = [np.array(step) for step in ((1, 1), (1, -1), (0, 2), (2, 0))]
+    steps += [-step for step in steps]
     return [
         lattice.place @ np.stack([down, across])
         for down, across in itertools.permutations(steps, 2)
@@ -105,7 +105,7 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
     table = _table(plate)
     marked = np.zeros(plate.count + 1, dtype=bool)
     marked[[row * plate.columns + column for row, column in plate.marks]] = True
-    found: list[tuple[float, IntArray]] = []
+    placed: list[tuple[float, IntArray]] = []
     outlying = float((np.abs(size) > OUTLYING_SIGMAS).sum() - len(plate.marks)) / len(size)
     strange = max(STRANGE_PROBABILITY, outlying)
     plain = _log_likelihood(size, strange)
@@ -120,11 +120,11 @@ def _placed_by_marks(lattice: Lattice, size: FloatArray, plate: PlateFamily) -> 
             gain = float((_log_likelihood(size[here] - larger, strange) - plain[here]).sum())
             if (code == UNCODED).any():  # plates are rarely larger than stated
                 gain += math.log(STRANGE_PROBABILITY)
-            found.append((gain, code))
-    if not found:
+            placed.append((gain, code))
+    if not placed:
         return None
-    best, code = max(found, key=lambda one: one[0])
-    all_of_them = sum(math.exp(gain - best) for gain, _ in found) + math.exp(-best)  # or no mark is visible
+    best, code = max(placed, key=lambda option: option[0])
+    all_of_them = sum(math.exp(gain - best) for gain, _ in placed) + math.exp(-best)  # or no mark is visible
     return code if 1 / all_of_them > MIN_CERTAINTY else None
 
 
@@ -205,9 +205,9 @@ def find_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
         steps = _first_steps(xy, seed)
         if steps is None:
             continue
-        found = _grown(xy, is_dot, seed, *steps)
-        if best is None or (len(found.rows), -found.box) > (len(best.rows), -best.box):
-            best = found
+        lattice = _grown(xy, is_dot, seed, *steps)
+        if best is None or (len(lattice.rows), -lattice.box) > (len(best.rows), -best.box):
+            best = lattice
         if len(best.rows) > len(dots) / 2 and best.box < MAX_BOX_RATIO * len(best.rows):
             break
     return best
@@ -258,7 +258,7 @@ def _grown(xy: FloatArray, is_dot: BoolArray, seed: int, across: FloatArray, dow
         step = xy[j] - xy[k]
         # find which of the four steps it was, and update that step
         options = ((0, 1, across), (0, -1, -across), (1, 0, down), (-1, 0, -down))
-        d_row, d_column, _ = min(options, key=lambda one: float(np.hypot(*(one[2] - step))))
+        d_row, d_column, _ = min(options, key=lambda option: float(np.hypot(*(option[2] - step))))
         where = place[k][0] + d_row, place[k][1] + d_column
         if where in taken:
             continue

@@ -56,26 +56,26 @@ def search_checkerboard(photographs: Sequence[AnyArray]) -> PlateFamily | None:
 
     Source: Duda and Frese (2018), in OpenCV, for boards of any size.
     """
-    return checkerboard_of_parts(photographs, [part_of_checkerboard(one) for one in photographs])
+    return checkerboard_of_parts(
+        photographs, [part_of_checkerboard(photograph) for photograph in photographs]
+    )
 
 
 def checkerboard_of_parts(
-    photographs: Sequence[AnyArray], found: Sequence[Part | None]
+    photographs: Sequence[AnyArray], parts: Sequence[Part | None]
 ) -> PlateFamily | None:
     """Return the checkerboard that photographs (uint8) show in parts; None without one.
 
     Args:
         photographs: intensities, uint8, each (H, W).
-        found: part in each photograph, from `part_of_checkerboard`.
+        parts: part in each photograph, from `part_of_checkerboard`.
     """
-    whole, parts = Counter[tuple[int, int]](), [part for part in found if part is not None]
-    for size, is_cut in parts:
-        if not any(is_cut):
-            whole[min(size), max(size)] += 1
-    for (rows, columns), _ in whole.most_common():
+    seen = [part for part in parts if part is not None]
+    uncut = Counter((min(size), max(size)) for size, is_cut in seen if not any(is_cut))
+    for (rows, columns), times in uncut.most_common():
         plate = PlateFamily("checkerboard", rows, columns)
-        showing = sum(_is_part(*part, plate) for part in parts)
-        if showing > 1 and plate.count >= MIN_CROSSINGS and _named(photographs, plate, whole[rows, columns]):
+        showing = sum(_is_part(size, is_cut, plate) for size, is_cut in seen)
+        if showing > 1 and plate.count >= MIN_CROSSINGS and _named(photographs, plate, times):
             return plate
     return None
 
@@ -87,9 +87,9 @@ def part_of_checkerboard(grey: AnyArray) -> Part | None:
         grey: photograph, uint8, (H, W).
     """
     small, _ = reduce_photograph(grey, SEARCHED_PX)
-    found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
+    is_found, corners, meta = cv2.findChessboardCornersSBWithMeta(small, SMALLEST, _LARGER)
     size, xy = (0, 0), np.zeros((0, 2))
-    if found and meta is not None:
+    if is_found and meta is not None:
         size, xy = meta.shape[:2], np.asarray(corners, dtype=float).reshape(-1, 2)
     lattice = find_filled_board(small)  # OpenCV's board ends where a wide-angle lens bends it
     if lattice is not None and len(lattice.xy) > len(xy):
@@ -133,7 +133,11 @@ def search_charuco(
             for board in charuco_patterns(PlateFamily("charuco", down - 1, across - 1, (), dictionary, 0.5))
         ]
         shares = max(
-            ([share for one in tags if (share := _tag_share(*one, middle))] for middle in middles), key=len
+            (
+                [share for number, quads in tags if (share := _tag_share(number, quads, middle))]
+                for middle in middles
+            ),
+            key=len,
         )
         if len(shares) < 2:
             continue
@@ -159,7 +163,7 @@ def search_april_grids(tried: Sequence[AnyArray], others: Sequence[AnyArray] = (
     while (grid := _april_grid(photographs, seen)) is not None:
         of_grid = [(number >= grid.first_tag) & (number <= grid.last_tag) for number, _ in seen]
         showing = {k for k, on in enumerate(of_grid) if on.sum() >= MIN_TAGS_OF_BOARD}
-        if not grids or any(showing & one for one in shown):
+        if not grids or any(showing & earlier for earlier in shown):
             grids.append(grid)
             shown.append(showing)
         seen = [(number[~on], quads[~on]) for (number, quads), on in zip(seen, of_grid, strict=True)]
@@ -177,7 +181,7 @@ def _april_grid(
     last = int(numbers[-1]) - first
     sizes = [(last // n + 1, n) for n in range(2, last + 1)]  # the whole range, or with other grids after it
     sizes += sorted(
-        ((m, n) for n in range(2, last) for m in range(2, last // n + 1)), key=lambda one: -one[0] * one[1]
+        ((m, n) for n in range(2, last) for m in range(2, last // n + 1)), key=lambda size: -size[0] * size[1]
     )
     for down, across in sizes:
         in_last_row = (numbers - first) // across == down - 1
@@ -190,13 +194,15 @@ def _april_grid(
             for number, quads in seen
             for in_grid in [number < first + down * across]
         ]
-        shares = [share for one in parts if (share := _tag_share(*one, middle))]
+        shares = [share for number, quads in parts if (share := _tag_share(number, quads, middle))]
         if len(shares) < 2:
             continue
         share = round(float(np.median(shares)), 3)
         plate = PlateFamily("aprilgrid", 2 * down, 2 * across, (), KALIBR_TAGS, share, first)
         named = [name_corners(number, quads, plate) for number, quads in seen]
-        squares = [_shows_squares(grey, *one, plate) for grey, one in zip(photographs, named, strict=True)]
+        squares = [
+            _shows_squares(grey, xy, code, plate) for grey, (xy, code) in zip(photographs, named, strict=True)
+        ]
         if sum(squares) > 1:
             return plate
     return None
@@ -217,8 +223,8 @@ def _shows_squares(grey: AnyArray, xy: FloatArray, code: IntArray, plate: PlateF
         (plate.tag_share / 16, -plate.tag_share / 2),
     )
     at = [cv2.perspectiveTransform((corner + place)[None], H)[0] for place in places]
-    inside = [np.rint(one).astype(int).clip(0, np.array(grey.shape[::-1]) - 1) for one in at]
-    square, white, black = (float(np.median(grey[one[:, 1], one[:, 0]])) for one in inside)
+    inside = [np.rint(points).astype(int).clip(0, np.array(grey.shape[::-1]) - 1) for points in at]
+    square, white, black = (float(np.median(grey[points[:, 1], points[:, 0]])) for points in inside)
     return square < (white + black) / 2 < white
 
 
@@ -239,17 +245,17 @@ def search_dots(
             continue
         size = size_of_marks(lattice, radius, is_ring)
         for name in GRIDS:
-            whole = [
+            complete = [
                 (plate, place)
                 for place in placements(lattice, PlateFamily(name, 1, 1))
                 if (plate := _whole_plate(name, place)) is not None
             ]
-            if whole and _apart(whole[0][0], whole[0][1], lattice.xy) == name:
-                plate, place = min(whole, key=lambda one: one[0].rows > one[0].columns)
+            if complete and _apart(complete[0][0], complete[0][1], lattice.xy) == name:
+                plate, place = min(complete, key=lambda option: option[0].rows > option[0].columns)
                 seen.setdefault((name, plate.rows, plate.columns), []).append((place, size))
-    for (name, rows, columns), found in sorted(seen.items(), key=lambda one: -len(one[1])):
-        if len(found) > 1:
-            return _with_marks(PlateFamily(name, rows, columns), found)
+    for (name, rows, columns), shown in sorted(seen.items(), key=lambda entry: -len(entry[1])):
+        if len(shown) > 1:
+            return _with_marks(PlateFamily(name, rows, columns), shown)
     return None
 
 
@@ -322,12 +328,12 @@ def _plate_lattice(xy: FloatArray, is_dot: BoolArray) -> Lattice | None:
 
 def _named(photographs: Sequence[AnyArray], plate: PlateFamily, needed: int = 2) -> bool:
     """Return whether enough photographs, at most two, show at least half of the crossings of a board."""
-    found = 0
+    count = 0
     for grey in photographs:
         # the noise does not affect which crossings are found
         saddles, _ = find_crossings(grey, plate, scale=255.0, noise=1.0)
-        found += len(saddles.xy) >= max(plate.count / 2, MIN_CROSSINGS / 2)
-        if found >= min(needed, 2):
+        count += len(saddles.xy) >= max(plate.count / 2, MIN_CROSSINGS / 2)
+        if count >= min(needed, 2):
             return True
     return False
 
@@ -370,10 +376,10 @@ def _apart(plate: PlateFamily, place: IntArray, xy: FloatArray) -> str:
     return min(shifted, key=lambda name: abs(np.log(apart / shifted[name])))
 
 
-def _with_marks(plate: PlateFamily, found: Sequence[tuple[IntArray, FloatArray]]) -> PlateFamily:
+def _with_marks(plate: PlateFamily, placed: Sequence[tuple[IntArray, FloatArray]]) -> PlateFamily:
     """Return a plate with marks at the dots that are larger in two photographs, if they define its turn."""
     tables = []
-    for place, size in found:
+    for place, size in placed:
         place = place - place.min(axis=0)
         table = np.full(place.max(axis=0) + 1, -np.inf)
         table[place[:, 0], place[:, 1]] = size
@@ -387,8 +393,8 @@ def _with_marks(plate: PlateFamily, found: Sequence[tuple[IntArray, FloatArray]]
                 continue
             other = np.full(first.shape, -np.inf)
             other[tuple((turned - low).T)] = second[np.isfinite(second)]
-            both = np.minimum(first, other)
-            row, step = np.nonzero(both > MARK_SIGMAS)
+            smaller = np.minimum(first, other)
+            row, step = np.nonzero(smaller > MARK_SIGMAS)
             column = step // 2 if plate.is_shifted else step
             marks = tuple(zip(row.tolist(), column.tolist(), strict=True))
             marked = PlateFamily(plate.name, plate.rows, plate.columns, marks)
@@ -396,5 +402,5 @@ def _with_marks(plate: PlateFamily, found: Sequence[tuple[IntArray, FloatArray]]
                 refuse_unusable_plate(marked)
             except GeometryError:
                 continue
-            best = max(best, (float(both[row, step].sum()), marked), key=lambda one: one[0])
+            best = max(best, (float(smaller[row, step].sum()), marked), key=lambda option: option[0])
     return best[1]

@@ -118,13 +118,13 @@ class PlateFamily:
         fold = GRIDS[self.name].turns if self.name in GRIDS else 4
         points = self.plane(1.0)[:, :2] @ [1, 1j]
         points -= points.mean()
-        found = []
+        numbers = []
         for turn in range(1, fold):
             away = np.abs(points[:, None] * np.exp(2j * np.pi * turn / fold) - points)
             number = away.argmin(axis=1)
             if away.min(axis=1).max() < MAX_ROUNDING and self._has_colours_of(number):
-                found.append(number)
-        return tuple(found)
+                numbers.append(number)
+        return tuple(numbers)
 
     def _has_colours_of(self, number: IntArray) -> bool:
         """Return whether the first square inside the crossings keeps its colour under a renumbering."""
@@ -207,13 +207,15 @@ def group_plates(plates: Sequence[PlateFamily]) -> PlateGroup:
     return PlateGroup(tuple(grouped))
 
 
-def _look_alike(one: PlateFamily, other: PlateFamily) -> bool:
+def _look_alike(plate: PlateFamily, other: PlateFamily) -> bool:
     """Return whether a finder may take one plate for the other."""
-    if one.name in TAGGED and other.name in TAGGED:
-        apart = one.first_tag > other.last_tag or other.first_tag > one.last_tag
-        return one.dictionary == other.dictionary and not apart
+    if plate.name in TAGGED and other.name in TAGGED:
+        apart = plate.first_tag > other.last_tag or other.first_tag > plate.last_tag
+        return plate.dictionary == other.dictionary and not apart
     crossings = ("checkerboard", "charuco")
-    return (one.name in GRIDS and other.name in GRIDS) or (one.name in crossings and other.name in crossings)
+    return (plate.name in GRIDS and other.name in GRIDS) or (
+        plate.name in crossings and other.name in crossings
+    )
 
 
 def refuse_unusable_plate(plate: PlateFamily) -> None:

@@ -153,13 +153,13 @@ def fit_cells(
             continue
         least, bits = start[k, 0], start[k, 2:]
         # position, spread, glow, ln of the blur over that of the dot
-        found, steps = np.array([start[k, 1], 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
+        best, steps = np.array([start[k, 1], 0.0, 0.0, 0.0]), np.array(_FIRST_STEPS)
         halved = 0
         for _ in range(_ROUNDS):
             before = least
-            for parameter in range(len(found)):
+            for parameter in range(len(best)):
                 for sign in (-1.0, 1.0):
-                    tried = found.copy()
+                    tried = best.copy()
                     tried[parameter] += sign * steps[parameter]
                     if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                         continue
@@ -172,7 +172,7 @@ def fit_cells(
                     cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
                     if cost < least:
                         least = cost
-                        found[:] = tried
+                        best[:] = tried
                         break
             if least == before:
                 halved += 1
@@ -180,13 +180,13 @@ def fit_cells(
                     break
                 steps /= 2
         if not _model(
-            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, found),
+            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, best),
             *(samples, sigma, ring_part, dot_part, W),
         ):
             continue
         if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
             _compare(samples, ring_part, dot_part, W, N, c, out[k])
-            out[k, SPREAD] = found[1]
+            out[k, SPREAD] = best[1]
     return out
 
 

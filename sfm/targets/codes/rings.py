@@ -323,20 +323,20 @@ class RingReader:
         if family.cells == 0:
             return _read_arcs(self.grey, self.xy, self.shape, self.levels, family)
         every = np.arange(len(self.xy))
-        found = self._read_with_radii(every, self.shape, np.zeros((len(every), 2)), family, as_seen=False)
-        unread = np.flatnonzero(found.code < 0)
+        codes = self._read_with_radii(every, self.shape, np.zeros((len(every), 2)), family, as_seen=False)
+        unread = np.flatnonzero(codes.code < 0)
         if not (as_seen and len(unread)):
-            return found
+            return codes
         rings = measure_rings(self.crossings[unread], self.shape[unread], (family.inner, family.outer))
         of = unread[rings.row]
         seen = replace(family, inner=rings.inner, outer=rings.outer)
         again = self._read_with_radii(of, rings.shape, rings.tilt, seen, as_seen=True)
-        found.ringed[of] |= again.ringed
+        codes.ringed[of] |= again.ringed
         read = again.code >= 0
         if not rings.are_other or len(np.unique(again.code[read])) >= MIN_READ:
-            for part, values in zip(found, again, strict=True):
+            for part, values in zip(codes, again, strict=True):
                 part[of[read]] = values[read]
-        return found
+        return codes
 
     def _read_with_radii(
         self, of: IntArray, shape: FloatArray, tilt: FloatArray, family: CodeFamily, *, as_seen: bool
@@ -379,10 +379,10 @@ class RingReader:
         ends = [k for k in range(len(of)) if _ends(contents[k], start[k, 2:])]
         geometry = xy[ends], shape[ends], levels[ends], blur[ends]
         cells = fit_cells(self.grey, *geometry, *proportions, tilt[ends], start[ends])
-        found: list[FloatArray | None] = [None] * len(of)
+        of_dots: list[FloatArray | None] = [None] * len(of)
         for k, fitted in zip(ends, cells, strict=True):
-            found[k] = fitted
-        return found
+            of_dots[k] = fitted
+        return of_dots
 
 
 @compiled
@@ -443,7 +443,7 @@ def _read_arcs(
     return RingCodes(count, confidence, np.full(len(xy), family.outer), count != UNCODED)
 
 
-def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
+def _read_cells(contents: FloatArray, family: CodeFamily, misfit: float) -> tuple[int, float]:
     """Return code number and confidence of one ring from the levels of its cells, see `fit_cells`.
 
     Set and clear cells are separated at the widest gap between their sorted levels, so a shadow across the
@@ -453,9 +453,9 @@ def _read_cells(found: FloatArray, family: CodeFamily, misfit: float) -> tuple[i
     must have the same level on all radii and over its length. A misfit of the model at the dot (in steps),
     for example from sharpening halos, is added to the tolerance for the samples.
     """
-    if not np.isfinite(found).all():
+    if not np.isfinite(contents).all():
         return UNREADABLE, 0.0
-    at_radii, (residual, gap, behind, sigma) = found[:3], found[3:7]
+    at_radii, (residual, gap, behind, sigma) = contents[:3], contents[3:7]
     level = at_radii.mean(axis=0)
     order = np.sort(level)
     jump = np.diff(order)

@@ -130,9 +130,9 @@ def find_tags(photograph: AnyArray, family: TagFamily, *, polarity: str, scale: 
     grey = as_bytes(photograph, scale)
     # OpenCV's search for inverted tags loses upright ones, so the photograph is inverted instead.
     pictures = {"dark": (grey,), "bright": (255 - grey,)}.get(polarity, (grey, 255 - grey))
-    found = [_detect_all(picture, family) for picture in pictures]
-    quads = np.concatenate([corners for corners, _ in found])
-    number = np.concatenate([ids for _, ids in found])
+    detected = [_detect_all(picture, family) for picture in pictures]
+    quads = np.concatenate([corners for corners, _ in detected])
+    number = np.concatenate([ids for _, ids in detected])
     order = np.argsort(number, kind="stable")
     quads, number = quads[order], number[order]
     fits, small, confirmed = _fitted(photograph, quads, number, family, float(scale))
@@ -180,8 +180,8 @@ def _widening(noise: FloatArray) -> FloatArray:
     """
     if not len(noise):
         return noise
-    usual, some = MAX_NOISE_RATIO * float(np.quantile(noise, 0.25)), np.finfo(float).eps
-    return np.asarray(1 + TOGETHER_PX * np.maximum(1 - ((usual + some) / (noise + some)) ** 2, 0.0))
+    usual, tiny = MAX_NOISE_RATIO * float(np.quantile(noise, 0.25)), np.finfo(float).eps
+    return np.asarray(1 + TOGETHER_PX * np.maximum(1 - ((usual + tiny) / (noise + tiny)) ** 2, 0.0))
 
 
 def _modules_px(quads: FloatArray, family: TagFamily) -> FloatArray:
@@ -200,27 +200,27 @@ def _fitted(
         the fit of all modules confirms the code, (t,). Corners of the others are flagged as a poor fit.
     """
     m, grey, noise = family.modules, as_grey(photograph), estimate_noise(photograph)
-    clear = np.array([~tag_modules(family, int(one)) for one in number], dtype=bool).reshape(-1, m, m)
+    clear = np.array([~tag_modules(family, int(tag)) for tag in number], dtype=bool).reshape(-1, m, m)
     small = _modules_px(quads, family) < MIN_MODULE_PX
 
     def fit(quads: FloatArray) -> CornerFits:
         parts = [
-            method(grey, quads[some], _tag_from_pixel(quads[some], m), clear[some], scale, *args)
-            for method, some, args in ((fit_corners, ~small, ()), (fit_whole_tags, small, (noise,)))
+            method(grey, quads[rows], _tag_from_pixel(quads[rows], m), clear[rows], scale, *args)
+            for method, rows, args in ((fit_corners, ~small, ()), (fit_whole_tags, small, (noise,)))
         ]
         back = np.argsort(np.concatenate([np.flatnonzero(~small), np.flatnonzero(small)]))
         return CornerFits(*(np.concatenate(part)[back] for part in zip(*parts, strict=True)))
 
     fits = fit(quads)
-    found = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
-    corners = np.where(found[..., None], fits.theta[..., :2], quads)
+    fitted = np.isfinite(fits.covariance[..., 0, 0]) & (fits.flag & NO_CORNER == 0)
+    corners = np.where(fitted[..., None], fits.theta[..., :2], quads)
     fits, confirmed = fit(corners), np.ones(len(quads), dtype=bool)
     for k in np.flatnonzero(~small):
         reduced, quad, share = _reduced(grey, corners[k], family)
-        one = fit_whole_tags(
+        whole_tag = fit_whole_tags(
             reduced, quad[None], _tag_from_pixel(quad[None], m), clear[k : k + 1], scale, noise * share
         )
-        confirmed[k] = not (one.flag & NO_CORNER).any()
+        confirmed[k] = not (whole_tag.flag & NO_CORNER).any()
     fits.flag[~confirmed] |= Flag.POOR_FIT.value
     return fits, small, confirmed
 

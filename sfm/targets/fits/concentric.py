@@ -170,10 +170,10 @@ def fit_concentric(
     Source: Gauss-Markov model with Levenberg-Marquardt steps.
     """
     length = float(abs(geometry[2] * geometry[4] - geometry[3] ** 2) ** -0.5)
-    found = _pixels(image, geometry)
-    if found is None:
+    pixels = _pixels(image, geometry)
+    if pixels is None:
         return None
-    xy, value = found
+    xy, value = pixels
     prior = np.zeros(UNKNOWNS)
     prior[SPREAD] = (max(noise, math.sqrt(QUANTISATION)) / SPREAD_SIGMA) ** 2
     prior[SHARPENING] = (max(noise, math.sqrt(QUANTISATION)) / SHARPENING_SIGMA) ** 2

@@ -85,19 +85,21 @@ def fit_undamaged(
 
     k = len(start)
     every = fit(start, sign, np.ones((k, RAYS), bool), np.full(k, np.inf))
-    alike = (np.flatnonzero(sign == one) for one in (1, -1))  # light and compression shift edges by polarity
-    classes = [rows[one] for rows in alike for one in sizes_apart(_radii(start[rows]))]
+    alike = (
+        np.flatnonzero(sign == polarity) for polarity in (1, -1)
+    )  # light and compression shift edges by polarity
+    classes = [rows[of_size] for rows in alike for of_size in sizes_apart(_radii(start[rows]))]
     classes = classes or [np.zeros(0, dtype=np.int64)]
-    found = [_repaired(_rows(every, one), sign[one], fit, noise**2, least_variance) for one in classes]
+    repaired = [_repaired(_rows(every, rows), sign[rows], fit, noise**2, least_variance) for rows in classes]
     back = np.argsort(np.concatenate(classes))
 
     def together(parts: Iterable[tuple[FloatArray | IntArray, ...]]) -> Iterator[Any]:
         return (np.concatenate(part)[back] for part in zip(*parts, strict=True))
 
     return (
-        EllipseFits(*together(one[0] for one in found)),
-        np.concatenate([one[1] for one in found])[back],
-        OutlineNoise(*together(one[2] for one in found)),
+        EllipseFits(*together(part[0] for part in repaired)),
+        np.concatenate([part[1] for part in repaired])[back],
+        OutlineNoise(*together(part[2] for part in repaired)),
     )
 
 
@@ -156,7 +158,7 @@ def sizes_apart(radius: FloatArray) -> list[IntArray]:
         small = min(range(len(classes)), key=lambda c: len(classes[c]))
         if len(classes[small]) >= MIN_POPULATION:
             break
-        middle = [float(np.median(np.log(radius[one]))) for one in classes]
+        middle = [float(np.median(np.log(radius[rows]))) for rows in classes]
         beside = [c for c in (small - 1, small + 1) if 0 <= c < len(classes)]
         other = min(beside, key=lambda c: abs(middle[c] - middle[small]))
         low, high = min(small, other), max(small, other)
@@ -202,8 +204,8 @@ def _repaired(
         depth[again & deep] = shallow[again & deep]
         begin = fits.theta[again, : R + 1]
         repaired = fit(begin, sign[again], keep[again], depth[again])
-        for whole, part in zip(fits, repaired, strict=True):
-            whole[again] = part
+        for of_all, part in zip(fits, repaired, strict=True):
+            of_all[again] = part
     seen = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
     weight, sound, telling = seen.weight, seen.sound, seen.telling
     cut = ~keep.all(axis=1)

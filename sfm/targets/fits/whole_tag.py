@@ -139,10 +139,10 @@ def _fit_tag(
     theta[_B : _A + 1] = np.linalg.lstsq(design[used], value[used], rcond=None)[0]
     light: _Light | None = None
     for _ in range(1 + LIGHT_ROUNDS):
-        found = _iterate(theta, P, value, used, black, scale, light)
-        if found is None:
+        solved = _iterate(theta, P, value, used, black, scale, light)
+        if solved is None:
             return Flag.NO_CONVERGENCE.value
-        theta, J, residual = found
+        theta, J, residual = solved
         corners_px = _corners(theta, modules) * scale + middle
         if np.abs(corners_px - quad).max() > FARTHEST_PX:
             return Flag.NO_CONVERGENCE.value
@@ -245,8 +245,8 @@ def _square(modules: int) -> FloatArray:
 
 def _pixels_of(H: FloatArray, places: FloatArray) -> FloatArray:
     """Return positions on the tag in the scaled frame of the pixels, shape (n, 2)."""
-    found = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(H).T
-    return np.asarray(found[:, :2] / found[:, 2:])
+    homogeneous = np.column_stack([places, np.ones(len(places))]) @ np.linalg.inv(H).T
+    return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:])
 
 
 def _corners(theta: FloatArray, modules: int) -> FloatArray:
