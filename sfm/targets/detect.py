@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +34,7 @@ from sfm.targets.measure import (
     fit_ellipse_model,
     judge_fits,
 )
-from sfm.targets.outlines import Flag, estimate_noise, find_outlines, scale_of
+from sfm.targets.outlines import Flag, Outlines, estimate_noise, find_outlines, scale_of
 
 SIGNS = {"dark": (-1,), "bright": (1,), "auto": (1, -1)}
 CENTRES = ("model", "edges", *WEIGHTS)
@@ -165,63 +167,43 @@ def find_targets(
         _of_crossings(saddles, plate.first_point + number)
         for plate, (saddles, number) in zip(boards, crossings, strict=True)
     ]
+    limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     if isinstance(codes, PlateGroup):
-        find_dots = partial(
-            find_targets,
-            photograph,
-            polarity=polarity,
-            centres=centres,
-            min_diameter_px=min_diameter_px,
-            max_diameter_px=max_diameter_px,
-        )
-        return _joined([*parts, *(find_dots(codes=plate) for plate in codes.plates if plate not in boards)])
+        parts += [
+            find_targets(photograph, polarity=polarity, codes=plate, centres=centres, **limits)
+            for plate in codes.plates
+            if plate not in boards
+        ]
+        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(Targets)}
+        return Targets(**{name: np.concatenate(values) for name, values in columns.items()})
     if parts:
         return parts[0]
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
-    grey = as_grey(photograph)
-    limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
     fit = fit_ellipse_model(
         photograph, outlines.xy, outlines.shape, outlines.sign, noise=noise, saturation=scale
     )
     reason = judge_fits(fit, noise=noise, scale=scale, **limits)
     code, confidence = np.full(len(reason), UNCODED), np.zeros(len(reason))
-    levels = np.column_stack([fit.background, fit.contrast])
-    ring_radius = np.zeros(len(reason))
-    if isinstance(family, CodeFamily):
-        legible = find_legible(fit, reason)
-        rings_read = read_codes(
-            grey,
-            fit.xy[legible],
-            fit.shape[legible],
-            levels[legible],
-            family,
-            blur_px=fit.blur[legible],
-            noise=fit.noise[legible],
-        )
-        code[legible], confidence[legible] = rings_read.code, rings_read.confidence
-        ring_radius[legible] = rings_read.outer
-        reason[code >= 0] = 0
+    dots = _Dots(
+        photograph,
+        outlines,
+        fit,
+        reason,
+        code,
+        confidence,
+        ring_radius=np.zeros(len(reason)),
+        polarity=polarity,
+        noise=noise,
+        scale=scale,
+    )
+    reading = READINGS.get(type(family), _Reading())
+    reading.before(family, dots)
     duplicate, off_centre = find_duplicates(fit, outlines.sign, reason, code >= 0)
     reason[duplicate] = Flag.DUPLICATE
-    tags = None
-    if isinstance(family, TagFamily):
-        tags = find_tags(photograph, family, polarity=polarity, scale=scale)
-        reason[(reason == 0) & inside_tags(fit.xy, tags, family)] = Flag.PART_OF_CODE
-    rings = None
-    if isinstance(family, ConcentricFamily):
-        rings = find_concentric(photograph, family, outlines, noise=noise, scale=scale)
-        reason[(reason == 0) & rings.inside(fit.xy)] = Flag.PART_OF_CODE
-    good = reason == 0
-    if isinstance(family, CodeFamily):
-        code[~good] = UNCODED
-        reason[good & find_parts_of_codes(fit, code, confidence, ring_radius)] = Flag.PART_OF_CODE
-    if isinstance(family, PlateFamily):
-        code[good] = _name_dots(fit, outlines.sign, good, family)
-        confidence[code >= 0] = 1.0
-        reason[good & (code < 0)] = Flag.NOT_ON_PLATE.value
-    free = np.flatnonzero((reason == 0) & (code < 0))
-    counter = find_counters(grey, fit.xy[free], fit.shape[free], levels[free])
+    with_tags = reading.after(family, dots)
+    grey, free = as_grey(photograph), np.flatnonzero((reason == 0) & (code < 0))
+    counter = find_counters(grey, fit.xy[free], fit.shape[free], dots.levels[free])
     reason[free[counter]] = Flag.THIN_BACKGROUND.value
     xy, covariance = fit.xy, fit.covariance
     if centres != "model":
@@ -250,25 +232,7 @@ def find_targets(
         rejected_xy=np.vstack([outlines.rejected_xy, outlines.xy[reason != 0]]),
         rejected_flag=np.concatenate([outlines.rejected_flag, reason[reason != 0]]),
     )
-    if rings is not None:
-        return _with_concentric(targets, rings)
-    return targets if tags is None else _with_corners(targets, tags)
-
-
-def _joined(parts: list[Targets]) -> Targets:
-    """Return the targets of several plates in one photograph."""
-    return Targets(
-        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Targets))
-    )
-
-
-def _name_dots(fit: EllipseFit, sign: IntArray, good: BoolArray, plate: PlateFamily) -> IntArray:
-    """Return the plate point of each good target; insides of rings have the other polarity."""
-    if not good.any():
-        return np.zeros(0, dtype=np.int64)
-    semi_axes, _ = axes_from_shape(fit.shape[good])
-    code = name_dots(fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), rings_among(sign[good]), plate)
-    return np.where(code == UNCODED, UNCODED, plate.first_point + code)
+    return with_tags(targets)
 
 
 def _measure_centres(
@@ -279,6 +243,79 @@ def _measure_centres(
         edges = measure_edge_ellipses(grey, fit.xy, fit.shape, sign, noise=noise)
         return edges.xy, edges.covariance
     return measure_centroids(grey, fit.xy, fit.shape, sign, noise=noise, weights=centres)
+
+
+@dataclass(frozen=True)
+class _Dots:
+    """The k fitted dots of a photograph, and what is known of their codes; reading changes the arrays."""
+
+    photograph: AnyArray
+    outlines: Outlines
+    fit: EllipseFit
+    reason: IntArray  # for their rejection, 0 for good ones, (k,)
+    code: IntArray  # number of each, `UNCODED` or `UNREADABLE`, (k,)
+    confidence: FloatArray  # of the code, (k,)
+    ring_radius: FloatArray  # outer radius of the ring around each, in radii of the dot, 0 for none, (k,)
+    polarity: str
+    noise: float
+    scale: float
+
+    @property
+    def levels(self) -> FloatArray:
+        """Intensity of the background and its step to the dot, (k, 2)."""
+        return np.column_stack([self.fit.background, self.fit.contrast])
+
+
+def _read_rings(family: CodeFamily, dots: _Dots) -> None:
+    """Read the rings around legible dots: a code shows that what it surrounds is a target."""
+    fit, legible = dots.fit, find_legible(dots.fit, dots.reason)
+    rings = read_codes(
+        as_grey(dots.photograph),
+        fit.xy[legible],
+        fit.shape[legible],
+        dots.levels[legible],
+        family,
+        blur_px=fit.blur[legible],
+        noise=fit.noise[legible],
+    )
+    dots.code[legible], dots.confidence[legible] = rings.code, rings.confidence
+    dots.ring_radius[legible] = rings.outer
+    dots.reason[dots.code >= 0] = 0
+
+
+def _without_parts_of_rings(_: CodeFamily, dots: _Dots) -> WithTags:
+    good = dots.reason == 0
+    dots.code[~good] = UNCODED
+    parts = find_parts_of_codes(dots.fit, dots.code, dots.confidence, dots.ring_radius)
+    dots.reason[good & parts] = Flag.PART_OF_CODE
+    return _as_they_are
+
+
+def _name_dots(plate: PlateFamily, dots: _Dots) -> WithTags:
+    """Name the good dots by the points of a plate; insides of rings have the other polarity."""
+    good = dots.reason == 0
+    if good.any():
+        semi_axes, _ = axes_from_shape(dots.fit.shape[good])
+        is_ring = rings_among(dots.outlines.sign[good])
+        number = name_dots(dots.fit.xy[good], np.sqrt(semi_axes.prod(axis=1)), is_ring, plate)
+        dots.code[good] = np.where(number == UNCODED, UNCODED, plate.first_point + number)
+    dots.confidence[dots.code >= 0] = 1.0
+    dots.reason[good & (dots.code < 0)] = Flag.NOT_ON_PLATE.value
+    return _as_they_are
+
+
+def _read_tags(family: TagFamily, dots: _Dots) -> WithTags:
+    """Read square tags, whose corners are targets; dots inside them are none."""
+    tags = find_tags(dots.photograph, family, polarity=dots.polarity, scale=dots.scale)
+    dots.reason[(dots.reason == 0) & inside_tags(dots.fit.xy, tags, family)] = Flag.PART_OF_CODE
+    return partial(_with_corners, tags=tags)
+
+
+def _read_concentric(family: ConcentricFamily, dots: _Dots) -> WithTags:
+    """Read concentric tags, whose centres are targets; dots inside them are none."""
+    rings = find_concentric(dots.photograph, family, dots.outlines, noise=dots.noise, scale=dots.scale)
+    dots.reason[(dots.reason == 0) & rings.inside(dots.fit.xy)] = Flag.PART_OF_CODE
+    return partial(_with_concentric, rings=rings)
 
 
 def _of_crossings(saddles: Saddles, code: IntArray) -> Targets:
@@ -355,3 +392,27 @@ def _with_corners(targets: Targets, tags: TagCorners) -> Targets:
         rejected_xy=np.vstack([targets.rejected_xy, tags.rejected_xy]),
         rejected_flag=np.append(targets.rejected_flag, tags.rejected_flag),
     )
+
+
+WithTags = Callable[[Targets], Targets]
+"""returns the measured dots followed by the points that tags define"""
+
+
+def _as_they_are(targets: Targets) -> Targets:
+    return targets
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """How the codes of a kind of family are read."""
+
+    before: Callable[[Any, _Dots], None] = lambda _, __: None  # before one of concentric dots is chosen
+    after: Callable[[Any, _Dots], WithTags] = lambda _, __: _as_they_are  # where each dot is a target
+
+
+READINGS: dict[type, _Reading] = {  # kind of family; without a row, dots have no codes
+    CodeFamily: _Reading(before=_read_rings, after=_without_parts_of_rings),
+    PlateFamily: _Reading(after=_name_dots),
+    TagFamily: _Reading(after=_read_tags),
+    ConcentricFamily: _Reading(after=_read_concentric),
+}

@@ -9,9 +9,8 @@ The code families are those that a survey file, a target sheet or `find_targets`
 - a family of rings with a table needs only the table file;
 - rings by the rule of `ring_patterns` need a row in `rings.RINGS`, all necklaces one in `rings.NECKLACES`;
 - a dictionary of square tags needs a row in `tags.DICTIONARIES`, concentric rings one in `concentric.WIDTHS`;
-- another kind of code needs a module beside these with a type for its families, and a row below. Its reading
-  goes into `sfm.targets.detect`, after that of rings (numbers for measured dots) or of tags (points that it
-  defines).
+- another kind of code needs a module beside these with a type for its families, a row below, and a row of
+  `READINGS` in `sfm.targets.detect`: for numbers of measured dots, as rings, or points of its own, as tags.
 """
 
 from __future__ import annotations
@@ -122,16 +121,12 @@ class PlateFamily:
         for turn in range(1, fold):
             away = np.abs(points[:, None] * np.exp(2j * np.pi * turn / fold) - points)
             number = away.argmin(axis=1)
-            if away.min(axis=1).max() < MAX_ROUNDING and self._has_colours_of(number):
+            if away.min(axis=1).max() >= MAX_ROUNDING:
+                continue
+            row, column = np.divmod(number[[0, self.columns + 1]], self.columns)  # of the first square
+            if self.name != "checkerboard" or int(row.min() + column.min()) % 2 == 0:  # keeps its colour
                 numbers.append(number)
         return tuple(numbers)
-
-    def _has_colours_of(self, number: IntArray) -> bool:
-        """Return whether the first square inside the crossings keeps its colour under a renumbering."""
-        if self.name != "checkerboard":
-            return True
-        row, column = np.divmod(number[[0, self.columns + 1]], self.columns)
-        return int(row.min() + column.min()) % 2 == 0
 
     @property
     def is_ambiguous(self) -> bool:
