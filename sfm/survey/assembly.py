@@ -17,7 +17,6 @@ from sfm.comparison.solutions import Baseline, BaselineComparison, compare_basel
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.judgement.survey_result import CheckPoint, SeenPlate, StageTime, SurveyResult
 from sfm.judgement.verdict import judge_survey
-from sfm.model.conventions import IntArray
 from sfm.model.errors import KolinearError, MissingLibraryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -57,6 +56,8 @@ def assemble_result(
     before = (*measured.left_out, *matched.left_out_image_points)
     correlations = exterior_correlations(adjustment)
     code = naming.codes(adjustment.network)
+    plates = points_of_plates(survey.family, code)
+    sigmas = [plate.plate_sigma or 0.0 for plate in (survey.targets, *survey.plates) if plates]
     result = SurveyResult(
         survey=survey.name,
         unit=survey.unit,
@@ -86,7 +87,7 @@ def assemble_result(
         unused_image_points=solution.unused_image_points + sum(point.image_points for point in before),
         reject=survey.reject,
         weights=survey.adjust.weights,
-        plates=_plates(survey, code),
+        plates=tuple(SeenPlate(points, sigma) for points, sigma in zip(plates, sigmas, strict=True)),
         check_points=_check_points(survey),
         equipment=survey.equipment,
         balance_radius_mm=tuple(
@@ -97,15 +98,6 @@ def assemble_result(
         seconds=tuple(StageTime(stage, seconds) for stage, seconds in clock.seconds),
     )
     return judge_survey(result)
-
-
-def _plates(survey: Survey, code: IntArray) -> tuple[SeenPlate, ...]:
-    """Return the plates of a survey with their points in the result."""
-    plates = points_of_plates(survey.family, code)
-    if not plates:
-        return ()
-    sigma = [plate.plate_sigma or 0.0 for plate in (survey.targets, *survey.plates)]
-    return tuple(SeenPlate(*plate) for plate in zip(plates, sigma, strict=True))
 
 
 def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
@@ -128,7 +120,14 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
     sections: list[tuple[str, Section]] = [(f"camera {camera.name}", camera) for camera in survey.cameras]
     sections += [section for _, source in sources_of(survey) for section in source.settings(survey)]
     sections += [("datum", survey.datum), ("adjust", survey.adjust), ("compare", survey.compare)]
-    rows = [(name, _format_values(section.model_dump())) for name, section in sections]
+    rows = []
+    for name, section in sections:
+        stated = [
+            f"{key} = {_format_value(value)}"
+            for key, value in section.model_dump().items()
+            if key != "name" and value is not None and value != ()
+        ]
+        rows.append((name, "; ".join(stated)))
     given = (
         ("control points", survey.control and survey.control.names),
         ("photographs of [exterior]", survey.exterior and survey.exterior.names),
@@ -136,19 +135,10 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         ("named points", dict.fromkeys(mark.name for mark in survey.marks)),
         ("image points", [name for given in tables_of(survey.observations) for name in given.point]),
     )
-    stated = [f"{len(values)} {name}" for name, values in given if values]
-    if stated:
-        rows.append(("given", ", ".join(stated)))
+    counts = [f"{len(values)} {name}" for name, values in given if values]
+    if counts:
+        rows.append(("given", ", ".join(counts)))
     return tuple(rows)
-
-
-def _format_values(values: dict[str, Any]) -> str:
-    """Format the keys whose values are not empty."""
-    return "; ".join(
-        f"{key} = {_format_value(value)}"
-        for key, value in values.items()
-        if key != "name" and value is not None and value != ()
-    )
 
 
 def _format_value(value: Any) -> str:

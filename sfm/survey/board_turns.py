@@ -10,7 +10,7 @@ names, or by their order.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import NamedTuple
@@ -132,26 +132,20 @@ def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair
         [name for name, k in zip(files.names, files.camera.tolist(), strict=True) if k == camera]
         for camera in (first, second)
     ]
-    numbers = [_numbered(of_camera) for of_camera in names]
+    numbers = []
+    for of_camera in names:
+        by_number: dict[int, list[str]] = {}  # by the last number in a name
+        for name in of_camera:
+            digits = re.findall(r"\d+", PurePosixPath(name).stem)
+            if digits:
+                by_number.setdefault(int(digits[-1]), []).append(name)
+        numbers.append({number: same[0] for number, same in by_number.items() if len(same) == 1})
     ways = [[(numbers[0][k], numbers[1][k]) for k in sorted(numbers[0].keys() & numbers[1].keys())]]
     if len(names[0]) == len(names[1]):
         ways.append(list(zip(*names, strict=True)))
-    return [_pairs_in(row, way) for way in ways]
-
-
-def _pairs_in(row: dict[str, int], names: Iterable[tuple[str, str]]) -> list[Pair]:
-    """Return the pairs of names as rows, without pairs whose photographs are not both measured."""
-    return [Pair(row[left], row[right]) for left, right in names if left in row and right in row]
-
-
-def _numbered(names: Sequence[str]) -> dict[int, str]:
-    """Return the names by the last number in them, without numbers that two names share."""
-    by_number: dict[int, list[str]] = {}
-    for name in names:
-        digits = re.findall(r"\d+", PurePosixPath(name).stem)
-        if digits:
-            by_number.setdefault(int(digits[-1]), []).append(name)
-    return {number: same[0] for number, same in by_number.items() if len(same) == 1}
+    return [
+        [Pair(row[left], row[right]) for left, right in way if left in row and right in row] for way in ways
+    ]  # without pairs whose photographs are not both measured
 
 
 def _common_rig(

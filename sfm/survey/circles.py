@@ -17,7 +17,6 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
-from sfm.survey.inputs.given import Diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import object_scale
@@ -74,8 +73,16 @@ def check_circles(
     if not survey.targets.eccentricity:
         return CircleCheck(network, estimate, names, None)
     names_of_circles = tuple(network.points[j] for j in numbers)
-    known = _known_radius(survey, names_of_circles)
-    remarks = _remark_on_unknown_ids(survey.diameters, network.points)
+    diameter = survey.targets.diameter
+    known = np.full(len(names_of_circles), np.nan if diameter is None else diameter / 2)
+    remarks: tuple[Remark, ...] = ()
+    if survey.diameters is not None:
+        measured = set(network.points)
+        stated = dict(zip(survey.diameters.names, survey.diameters.diameter.tolist(), strict=True))
+        known = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(names_of_circles, known, strict=True)])
+        unknown = [name for name in survey.diameters.names if name not in measured]
+        if unknown:
+            remarks = (remark("names_missing", of="diameters", names=unknown),)
     if np.isfinite(known).any():
         scale = object_scale(network, estimate)
         other: tuple[Remark, ...] = ()
@@ -132,25 +139,6 @@ def _seen_twice(
     )
     rays = np.bincount(seen.point[rows], minlength=len(network.points))
     return np.asarray(rows & (rays[seen.point] >= 2))
-
-
-def _known_radius(survey: Survey, points: tuple[str, ...]) -> FloatArray:
-    """Return the stated radius of each target, NaN where none is stated, object unit, (n,)."""
-    diameter = survey.targets.diameter
-    radius = np.full(len(points), np.nan if diameter is None else diameter / 2)
-    if survey.diameters is not None:
-        stated = dict(zip(survey.diameters.names, survey.diameters.diameter.tolist(), strict=True))
-        radius = np.array([stated.get(p, 2 * r) / 2 for p, r in zip(points, radius, strict=True)])
-    return radius
-
-
-def _remark_on_unknown_ids(given: Diameters | None, points: tuple[str, ...]) -> tuple[Remark, ...]:
-    """Return a remark on ids in the table of diameters that no target of the survey has."""
-    known = set(points)
-    unknown = [name for name in given.names if name not in known] if given is not None else []
-    if given is None or not unknown:
-        return ()
-    return (remark("names_missing", of="diameters", names=unknown),)
 
 
 def _remarks_on_diameters(

@@ -77,9 +77,11 @@ def choose_free_parameters(
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
     alarm = survey.adjust.false_alarm
-    names: Chosen = [
-        _candidates(survey, camera) if a in silent else None for a, camera in enumerate(survey.cameras)
-    ]
+    names: Chosen = [None] * len(survey.cameras)
+    for a in silent:
+        stated = survey.cameras[a]
+        further = OF_PLATES if plate_family(survey.targets) is not None else ()
+        names[a] = {*stated.may_be_free, *MODELS[stated.model].names_of(*further)}
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
     images, points = select_supported(
@@ -113,22 +115,18 @@ def choose_free_parameters(
             chosen if chosen is None else chosen - set(dict(stated.weighted))
             for stated, chosen in zip(settings, alone, strict=True)
         ]
-    cameras = tuple(
-        stated if chosen is None else stated.model_copy(update={"free": _in_order(stated, chosen)})
-        for stated, chosen in zip(settings, names, strict=True)
-    )
+    cameras = []
+    for stated, chosen in zip(settings, names, strict=True):
+        if chosen is not None:
+            in_order = tuple(name for name in MODELS[stated.model].names if name in chosen)
+            stated = stated.model_copy(update={"free": in_order})
+        cameras.append(stated)
     remarks = [
         said
         for a in silent
         for said in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
-    return FreeParameters(cameras, _with_free(estimate, names), tuple(remarks))
-
-
-def _candidates(survey: Survey, settings: CameraSettings) -> set[str]:
-    """Return the parameters of a camera that may be free."""
-    further = MODELS[settings.model].names_of(*OF_PLATES) if plate_family(survey.targets) is not None else ()
-    return {*settings.may_be_free, *further}
+    return FreeParameters(tuple(cameras), _with_free(estimate, names), tuple(remarks))
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:
@@ -191,8 +189,12 @@ def _hold_undetermined(
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
             free = [name for name in chosen or () if (a, index(name)) not in observed]
-            for name in sorted(free, key=lambda name: (_rank(name), -index(name))):
-                now = np.inf if adjusted is None else _corner_shift(adjusted, a, name)
+            first = [name for name in FIRST_HELD if name in free]
+            for name in first + sorted(set(free).difference(first), key=index, reverse=True):
+                now = np.inf
+                if adjusted is not None:  # the shift by one sigma, in half diagonals
+                    sigma = float(adjusted.interior_sigma(a)[index(name)])
+                    now = corner_shift(adjusted.estimate.cameras[a], index(name), sigma)
                 if now > reach:
                     worst, reach = (a, name), now
         if worst is None:
@@ -212,26 +214,15 @@ def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: flo
         )
     except (GeometryError, np.linalg.LinAlgError):
         return None
-    allowed = adjustment.expected_defect + _defect_of_points(part, adjustment)
-    return adjustment if adjustment.converged and adjustment.defect <= allowed else None
-
-
-def _defect_of_points(part: Network, adjustment: Adjustment) -> int:
-    """Return the rank defect that points with rejected rays add; it is not a defect of the cameras."""
+    # points with rejected rays add to the rank defect, which is none of the cameras
     rays = np.bincount(part.image_points.point[~adjustment.rejected], minlength=len(part.points))
     known = np.zeros(len(part.points), dtype=np.int64)  # coordinates, from control
     if adjustment.datum == "control":
         variance = np.diagonal(part.control.covariance, axis1=1, axis2=2)
         np.maximum.at(known, part.control.point, np.isfinite(variance).sum(axis=1))
     left = np.where(rays == 0, 3, np.where(rays == 1, 1, 0))
-    return int(np.maximum(left - known, 0).sum())
-
-
-def _corner_shift(adjusted: Adjustment, a: int, name: str) -> float:
-    """Return the image shift at the corner by one sigma of a parameter, in half diagonals."""
-    camera = adjusted.estimate.cameras[a]
-    s = camera.names.index(name)
-    return corner_shift(camera, s, float(adjusted.interior_sigma(a)[s]))
+    allowed = adjustment.expected_defect + int(np.maximum(left - known, 0).sum())
+    return adjustment if adjustment.converged and adjustment.defect <= allowed else None
 
 
 def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
@@ -243,15 +234,6 @@ def _with_free(estimate: Estimate, names: Chosen) -> Estimate:
         for camera, chosen in zip(estimate.cameras, names, strict=True)
     )
     return replace(estimate, cameras=cameras)
-
-
-def _rank(name: str) -> int:
-    """Return the rank of a parameter in the order of holding where precision does not decide."""
-    return FIRST_HELD.index(name) if name in FIRST_HELD else len(FIRST_HELD)
-
-
-def _in_order(settings: CameraSettings, chosen: set[str]) -> tuple[str, ...]:
-    return tuple(name for name in MODELS[settings.model].names if name in chosen)
 
 
 def _remarks(settings: CameraSettings, units: tuple[str, ...], photographs: int) -> list[Remark]:

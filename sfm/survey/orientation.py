@@ -22,7 +22,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.solvers.choice import refuse_too_large
 from sfm.adjustment.solve import adjust
 from sfm.judgement.model_choice import Choice, solve_likeliest
-from sfm.model.camera import Camera, camera_from_values
+from sfm.model.camera import camera_from_values
 from sfm.model.conventions import BoolArray, IntArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -173,8 +173,11 @@ def _orient_with_best_c(
         orientation = orient_from(estimate)
     except GeometryError as error:
         failure = error
-        if measured.photographs is not None and _most_in_common(network) < MIN_POINTS:
-            raise GeometryError(describe_codes(survey, measured.photographs)) from error
+        if measured.photographs is not None:
+            every = np.ones(len(network.image_points), dtype=bool)
+            most = max(int(common.max(initial=0)) for _, _, common in network.common_points(every))
+            if most < MIN_POINTS:  # points that two photographs share
+                raise GeometryError(describe_codes(survey, measured.photographs)) from error
     wrong_c: tuple[Remark, ...] = ()
     if not given:
         orientation, wrong_c = try_other_principal_distances(
@@ -299,7 +302,16 @@ def _orient_strongest(
     image_points = np.ones(len(network.image_points), dtype=bool)
     part, start = network, estimate
     if not network.named.all():
-        part, start = reduce_network(network, estimate, images, _strongest(network), image_points)
+        seen = network.image_points
+        order = np.argsort(-network.rays(), kind="stable")
+        chosen = network.named.copy()
+        chosen[order[:ORIENTATION_POINTS]] = True
+        rank = np.empty(len(order), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        for rows in rows_of(seen.image, len(network.images)):
+            points = seen.point[rows]
+            chosen[points[np.argsort(rank[points], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
+        part, start = reduce_network(network, estimate, images, chosen, image_points)
     judge = None if measured is None else _circle_judge(measured, part)
     orientation = orient(part, start, refine=refine, contradicting=contradicting, judge=judge)
     if part is network:
@@ -319,26 +331,6 @@ def _orient_strongest(
     return replace(orientation, estimate=estimate, fits=fits, point_failures=failures)
 
 
-def _strongest(network: Network) -> BoolArray:
-    """Choose the points with names, those with the most rays, and some of each photograph, (n,)."""
-    seen = network.image_points
-    order = np.argsort(-network.rays(), kind="stable")
-    chosen = network.named.copy()
-    chosen[order[:ORIENTATION_POINTS]] = True
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    for rows in rows_of(seen.image, len(network.images)):
-        points = seen.point[rows]
-        chosen[points[np.argsort(rank[points], kind="stable")][:POINTS_PER_PHOTOGRAPH]] = True
-    return chosen
-
-
-def _most_in_common(network: Network) -> int:
-    """Return the largest number of points that two photographs share."""
-    every = np.ones(len(network.image_points), dtype=bool)
-    return max(int(common.max(initial=0)) for _, _, common in network.common_points(every))
-
-
 def refine(network: Network, estimate: Estimate) -> Estimate:
     """Adjust a growing network for its approximate values only; see `incremental.sequence.orient`."""
     return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False).estimate
@@ -350,21 +342,25 @@ def _models_with_fisheyes(survey: Survey, measured: Measurements, present: Prese
     if present is not None and _likelihood(present)[1] >= MIN_FITTING_FRACTION * len(
         measured.network.image_points
     ):
-        wide = [a for a in wide if _is_wide(present.orientation.estimate.cameras[a])]
-    if wide:
-        known = measured.cameras if present is None else present.orientation.estimate.cameras
-        yield _with_fisheyes(survey, measured, known, wide)
-
-
-def _with_fisheyes(
-    survey: Survey, measured: Measurements, known: tuple[Camera, ...], wide: Sequence[int]
-) -> tuple[Survey, Measurements]:
-    """Return the survey and start values in which the wide cameras have the fisheye model with a known c."""
+        known = present.orientation.estimate.cameras
+        wide = [a for a in wide if known[a].c_px < WIDE_C * np.hypot(*known[a].size_px) / 2]
+    if not wide:
+        return
+    known = measured.cameras if present is None else present.orientation.estimate.cameras
     cameras, starts = list(survey.cameras), list(measured.cameras)
-    for a in wide:
+    for a in wide:  # with the same c, and the principal point in the middle
+        camera = known[a]
         cameras[a] = cameras[a].model_copy(update={"model": FISHEYE})
-        starts[a] = _as_fisheye(known[a], cameras[a].may_be_free)
-    return replace(survey, cameras=tuple(cameras)), replace(measured, cameras=tuple(starts))
+        pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
+        starts[a] = camera_from_values(
+            camera.name,
+            FISHEYE,
+            camera.size_px,
+            pixel,
+            c_mm=camera.c_px * float(np.mean(pixel)),
+            free=cameras[a].may_be_free,
+        )
+    yield replace(survey, cameras=tuple(cameras)), replace(measured, cameras=tuple(starts))
 
 
 def _gain(before: Present, after: Present) -> float:
@@ -402,18 +398,6 @@ def _fisheyes_of(survey: Survey, after: Oriented) -> list[str]:
     """Return the names of the cameras that have another model than in the survey."""
     pairs = zip(survey.cameras, after.survey.cameras, strict=True)
     return [camera.name for usual, camera in pairs if camera.model != usual.model]
-
-
-def _is_wide(camera: Camera) -> bool:
-    """Return whether the corner of a central perspective with this c is over 45 degrees off the axis."""
-    return bool(camera.c_px < WIDE_C * np.hypot(*camera.size_px) / 2)
-
-
-def _as_fisheye(camera: Camera, free: tuple[str, ...]) -> Camera:
-    """Return start values of the fisheye model with the same c, and the principal point in the middle."""
-    pixel = (float(camera.pixel_mm[0]), float(camera.pixel_mm[1]))
-    c_mm = camera.c_px * float(np.mean(pixel))
-    return camera_from_values(camera.name, FISHEYE, camera.size_px, pixel, c_mm=c_mm, free=free)
 
 
 def _likelihood(oriented: Oriented) -> tuple[float, int]:

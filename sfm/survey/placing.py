@@ -145,20 +145,15 @@ def _fitted(
         step /= size
         R = rotation_from_vector(step[3:6])
         estimate = Similarity(float(np.exp(step[6])), R, step[:3]).apply_estimate(estimate)
-        away = [
-            _over_sigma(kind, reweighted, estimate) for kind, reweighted in zip(kinds, weighted, strict=True)
-        ]
+        away = []  # absolute residuals over the stated sigma
+        for kind, reweighted in zip(kinds, weighted, strict=True):
+            difference = reweighted.linearise(values_of(estimate)).difference
+            away.append(np.asarray(np.abs(difference.reshape(kind.sigma.shape)) / kind.sigma))
         weighted = [
             kind.with_sigma(kind.sigma * np.sqrt(np.maximum(over, 1.0)))
             for kind, over in zip(kinds, away, strict=True)
         ]
     return estimate, sum(float(over.sum()) for over in away)
-
-
-def _over_sigma(kind: Weighted, weighted: Weighted, estimate: Estimate) -> FloatArray:
-    """Return absolute residuals over sigma; `weighted` has the same observations with other weights."""
-    difference = weighted.linearise(values_of(estimate)).difference
-    return np.asarray(np.abs(difference.reshape(kind.sigma.shape)) / kind.sigma)
 
 
 def _rows(kinds: Sequence[Kind], estimate: Estimate) -> tuple[FloatArray, FloatArray]:

@@ -264,9 +264,9 @@ def _readjust_until_converged(
         lambda _: held, lambda _, after: float(after.converged), suffices=lambda _: True
     )
     adjustment = choose(ended, (first_converged,), adjust_holding)
-    return adjustment, () if adjustment is ended else held_to_converge(
-        nearer.cameras, adjustment.estimate.cameras
-    )
+    if adjustment is ended:
+        return ended, ()
+    return adjustment, held_to_converge(nearer.cameras, adjustment.estimate.cameras)
 
 
 def _adjust_with_snooping(

@@ -62,7 +62,6 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
-from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
@@ -124,7 +123,8 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     survey, matched = model.survey, model.matched
     start = _prepare(survey, matched, model.varying)
     free = _free_network(start)
-    plates = _points_of_plates(survey, matched.naming, matched.network)
+    of_plates = points_of_plates(survey.family, matched.naming.codes(matched.network))
+    plates = tuple(tuple(matched.network.points[j] for j in rows) for rows in of_plates)
     task, given = _with_confirmed_values(start, free, plates)
     settled = _settle_with_given(start, free, task, given)
     report_step("adjusting all observations")
@@ -176,12 +176,6 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
         given.tests,
         finished.others,
     )
-
-
-def _points_of_plates(survey: Survey, naming: Naming, network: Network) -> tuple[tuple[str, ...], ...]:
-    """Return the names of the points of each plate; empty without plates."""
-    plates = points_of_plates(survey.family, naming.codes(network))
-    return tuple(tuple(network.points[j] for j in plate) for plate in plates)
 
 
 @dataclass(frozen=True)
@@ -264,7 +258,12 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
-    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, _needed(network))
+    # image points of a source that gives a photograph enough determine it
+    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
+    for k, source in enumerate(network.sources):
+        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
+        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, needed)
     of_its_own = least
     if network.moment is not None:  # the other photographs of a moment determine its pose
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
@@ -276,15 +275,6 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         frame,
         (*unused, *chosen.remarks),
     )
-
-
-def _needed(network: Network) -> IntArray:
-    """Return how many image points each photograph needs: those of a source that gives it enough, (m,)."""
-    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
-    for k, source in enumerate(network.sources):
-        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
-        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
-    return needed
 
 
 def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
@@ -414,23 +404,20 @@ def _settle_with_given(
     if task.datum.kind == "control":
         estimate = hold_fixed(task.network, estimate)
     if given.mounts is not None and len(given.mounts):
-        task, estimate = _with_mounts(task, estimate, given.mounts)
+        scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
+        estimate = hold_mounts(estimate, given.mounts, scaled=scaled)
+        if task.network.observations and task.datum.kind != "control":
+            estimate = place_on_observations(task.network, estimate)
+        task = replace(task, network=with_given_mounts(given.mounts, task.network))
     if free is None:
         return settle_by_photograph(task, estimate)
     if task.datum.kind != "control" and not is_scaled(task.network, estimate):
-        return _with_given(replace(free, task=task))
+        # nothing else is adjusted with the image points, but the network states it
+        every = np.ones(len(task.network.image_points), dtype=bool)
+        part, _ = reduce_network(task.network, free.whole, free.images, free.points, every)
+        return replace(free, task=task, adjustment=replace(free.adjustment, network=part))
     settled = settle(task, estimate, free.accepted).after(free)
     return replace(settled, held=settled.held or free.held)
-
-
-def _with_mounts(task: Task, estimate: Estimate, mounts: MountObservations) -> tuple[Task, Estimate]:
-    """Return the task and start values with the given mounts."""
-    scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
-    estimate = hold_mounts(estimate, mounts, scaled=scaled)
-    network = with_given_mounts(mounts, task.network)
-    if task.network.observations and task.datum.kind != "control":
-        estimate = place_on_observations(task.network, estimate)
-    return replace(task, network=network), estimate
 
 
 def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Final:
@@ -458,8 +445,17 @@ def _gain_of_start(before: _Final, again: _Final) -> float:
 
 
 def _report_start(before: _Final, again: _Final) -> _Final:
-    """Return the final adjustment with the remark on its start."""
-    return replace(again, remarks=(_remark_on_better_start(before.adjustment, before.others[0]),))
+    """Return the final adjustment with the remark on its start, a solution of smaller v'Pv."""
+    other, cameras = before.others[0], before.adjustment.estimate.cameras
+    first = next(camera for camera in cameras if camera.name == other.camera)
+    said = remark(
+        "better_solution_taken",
+        camera=other.camera,
+        first=(first.parameters[0], other.unit),
+        better=(other.c, other.unit),
+        vPv=other.vPv,
+    )
+    return replace(again, remarks=(said,))
 
 
 BETTER_START = Choice(_with_better_start, _gain_of_start, report=_report_start)
@@ -495,14 +491,6 @@ def _free_network_in_frame(before: Estimate, free: Estimate, task: Task, given: 
     lost = task.needed == 1  # control seen by one photograph: its given coordinates determine it
     points = np.where((lost & ~free.determined)[:, None], before.points, free.points)
     return replace(free, points=points)
-
-
-def _with_given(settled: StableAdjustment) -> StableAdjustment:
-    """Return the adjustment with the network of its task, which also has the given values."""
-    network = settled.task.network
-    every = np.ones(len(network.image_points), dtype=bool)
-    part, _ = reduce_network(network, settled.whole, settled.images, settled.points, every)
-    return replace(settled, adjustment=replace(settled.adjustment, network=part))
 
 
 def _solutions_of_pair(final: Adjustment) -> tuple[Estimate, ...]:
@@ -542,16 +530,4 @@ def _dropped_photographs(start: _Prepared, settled: StableAdjustment) -> tuple[t
             task.network.images, start.estimate.oriented, settled.images, task.least, strict=True
         )
         if was and not is_in
-    )
-
-
-def _remark_on_better_start(final: Adjustment, other: OtherSolution) -> Remark:
-    """Return the remark that the network was adjusted again from a solution of smaller v'Pv."""
-    first = final.estimate.cameras[[camera.name for camera in final.estimate.cameras].index(other.camera)]
-    return remark(
-        "better_solution_taken",
-        camera=other.camera,
-        first=(first.parameters[0], other.unit),
-        better=(other.c, other.unit),
-        vPv=other.vPv,
     )

@@ -168,11 +168,13 @@ def describe_codes(survey: Survey, photographs: MeasuredPhotographs) -> str:
     codes = [int((of_photograph.code >= 0).sum()) for of_photograph in photographs.targets]
     with_codes = sum(count > 0 for count in codes)
     settings = survey.targets
+    of_each = (f"{name}: {count}" for name, count in zip(photographs.names, codes, strict=True))
+    codes_read = f" ({listed(of_each, most=10)})" if with_codes else ""
     return (
         f"no two photographs have {MIN_POINTS} coded targets in common, which their orientation needs: "
         f"{counted(sum(targets), 'target')} found in {counted(len(targets), 'photograph')}, "
         f"{counted(sum(codes), 'code')} read in "
-        f"{with_codes} of them{_list_codes_read(photographs, codes)}; check in [targets] "
+        f"{with_codes} of them{codes_read}; check in [targets] "
         f"codes = '{settings.codes}', "
         f"polarity = '{settings.polarity}' and min_diameter_px = {settings.min_diameter_px:g}"
         f"{_describe_size(survey, photographs)}{_other_settings(survey, photographs)}"
@@ -225,14 +227,6 @@ def _describe_size(survey: Survey, photographs: MeasuredPhotographs) -> str:
         f"{survey.targets.min_diameter_px:g}; codes "
         f"are read from dots of {MIN_DOT_PX:g} px on in sharp photographs"
     )
-
-
-def _list_codes_read(photographs: MeasuredPhotographs, codes: list[int]) -> str:
-    """List how many codes were read in each of the first photographs, if any were."""
-    if not any(codes):
-        return ""
-    shown = (f"{name}: {count}" for name, count in zip(photographs.names, codes, strict=True))
-    return f" ({listed(shown, most=10)})"
 
 
 def _other_settings(survey: Survey, photographs: MeasuredPhotographs) -> str:

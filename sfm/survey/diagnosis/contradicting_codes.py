@@ -67,7 +67,15 @@ def find_contested_codes(
     for image, codes in foreign.items():
         group = next(group for group in groups if image in group)
         others = [photographs.names[k] for k in sorted(group & foreign.keys() - {image})]
-        left_out[image] = _reason_for_other_object(codes, others, plate=bool(plates_of(family)))
+        if plates_of(family):  # perhaps another part of a plate
+            reason = remark(
+                "plate_points_apart", points=list(map(str, sorted(codes))), agreeing=others or None
+            )
+        else:
+            reason = remark(
+                "photograph_of_second_object", codes=list(map(str, sorted(codes))), agreeing=others or None
+            )
+        left_out[image] = reason
     main = {
         code: place
         for code, places in contested.items()
@@ -226,14 +234,6 @@ def _majority_point(places: dict[int, frozenset[int]], group: frozenset[int]) ->
     """Return the point at which most photographs of a group show a code, UNNAMED without one."""
     counted = Counter(k for image, at in places.items() if image in group for k in at if k != UNNAMED)
     return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
-
-
-def _reason_for_other_object(codes: set[int], agreeing: list[str], *, plate: bool) -> Remark:
-    """Return why a photograph of another object, or of another part of a plate, is not in the result."""
-    numbers = [str(code) for code in sorted(codes)]
-    if plate:
-        return remark("plate_points_apart", points=numbers, agreeing=agreeing or None)
-    return remark("photograph_of_second_object", codes=numbers, agreeing=agreeing or None)
 
 
 def _number(code: int, naming: Naming) -> int:

@@ -107,7 +107,19 @@ def explain_lost_photographs(network: Network, orientation: Orientation) -> Orie
             count = int(np.isin(_points_of(network, [i]), group.shared).sum())
             reasons[network.images[i]] = remark("photograph_with_few_points", seen=count, needed=MIN_POINTS)
     groups.sort(key=lambda group: -len(group.images))
-    remarks = (_remark_on_unconnected(network, oriented, group) for group in groups)
+    remarks = []
+    for group in groups:
+        theirs = _most_seen_points(network, group.images)
+        unconnected = remark(
+            "not_connected",
+            photographs=[network.images[i] for i in group.images],
+            oriented=int(oriented.sum()),
+            shared=[network.points[j] for j in group.shared if network.named[j]] or None,
+            needed=MIN_POINTS,
+            points=theirs if len(theirs) >= MIN_POINTS else None,
+            others=_most_seen_points(network, np.flatnonzero(oriented)) or None,
+        )
+        remarks.append(unconnected)
     failures = tuple((image, reasons[image]) for image, _ in orientation.failures)
     return replace(orientation, failures=failures, remarks=(*orientation.remarks, *remarks))
 
@@ -194,7 +206,11 @@ def try_other_principal_distances(
     best = choose(orientation, (row,), orient, false_alarm=false_alarm)
     if best is None or best is orientation:
         return orientation, ()
-    taken = _with_original_freedom(best, estimate) if free else orientation
+    taken = orientation
+    if free:  # the same parameters as in the start values
+        pairs = zip(best.estimate.cameras, estimate.cameras, strict=True)
+        cameras = tuple(replace(after, free=before.free) for after, before in pairs)
+        taken = replace(best, estimate=replace(best.estimate, cameras=cameras))
     if single:
         return taken, ()
     remarks = tuple(
@@ -215,15 +231,6 @@ def try_other_principal_distances(
 def _count_oriented(orientation: Orientation | None) -> int:
     """Return the number of oriented photographs."""
     return 0 if orientation is None else int(orientation.estimate.oriented.sum())
-
-
-def _with_original_freedom(orientation: Orientation, estimate: Estimate) -> Orientation:
-    """Return the orientation with the same free parameters as the start values."""
-    cameras = tuple(
-        replace(new, free=old.free)
-        for new, old in zip(orientation.estimate.cameras, estimate.cameras, strict=True)
-    )
-    return replace(orientation, estimate=replace(orientation.estimate, cameras=cameras))
 
 
 def _count_unexplained(network: Network, orientation: Orientation) -> int:
@@ -255,20 +262,6 @@ def _with_c(estimate: Estimate, factor: float, *, free: bool) -> Estimate:
         adjusted = camera.free | focal if free else np.zeros_like(camera.free)
         cameras.append(replace(camera.with_parameters(p), free=adjusted))
     return replace(estimate, cameras=tuple(cameras))
-
-
-def _remark_on_unconnected(network: Network, oriented: BoolArray, group: LostGroup) -> Remark:
-    """Return the remark on a group of photographs that is not connected, with points to connect it."""
-    theirs = _most_seen_points(network, group.images)
-    return remark(
-        "not_connected",
-        photographs=[network.images[i] for i in group.images],
-        oriented=int(oriented.sum()),
-        shared=[network.points[j] for j in group.shared if network.named[j]] or None,
-        needed=MIN_POINTS,
-        points=theirs if len(theirs) >= MIN_POINTS else None,
-        others=_most_seen_points(network, np.flatnonzero(oriented)) or None,
-    )
 
 
 def _most_seen_points(network: Network, images: IntArray) -> list[str]:

@@ -191,7 +191,13 @@ def given_by(
     for placement, item in zip(used, items, strict=True):
         assert temperature is not None
         own = item.points if isinstance(item, Bar) else equipment.tables[placement.name].texts[0]
-        points = _points(placement, own, 2 if isinstance(item, Bar) else len(own), where)
+        count = 2 if isinstance(item, Bar) else len(own)
+        points = tuple(placement.points or own)
+        if len(points) != count or len(set(points)) < count:
+            raise SurveyFileError(
+                f"{where}: equipment '{placement.name}': points = {listed(list(points)) or 'none'}, needed "
+                f"{count} different names, in the order of the equipment file"
+            )
         places = places_of.setdefault(placement.name, [])
         if frozenset(points) in places:
             raise SurveyFileError(
@@ -223,17 +229,6 @@ def given_by(
             )
         )
     return GivenEquipment(tuple(bars), tuple(frames), tuple(placed))
-
-
-def _points(placement: EquipmentSettings, names: Names, count: int, where: str) -> Names:
-    """Return the names of the points of an item in the survey."""
-    points = placement.points or names
-    if len(points) != count or len(set(points)) < count:
-        raise SurveyFileError(
-            f"{where}: equipment '{placement.name}': points = {listed(list(points)) or 'none'}, needed "
-            f"{count} different names, in the order of the equipment file"
-        )
-    return tuple(points)
 
 
 def _frame(

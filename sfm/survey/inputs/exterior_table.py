@@ -114,7 +114,13 @@ def read_observed_exterior(path: Path, *, of: str = "image") -> ObservedExterior
             deviation = (
                 table.values[:, columns.index(sigmas[k])] if sigmas else np.where(np.isnan(given), given, 0.0)
             )
-            _refuse_halves(table, given, deviation, name, sigmas[k] if sigmas else "")
+            for row in np.flatnonzero(np.isnan(given) != np.isnan(deviation))[:1]:
+                halves = name, sigmas[k] if sigmas else ""
+                empty, other = halves if np.isnan(given[row]) else halves[::-1]
+                raise SurveyFileError(
+                    f"{table.place(row)}: column {empty} is empty beside a value in {other}; needed "
+                    "both, sigma 0 for a fixed value, or neither for one that was not observed"
+                )
             value[:, place + k], sigma[:, place + k] = given, deviation
     return _observed_exterior(table, value, sigma, of)
 
@@ -174,16 +180,6 @@ def mount_observations(
     return MountObservations(
         np.array(mounted_cameras, dtype=np.int64), value[:, :3], value[:, 3:], covariance
     )
-
-
-def _refuse_halves(table: CsvTable, given: FloatArray, sigma: FloatArray, name: str, sigma_name: str) -> None:
-    """Refuse a value without its sigma and a sigma without its value."""
-    for k in np.flatnonzero(np.isnan(given) != np.isnan(sigma))[:1]:
-        empty, other = (name, sigma_name) if np.isnan(given[k]) else (sigma_name, name)
-        raise SurveyFileError(
-            f"{table.place(k)}: column {empty} is empty beside a value in {other}; needed "
-            "both, sigma 0 for a fixed value, or neither for one that was not observed"
-        )
 
 
 def _refuse_impossible(table: CsvTable, value: FloatArray, sigma: FloatArray) -> None:

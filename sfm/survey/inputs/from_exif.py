@@ -52,10 +52,12 @@ def exterior_from_exif(survey: Survey, files: PhotographList) -> tuple[Survey, t
         )
     near = plausible_positions(positions)
     if not near:
+        names, (_, places) = list(positions), local_coordinates(tuple(positions.values()))
+        farthest = names[int(np.linalg.norm(places[:, :2] - places[0, :2], axis=1).argmax())]
         raise SurveyFileError(
             f"{survey.source}: [exterior] exif_sigma_m: the positions in EXIF data of "
             f"{counted(len(positions), 'photograph')} are in places more than {MAX_DISTANCE_M / 1000:g} km "
-            f"apart, as {' and '.join(_farthest(positions))}, and none has most of them; remove the "
+            f"apart, as {names[0]} and {farthest}, and none has most of them; remove the "
             "wrong ones, or give a file"
         )
     origin, exterior = observed_positions(near, survey.exif_sigma_m, survey.unit)
@@ -203,12 +205,6 @@ def plausible_positions(positions: Mapping[str, SatellitePosition]) -> dict[str,
     if 2 * near.sum() <= len(near):
         return {}
     return {name: position for (name, position), keep in zip(positions.items(), near, strict=True) if keep}
-
-
-def _farthest(positions: Mapping[str, SatellitePosition]) -> tuple[str, str]:
-    """Return the names of the first photograph and of the photograph farthest from it."""
-    names, (_, places) = list(positions), local_coordinates(tuple(positions.values()))
-    return names[0], names[int(np.linalg.norm(places[:, :2] - places[0, :2], axis=1).argmax())]
 
 
 def observed_positions(

@@ -273,9 +273,16 @@ def refuse_incomplete_cameras(
     """
     lines = []
     for number, camera in enumerate(settings):
-        wanted = _wanted(camera)
-        paths = [photographs.paths[k] for k in np.flatnonzero(photographs.camera == number)]
-        metadata = _readable(paths) if wanted else []
+        said = {name for name, _ in (*camera.fixed, *camera.start, *camera.weighted, *camera.balanced)}
+        wanted = []  # (key of the survey file, attribute of `Metadata`)
+        if camera.pixel_mm is None and camera.sensor_mm is None:
+            wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
+        if camera.c_mm is None and not said & {"c", "fx", "f"}:
+            wanted.append(("c_mm", "focal_mm"))
+        metadata = []
+        for k in np.flatnonzero(photographs.camera == number) if wanted else ():
+            with suppress(PhotographError, OSError):  # the others are reported when they are measured
+                metadata.append(read_metadata(photographs.paths[k]))
         missing = [
             key for key, attribute in wanted if metadata and not any(getattr(m, attribute) for m in metadata)
         ]
@@ -285,23 +292,3 @@ def refuse_incomplete_cameras(
         raise SurveyFileError(
             f"{source}: EXIF data of the photographs lack values that are needed: {'; '.join(lines)}"
         )
-
-
-def _wanted(camera: CameraSettings) -> list[tuple[str, str]]:
-    """Return (key of the survey file, attribute of `Metadata`) of values that a camera does not state."""
-    said = {name for name, _ in (*camera.fixed, *camera.start, *camera.weighted, *camera.balanced)}
-    wanted = []
-    if camera.pixel_mm is None and camera.sensor_mm is None:
-        wanted.append(("pixel_mm or sensor_mm", "pixel_mm"))
-    if camera.c_mm is None and not said & {"c", "fx", "f"}:
-        wanted.append(("c_mm", "focal_mm"))
-    return wanted
-
-
-def _readable(paths: Sequence[Path]) -> list[Metadata]:
-    """Return the metadata of the readable photographs; the others are reported when they are read."""
-    metadata = []
-    for path in paths:
-        with suppress(PhotographError, OSError):
-            metadata.append(read_metadata(path))
-    return metadata

@@ -122,7 +122,9 @@ def find_covering_points(
     shapes = [estimate.cameras[lens].size_px[::-1] for lens in camera]
     covered = CoveredPixels(shapes)
     grey = GreyPhotographs(photographs.__getitem__)
-    parts = [_no_points()]
+    none = np.zeros(0, dtype=np.int64)
+    nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    parts = [CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), 0)]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
@@ -363,10 +365,3 @@ def _concatenate_points(parts: Sequence[CoveringPoints]) -> CoveringPoints:
         np.concatenate([part.residuals for part in parts]),
         sum(part.matched for part in parts),
     )
-
-
-def _no_points() -> CoveringPoints:
-    """Return an empty set of points."""
-    none = np.zeros(0, dtype=np.int64)
-    nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), 0)

@@ -71,7 +71,16 @@ class MeasuredStore:
             path = self._path(self.folder, key)
             if path.stat().st_size > MAX_ENTRY_BYTES:
                 return None
-            measured = _unpacked(path.read_bytes(), kind)
+            data = path.read_bytes()
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                if sum(entry.file_size for entry in archive.infolist()) > len(data):
+                    raise ValueError("entries are stored as they are, these are packed")
+            with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+                arrays = {f.name: stored[f.name] for f in fields(kind.type)}
+            for apart in (True, False):
+                if len({len(a) for name, a in arrays.items() if name.startswith(kind.apart) == apart}) != 1:
+                    raise ValueError("arrays of different length")
+            measured = kind.type(**arrays)
             os.utime(path)  # marks it as used now
             return measured
         except (OSError, ValueError, TypeError, EOFError, KeyError, MemoryError, zipfile.BadZipFile):
@@ -168,16 +177,3 @@ def _code_version(measuring: tuple[str, ...]) -> str:
     for _, source in sorted(sources_of(*measuring).items()):
         digest.update(source.encode())
     return digest.hexdigest()
-
-
-def _unpacked(data: bytes, kind: Kind[M]) -> M:
-    """Return stored measurements; raise ValueError or KeyError if the data are not as they were written."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > len(data):
-            raise ValueError("entries are stored as they are, these are packed")
-    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        arrays = {f.name: stored[f.name] for f in fields(kind.type)}
-    for apart in (True, False):
-        if len({len(a) for name, a in arrays.items() if name.startswith(kind.apart) == apart}) != 1:
-            raise ValueError("arrays of different length")
-    return kind.type(**arrays)

@@ -129,10 +129,17 @@ def cover_photographs(
         hidden=hidden,
         threads=jobs,
     )
-    covered = without_far_points(_visible(hidden, covered), estimate)
+    if hidden is not None:
+        of_covered = covered.image_points
+        kept = hidden.free_positions(of_covered.image, of_covered.xy)
+        shown = np.bincount(of_covered.point[kept], minlength=len(covered.points)) >= 2
+        covered = _some_points(covered, shown, kept)
+    covered = without_far_points(covered, estimate)
     apart = points_apart(seen, fits, settings.window_px, n_points=len(network.points))
     if len(covered.image_points) < (fits & apart[seen.point]).sum():
-        return _tie_points(measured, estimate, apart)
+        images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(seen), dtype=bool)
+        tied, values = reduce_network(network, estimate, images, apart, rays)
+        return Surface(tied, values, measured.overlays, ())
     points = tuple(f"t{j + 1:05d}" for j in range(len(covered.points)))
     order = np.argsort(covered.image_points.point, kind="stable")
     covariance = covered.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
@@ -151,13 +158,6 @@ def cover_photographs(
     return Surface(
         covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(covered)
     )
-
-
-def _tie_points(measured: Measurements, estimate: Estimate, kept: BoolArray) -> Surface:
-    """Return the network of some of the tie points, (n,)."""
-    network = measured.network
-    images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(network.image_points), dtype=bool)
-    return Surface(*reduce_network(network, estimate, images, kept, rays), measured.overlays, ())
 
 
 def remarks_on_disagreement(covering: CoveringPoints) -> tuple[Remark, ...]:
@@ -287,16 +287,6 @@ def _coded_points(seen: Sequence[tuple[int, Targets]], network: Network, estimat
         np.concatenate(rays or [np.zeros((0, 2))]), image, point, estimate.position, estimate.rotation
     ).points
     return np.asarray(points[np.isfinite(points).all(axis=1)])
-
-
-def _visible(hidden: CoveredPixels | None, covering: CoveringPoints) -> CoveringPoints:
-    """Return the covering points that two photographs show where these are not masked."""
-    seen = covering.image_points
-    if hidden is None:
-        return covering
-    kept = hidden.free_positions(seen.image, seen.xy)
-    good = np.bincount(seen.point[kept], minlength=len(covering.points)) >= 2
-    return _some_points(covering, good, kept)
 
 
 def without_far_points(covering: CoveringPoints, estimate: Estimate) -> CoveringPoints:

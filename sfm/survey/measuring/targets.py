@@ -75,12 +75,20 @@ def measure_photographs(
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
     family = survey.family
+
+    def read_and_measure(path: Path) -> tuple[Metadata, Targets, bool]:
+        targets, stored = measure_photograph(
+            path, survey.targets, family, store
+        )  # first: it reports faults of a file best
+        return read_metadata(path), targets, stored
+
+    def picture(read: tuple[Metadata, Targets, bool]) -> bytes:
+        return read[1].xy.tobytes() if len(read[1]) >= MIN_COMMON else b""
+
     measured, failed = each_photograph(
         photographs,
-        lambda path: _read_and_measure(path, survey.targets, family, store),
-        picture=lambda of_photograph: (
-            of_photograph[1].xy.tobytes() if len(of_photograph[1]) >= MIN_COMMON else b""
-        ),
+        read_and_measure,
+        picture=picture,
         jobs=jobs,
         progress=progress,
     )
@@ -108,15 +116,6 @@ def measure_photographs(
         failed,
         tuple(measured[k][2] for k in order),
     )
-
-
-def _read_and_measure(
-    path: Path, settings: TargetSettings, family: TargetFamily | None, store: MeasuredStore | None
-) -> tuple[Metadata, Targets, bool]:
-    targets, stored = measure_photograph(
-        path, settings, family, store
-    )  # first: it reports faults of a file best
-    return read_metadata(path), targets, stored
 
 
 def measure_photograph(
@@ -320,8 +319,12 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
         for size, rows in sorted(counted.items()):
             if size == main:
                 continue
-            what = _kind(size, main)
-            held = _is_held(camera) and what != RESAMPLED
+            ratio = (size[0] / size[1]) / (main[0] / main[1])
+            what = RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
+            what = UPRIGHT if size == main[::-1] else what
+            # at given values, which apply to the whole format only
+            held = bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
+            held = held and what != RESAMPLED
             if len(rows) < MIN_OWN or held:
                 reason = remark(
                     "photograph_of_other_size",
@@ -380,18 +383,6 @@ def _main_size(camera: CameraSettings, counted: dict[Size, list[int]]) -> Size |
     if camera.size_px is not None or not counted:
         return None
     return max(counted, key=lambda size: (len(counted[size]), -counted[size][0]))
-
-
-def _kind(size: Size, main: Size) -> str:
-    if size == main[::-1]:
-        return UPRIGHT
-    ratio = (size[0] / size[1]) / (main[0] / main[1])
-    return RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
-
-
-def _is_held(camera: CameraSettings) -> bool:
-    """Return whether a camera is held at given values, which apply to its whole format only."""
-    return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 
 
 def _resized(

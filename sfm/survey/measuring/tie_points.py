@@ -82,9 +82,14 @@ def tie_photographs(
     """
     settings, masks = survey.texture, Masks(survey.masks)
     name_of = dict(zip(files.paths, files.names, strict=True))
+
+    def read_and_detect(path: Path) -> tuple[Metadata, NaturalPoints, bool]:
+        natural, stored = natural_points_of(path, name_of[path], settings, masks, store)
+        return read_metadata(path), natural, stored  # after the pixels, as for targets
+
     detected, failed = each_photograph(
         files,
-        lambda path: _read(path, name_of[path], settings, masks, store),
+        read_and_detect,
         picture=_picture,
         jobs=jobs,
         progress=progress,
@@ -212,13 +217,6 @@ def drawn_windows(network: Network, paths: Sequence[Path], window_px: int) -> tu
         none = np.zeros(0, dtype=np.int64)
         drawn.append(PhotographTargets(name, path, xy, radius, np.zeros(len(xy)), np.zeros((0, 2)), none))
     return tuple(drawn)
-
-
-def _read(
-    path: Path, name: str, settings: TiePointSettings, masks: Masks, store: MeasuredStore | None
-) -> tuple[Metadata, NaturalPoints, bool]:
-    natural, stored = natural_points_of(path, name, settings, masks, store)  # first: as for targets
-    return read_metadata(path), natural, stored
 
 
 def _picture(read: tuple[Metadata, NaturalPoints, bool]) -> bytes:

@@ -45,11 +45,10 @@ from sfm.survey.sources.source import Correspondences, SurveySource
 
 def sources_of(survey: Survey | SurveyFile) -> tuple[tuple[Declared, SurveySource], ...]:
     """Return the sources of a survey, each with its row."""
-    return tuple((row, _module_of(row)) for row in declared(survey))
-
-
-def _module_of(row: Declared) -> SurveySource:
-    return cast(SurveySource, import_module(f"sfm.survey.sources.{row.source.name}").SOURCE)
+    return tuple(
+        (row, cast(SurveySource, import_module(f"sfm.survey.sources.{row.source.name}").SOURCE))
+        for row in declared(survey)
+    )
 
 
 def measure_sources(
@@ -248,22 +247,19 @@ def _joined(
         )
     once = without_repeated(ImagePoints.joined(parts), sources)
     contradicting = tuple(f"{points[j]} in {images[i]}" for i, j in once.contradicting)
-    network = network_of(survey, images, camera, points, once.image_points, bars=_all_bars(bars))
-    return replace(network, sources=sources), _Repeated(once.remarks, contradicting)
-
-
-def _all_bars(bars: Sequence[ScaleBars]) -> ScaleBars:
-    table = [
+    tables = [
         of_source.table if len(of_source.table) else np.zeros(len(of_source), dtype=np.int64)
         for of_source in bars
     ]
-    return ScaleBars(
+    all_bars = ScaleBars(
         np.concatenate([of_source.start for of_source in bars]),
         np.concatenate([of_source.end for of_source in bars]),
         np.concatenate([of_source.length for of_source in bars]),
         np.concatenate([of_source.sigma for of_source in bars]),
-        np.concatenate(table),
+        np.concatenate(tables),
     )
+    network = network_of(survey, images, camera, points, once.image_points, bars=all_bars)
+    return replace(network, sources=sources), _Repeated(once.remarks, contradicting)
 
 
 def _joined_overlays(overlays: Sequence[Sequence[PhotographTargets]]) -> tuple[PhotographTargets, ...]:

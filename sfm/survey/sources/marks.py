@@ -85,11 +85,6 @@ def measure_marks(survey: Survey, files: PhotographList = NO_PHOTOGRAPHS, **_: o
     return read_tables(survey, (table,), files)
 
 
-def _path_of(survey: Survey, mark: PointSettings) -> Path:
-    """Return the file of the photograph of a mark, which may be of an earlier epoch."""
-    return path_inside(survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside)
-
-
 def match_marks(
     oriented: Oriented, measured: Measurements, start: Orientation, *, jobs: int = 1
 ) -> Correspondences:
@@ -275,7 +270,8 @@ def _scene_with(
 ) -> tuple[TemplateScene, int] | None:
     """Return the scene with the photograph of a mark, and which it is; None if it is not oriented."""
     if mark.image not in files.names:
-        with_earlier = _with_earlier(scene, grey_of(read_photograph(_path_of(survey, mark))))
+        path = path_inside(survey.folder, mark.image, survey.source, allow_outside=survey.allow_outside)
+        with_earlier = _with_earlier(scene, grey_of(read_photograph(path)))
         return None if with_earlier is None else (with_earlier, with_earlier.earlier)
     images = scene.network.images
     i = images.index(mark.image) if mark.image in images else -1

@@ -78,10 +78,6 @@ class Complete(Protocol):
     ) -> Correspondences: ...
 
 
-def _no_settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
-    return ()
-
-
 class MeasureOne(Protocol):
     """Measures what a photograph shows by itself, and stores it.
 
@@ -107,7 +103,7 @@ class SurveySource:
     measure: Measure
     complete: Complete
     # (table of the survey file, its settings)
-    settings: Callable[[Survey], tuple[tuple[str, Section], ...]] = _no_settings
+    settings: Callable[[Survey], tuple[tuple[str, Section], ...]] = lambda _: ()
     measure_one: MeasureOne | None = None  # None: nothing is measured in a photograph by itself
 
 
