@@ -275,28 +275,18 @@ def _advice_on_mistake(text: str, message: str, repeated: Collection[str]) -> st
     number = int(position[1]) if position else 0
     line = text.splitlines()[number - 1] if 0 < number <= text.count("\n") + 1 else ""
     if (section := _SECTION.match(line)) and message.startswith(("Cannot declare", "Cannot overwrite")):
-        return f", line {number}: {_advice_on_duplicate(text.splitlines(), number, section[1], repeated)}"
+        sections = (_SECTION.match(earlier) for earlier in text.splitlines()[: number - 1])
+        name = section[1]
+        first = next((k for k, other in enumerate(sections, 1) if other and other[1] == name), None)
+        shown = as_plain(name[:MAX_SAID])
+        where = "" if first is None else f", first in line {first}"
+        write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"
+        return f", line {number}: [{shown}] is there twice{where}; {write}"
     if message.startswith("Cannot overwrite a value"):
         return f", line {number}: {as_plain(line.partition('=')[0].strip()[:MAX_SAID])} is there twice"
     for looks, write in SLIPS if len(line) <= MAX_SAID else ():
         if looks.search(line):
             return f", line {number}: {as_plain(line.strip())}: {write}"
-    return f": not a TOML file: {_shorten_message(message)}"
-
-
-def _advice_on_duplicate(lines: list[str], number: int, name: str, repeated: Collection[str]) -> str:
-    """Return where a duplicate section occurs first, with advice."""
-    sections = (_SECTION.match(line) for line in lines[: number - 1])
-    first = next((k for k, section in enumerate(sections, 1) if section and section[1] == name), None)
-    shown = as_plain(name[:MAX_SAID])
-    where = "" if first is None else f", first in line {first}"
-    write = f"write [[{shown}]] above each" if name in repeated else "put its keys into one section"
-    return f"[{shown}] is there twice{where}; {write}"
-
-
-def _shorten_message(message: str) -> str:
-    """Return the parser's message without the middle of a long key; its end states the position."""
-    kept = (
-        message if len(message) <= MAX_SAID else f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
-    )
-    return as_plain(kept)
+    if len(message) > MAX_SAID:  # a long key; the end states the position
+        message = f"{message[: MAX_SAID // 2]} ... {message[-MAX_SAID // 2 :]}"
+    return f": not a TOML file: {as_plain(message)}"

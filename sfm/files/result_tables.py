@@ -59,7 +59,13 @@ class ResultTable:
                 read if the first optional group is present.
         """
         self.file = f"{stem}.csv"
-        self.groups = tuple(_group(text) for text in groups)
+        declared = []
+        for text in groups:
+            kind, _, names = text.partition(": ")
+            if kind not in KINDS:
+                raise ValueError(f"columns '{text}', expected one of {', '.join(KINDS)} before the names")
+            declared.append((kind, tuple(names.split())))
+        self.groups = tuple(declared)
 
     def names_of(self, *kinds: str) -> tuple[str, ...]:
         """Return the names of the columns of the given kinds; of all kinds if none is given."""
@@ -100,8 +106,14 @@ class ResultTable:
         columns: list[Sequence[object]] = []
         for (_, names), value in zip(self.groups, values, strict=True):
             if value is not None:
+                if isinstance(value, np.ndarray):
+                    value = value.T.tolist() if value.ndim == 2 else value.tolist()
+                of_group = [value] if len(names) == 1 else list(value) or [()] * len(names)
+                if len(of_group) != len(names):
+                    wrong = f"{len(of_group)} columns of values for {len(names)} columns of the table"
+                    raise ValueError(wrong)
                 header += names
-                columns += _columns(value, len(names))
+                columns += of_group
         self._save(folder, header, zip(*columns, strict=True))
 
     def write_rows(self, folder: Path, rows: Iterable[Sequence[object]]) -> None:
@@ -111,23 +123,6 @@ class ResultTable:
     def _save(self, folder: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         with (folder / self.file).open("w", encoding="utf-8", newline="") as file:
             file.writelines(csv_blocks(header, rows))
-
-
-def _group(text: str) -> tuple[str, tuple[str, ...]]:
-    kind, _, names = text.partition(": ")
-    if kind not in KINDS:
-        raise ValueError(f"columns '{text}', expected one of {', '.join(KINDS)} before the names")
-    return kind, tuple(names.split())
-
-
-def _columns(value: Any, count: int) -> list[Sequence[object]]:
-    """Return the columns of a group as sequences."""
-    if isinstance(value, np.ndarray):
-        value = value.T.tolist() if value.ndim == 2 else value.tolist()
-    columns = [value] if count == 1 else list(value) or [()] * count
-    if len(columns) != count:
-        raise ValueError(f"{len(columns)} columns of values for {count} columns of the table")
-    return columns
 
 
 EXTERIOR = "X0 Y0 Z0 omega phi kappa"

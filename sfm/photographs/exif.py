@@ -116,6 +116,8 @@ def read_metadata(path: str | Path) -> Metadata:
     focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
     equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
     orientation = exif.get(ExifTags.Base.Orientation, 1)
+    width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
+    height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
     return Metadata(
         size_px=size,
         make=_text(exif.get(ExifTags.Base.Make)),
@@ -126,7 +128,7 @@ def read_metadata(path: str | Path) -> Metadata:
         orientation=orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1,
         serial=_text(camera.get(ExifTags.Base.BodySerialNumber)),
         lens=_text(camera.get(ExifTags.Base.LensModel)),
-        taken_px=_size_taken(camera),
+        taken_px=(round(width), round(height)) if width and height else None,
         taken=_moment(camera),
         position=satellite_position(gps, xmp if isinstance(xmp, bytes) else b""),
     )
@@ -149,12 +151,6 @@ def _moment(camera: Any) -> datetime | None:
         return None
     digits = _text(camera.get(ExifTags.Base.SubsecTimeOriginal)) or ""
     return moment.replace(microsecond=int(f"{digits:0<6.6}")) if digits.isdecimal() else moment
-
-
-def _size_taken(camera: Any) -> tuple[int, int] | None:
-    width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
-    height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
-    return (round(width), round(height)) if width and height else None
 
 
 def _pixel_from_exif(

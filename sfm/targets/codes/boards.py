@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
-from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.targets.codes.dot_plates import Lattice, find_lattice
 from sfm.targets.codes.plates import APRIL_BORDERS, MAX_OFF_PLACE, PlateFamily, quarter_turn
 from sfm.targets.codes.tags import CORRECTED, WRONG_IN_BORDER, opencv_dictionary
@@ -128,7 +128,14 @@ def _checkerboard(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntAr
         xy = xy[:, ::-1]
     ways = [np.rot90(xy, k) for k in ((0, 2) if plate.rows != plate.columns else range(4))]
     step = len(ways) // (1 + len(plate.turns))  # between ways in which the first square has the same colour
-    alike = min((ways[k::step] for k in range(step)), key=lambda turns: _first_squares(grey, turns))
+
+    def first_square(turns: Sequence[FloatArray]) -> float:
+        middles = [way[:2, :2].reshape(-1, 2).mean(axis=0) for way in turns]
+        return float(
+            np.mean([cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean() for x, y in middles])
+        )
+
+    alike = min((ways[k::step] for k in range(step)), key=first_square)  # it is dark
     xy = max(alike, key=lambda way: float((way[:, -1] - way[:, 0]).mean(axis=0)[0]))
     return xy.reshape(-1, 2), np.arange(plate.count)
 
@@ -140,12 +147,6 @@ def reduce_photograph(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]
         return grey, scale
     height, width = (max(1, round(scale * side)) for side in grey.shape)
     return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)), scale
-
-
-def _first_squares(grey: AnyArray, ways: Sequence[FloatArray]) -> float:
-    """Return the mean intensity in the middle of the first square inside the crossings, over some turns."""
-    middles = [way[:2, :2].reshape(-1, 2).mean(axis=0) for way in ways]
-    return float(np.mean([cv2.getRectSubPix(grey, (3, 3), (float(x), float(y))).mean() for x, y in middles]))
 
 
 def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
@@ -209,15 +210,24 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
         turned = turned - turned.min(axis=0)
         ends = board_ends(lattice.xy, turned, grey.shape)
         size = turned.max(axis=0) + 1
-        offsets = [_offset(int(size[k]), (rows, columns)[k], ends[k]) for k in range(2)]
-        if offsets[0] is None or offsets[1] is None:
+        offsets = []  # of the first visible row and column; none if it is ambiguous
+        for seen, of_board, (before, behind) in zip(size.tolist(), (rows, columns), ends, strict=True):
+            if seen == of_board:
+                offsets.append(0)
+            elif seen < of_board and before != behind:
+                offsets.append(0 if before else of_board - seen)
+        if len(offsets) < 2:
             continue
         moved = turned + np.array(offsets)
         if (moved[dark].min(axis=1).sum(axis=1) % 2 == 0).all():  # the first square of the board is dark
             numberings.append((turn, moved[:, 0] * columns + moved[:, 1]))
     if len(numberings) == 2 and (numberings[0][0] - numberings[1][0]) % 4 == 2:  # it looks alike upside down
+        x = lattice.xy[:, 0] - lattice.xy[:, 0].mean()
         numberings = [
-            (turn, number) for turn, number in numberings if _is_upright(lattice.xy, number % columns)
+            (turn, number)
+            for turn, number in numberings
+            for column in [number % columns]
+            if float(x @ (column - column.mean())) > 0  # columns run to the right
         ]
     return (lattice.xy, numberings[0][1]) if len(numberings) == 1 else none
 
@@ -247,17 +257,13 @@ def find_saddles(grey: AnyArray) -> FloatArray:
         return np.zeros((0, 2))
     strong = value > MIN_SADDLE * np.sort(value)[-STRONG_RANK]
     candidates = np.stack([column, row], axis=1)[strong].astype(np.float64)
-    return np.asarray(candidates[_has_four_sectors(smooth, candidates)])
-
-
-def _has_four_sectors(smooth: AnyArray, xy: FloatArray) -> BoolArray:
-    """Return around which positions the intensity crosses its mean four times on a circle, (k,)."""
+    # the intensity crosses its mean four times on a circle around a saddle
     t = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    x = (xy[:, :1] + RADIUS_PX * np.cos(t)).astype(np.float32)
-    y = (xy[:, 1:] + RADIUS_PX * np.sin(t)).astype(np.float32)
+    x = (candidates[:, :1] + RADIUS_PX * np.cos(t)).astype(np.float32)
+    y = (candidates[:, 1:] + RADIUS_PX * np.sin(t)).astype(np.float32)
     ring = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     above = ring > (ring.max(axis=1, keepdims=True) + ring.min(axis=1, keepdims=True)) / 2
-    return np.asarray((above != np.roll(above, 1, axis=1)).sum(axis=1) == 4)
+    return np.asarray(candidates[(above != np.roll(above, 1, axis=1)).sum(axis=1) == 4])
 
 
 def _dark_squares(grey: AnyArray, lattice: Lattice) -> IntArray | None:
@@ -300,21 +306,6 @@ def board_ends(xy: FloatArray, place: IntArray, shape: tuple[int, ...]) -> list[
     return ends
 
 
-def _offset(seen: int, of_board: int, ends: tuple[bool, bool]) -> int | None:
-    """Return the index of the first visible row or column of the board; None if it is ambiguous."""
-    before, behind = ends
-    if seen == of_board:
-        return 0
-    if seen > of_board or before == behind:
-        return None
-    return 0 if before else of_board - seen
-
-
-def _is_upright(xy: FloatArray, column: IntArray) -> bool:
-    """Return whether columns run to the right."""
-    return float((xy[:, 0] - xy[:, 0].mean()) @ (column - column.mean())) > 0
-
-
 def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArray]:
     """Return numbers (t,) and corners (t, 4, 2), px, of tags touched by squares, with the commonest border.
 
@@ -326,7 +317,14 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
         Tags that were read exactly once; their corners start at any corner, the same for all tags.
     """
     modules = opencv_dictionary(dictionary).markerSize + 2 * min(APRIL_BORDERS)
-    quads = _unique(np.array(list(_outlines(grey, MIN_MODULE_PX * modules))).reshape(-1, 4, 2))
+    different: list[FloatArray] = []  # each with another centre or size than those before
+    middles = np.zeros((0, 3))
+    for quad in _outlines(grey, MIN_MODULE_PX * modules):
+        middle = np.append(quad.mean(axis=0), np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
+        if (np.abs(middles - middle).max(axis=1, initial=0) > SPACING * middle[2]).all():
+            different.append(quad)
+            middles = np.vstack([middles, middle])
+    quads = np.array(different).reshape(-1, 4, 2)
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
     xy = measure_saddles(
         grey, quads.reshape(-1, 2), np.repeat(MAX_HALF_SPACINGS * SPACING * side, 4), noise=1.0
@@ -370,18 +368,6 @@ def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
                 if len(quad) == 4 and cv2.isContourConvex(quad) and cv2.contourArea(quad) > min_side_px**2:
                     clockwise = cv2.contourArea(quad, True) > 0  # y runs down
                     yield (quad if clockwise else quad[::-1]).astype(float)
-
-
-def _unique(quads: FloatArray) -> FloatArray:
-    """Return quadrilaterals without those that have about the centre and size of an earlier one."""
-    kept: list[FloatArray] = []
-    middles = np.zeros((0, 3))
-    for quad in quads:
-        middle = np.append(quad.mean(axis=0), np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
-        if (np.abs(middles - middle).max(axis=1, initial=0) > SPACING * middle[2]).all():
-            kept.append(quad)
-            middles = np.vstack([middles, middle])
-    return np.array(kept).reshape(-1, 4, 2)
 
 
 def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, border: int) -> tuple[int, int]:

@@ -258,9 +258,13 @@ def read_dictionaries(photograph: AnyArray) -> dict[str, tuple[IntArray, FloatAr
         Numbers (t,) and corners (t, 4, 2), px, of the tags by the name of their dictionary. A dictionary that
         is part of another is listed under the largest.
     """
-    detector = cv2.aruco.ArucoDetector(
-        [opencv_dictionary(name) for name in LARGEST_DICTIONARIES], _reading_settings(max(photograph.shape))
+    settings = cv2.aruco.DetectorParameters()  # for small tags too; OpenCV begins at 45 px of 6000
+    settings.minMarkerPerimeterRate = min(
+        settings.minMarkerPerimeterRate, _least_perimeter(FEWEST_MODULES) / max(photograph.shape)
     )
+    settings.errorCorrectionRate = CORRECTED
+    settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
+    detector = cv2.aruco.ArucoDetector([opencv_dictionary(name) for name in LARGEST_DICTIONARIES], settings)
     for picture in (photograph, 255 - photograph):  # upright tags, or inverted ones
         corners, ids, _, which = detector.detectMarkersMultiDict(picture)
         if ids is None or not len(ids):
@@ -280,17 +284,6 @@ def smallest_dictionary(name: str, number: IntArray) -> str:
     kind, _, count = name.rpartition("_")
     parts = (f"{kind}_{n}" for n in (50, 100, 250, 1000)) if count == "1000" else (name,)
     return next(part for part in parts if tag_family(part).count > number.max(initial=0))
-
-
-def _reading_settings(longest_px: int) -> cv2.aruco.DetectorParameters:
-    """Return settings that also read small tags of large photographs; OpenCV begins at 45 px of 6000."""
-    settings = cv2.aruco.DetectorParameters()
-    settings.minMarkerPerimeterRate = min(
-        settings.minMarkerPerimeterRate, _least_perimeter(FEWEST_MODULES) / longest_px
-    )
-    settings.errorCorrectionRate = CORRECTED
-    settings.maxErroneousBitsInBorderRate = WRONG_IN_BORDER
-    return settings
 
 
 def _least_perimeter(modules: int) -> float:

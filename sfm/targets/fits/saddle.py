@@ -79,13 +79,9 @@ def measure_saddles(image: AnyArray, start: FloatArray, half_px: FloatArray, *, 
     return out
 
 
-def _taps() -> tuple[FloatArray, FloatArray]:
-    """Return the weights of a derivative's smoothing along and across it, 2 REACH_PX + 1 each."""
-    smoothing = cv2.getGaussianKernel(2 * REACH_PX - 1, SMOOTHING_PX)[:, 0]
-    return np.convolve(smoothing, [-0.5, 0.0, 0.5]), np.convolve(smoothing, [0.25, 0.5, 0.25])
-
-
-ALONG, ACROSS = _taps()
+# Weights of a derivative's smoothing along and across it, 2 REACH_PX + 1 each.
+_SMOOTHING = cv2.getGaussianKernel(2 * REACH_PX - 1, SMOOTHING_PX)[:, 0]
+ALONG, ACROSS = np.convolve(_SMOOTHING, [-0.5, 0.0, 0.5]), np.convolve(_SMOOTHING, [0.25, 0.5, 0.25])
 NOISE_OF_GRADIENT = float(np.sqrt((ALONG**2).sum() * (ACROSS**2).sum()))
 
 

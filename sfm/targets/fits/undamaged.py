@@ -85,21 +85,24 @@ def fit_undamaged(
 
     k = len(start)
     every = fit(start, sign, np.ones((k, RAYS), bool), np.full(k, np.inf))
-    alike = (
-        np.flatnonzero(sign == polarity) for polarity in (1, -1)
-    )  # light and compression shift edges by polarity
+    # light and compression shift edges by polarity
+    alike = (np.flatnonzero(sign == polarity) for polarity in (1, -1))
     classes = [rows[of_size] for rows in alike for of_size in sizes_apart(_radii(start[rows]))]
     classes = classes or [np.zeros(0, dtype=np.int64)]
-    repaired = [_repaired(_rows(every, rows), sign[rows], fit, noise**2, least_variance) for rows in classes]
+    repaired = []
+    for rows in classes:
+        of_class: Iterator[Any] = (part[rows] for part in every)
+        repaired.append(_repaired(EllipseFits(*of_class), sign[rows], fit, noise**2, least_variance))
     back = np.argsort(np.concatenate(classes))
 
     def together(parts: Iterable[tuple[FloatArray | IntArray, ...]]) -> Iterator[Any]:
         return (np.concatenate(part)[back] for part in zip(*parts, strict=True))
 
+    fits, variances, noises = zip(*repaired, strict=True)
     return (
-        EllipseFits(*together(part[0] for part in repaired)),
-        np.concatenate([part[1] for part in repaired])[back],
-        OutlineNoise(*together(part[2] for part in repaired)),
+        EllipseFits(*together(fits)),
+        np.concatenate(variances)[back],
+        OutlineNoise(*together(noises)),
     )
 
 
@@ -134,11 +137,6 @@ def unlike_targets(
         (Flag.THIN_BACKGROUND, (strokes > STROKES) & (lobes > limit / 2)),
         (Flag.POOR_FIT, noise_of_fit / contrast > POOR_FIT + noise / contrast),
     ]
-
-
-def _rows(fits: EllipseFits, some: IntArray) -> EllipseFits:
-    parts: Iterator[Any] = (part[some] for part in fits)
-    return EllipseFits(*parts)
 
 
 def sizes_apart(radius: FloatArray) -> list[IntArray]:
@@ -325,18 +323,14 @@ def _marks(fits: EllipseFits, column: int, sound: BoolArray) -> FloatArray:
     spread = fits.statistics[:, goodness.SPREAD]
     if sound.sum() >= MIN_POPULATION:
         spread = np.maximum(np.median(spread[sound] / contrast[sound]) * contrast, goodness.ROUNDING)
-    lacking = _model_misfit(fits.theta) * contrast * 2 * blur
+    p, q, r = fits.theta[:, P : R + 1].T
+    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
+    flattened = 2 * half / np.maximum(mean + half, 1e-12)
+    misfit = MISFIT * flattened * fits.theta[:, BLUR] / np.maximum(_least_curvature(fits.theta), 1e-12)
+    lacking = misfit * contrast * 2 * blur  # of undamaged ellipses, in a square of two blurs
     marks = np.maximum((fits.statistics[:, column] - lacking) / spread, 1.0)
     squares = (fits.statistics[:, goodness.PIXELS] / blur**2).sum()
     return np.asarray(marks / -ndtri(FAMILY / (2 * max(squares, 1.0))))
-
-
-def _model_misfit(theta: FloatArray) -> FloatArray:
-    """Return the largest mean residual of undamaged ellipses in a square of two blurs, in contrasts, (k,)."""
-    p, q, r = theta[:, P : R + 1].T
-    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
-    flattened = 2 * half / np.maximum(mean + half, 1e-12)
-    return np.asarray(MISFIT * flattened * theta[:, BLUR] / np.maximum(_least_curvature(theta), 1e-12))
 
 
 def _stands_out(value: FloatArray, usual: FloatArray) -> BoolArray:

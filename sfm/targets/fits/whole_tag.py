@@ -157,7 +157,11 @@ def _fit_tag(
     variance = float(residual @ light.without(residual)) / max(int(used.sum()) - len(theta), 1)
     cofactor = np.linalg.pinv(J.T @ light.without(J), hermitian=True)
     fits.noise[i] = math.sqrt(variance)
-    scatter, shown = _scatter_of_modules(seen, J, light.without(residual)), []
+    # At the end of a shadow, the pixels of a module have a common error: the scatter of the contributions of
+    # modules (Liang and Zeger 1986, Biometrika 73(1)). As many of them as unknowns are lost.
+    parts = np.zeros((len(seen.place), J.shape[1]))
+    np.add.at(parts, seen.share.argmax(axis=1), J * light.without(residual)[:, None])
+    scatter, shown = parts.T @ parts * len(parts) / (len(parts) - J.shape[1]), []
     for j, place in enumerate(_square(modules)):
         D = np.zeros((5, len(theta)))
         at = np.append(_corners(theta, modules)[j], 1.0)
@@ -186,18 +190,6 @@ class _Light:
         return np.asarray(values - self.pixels @ (self.weights @ (self.pixels.T @ values)))
 
 
-def _scatter_of_modules(seen: _Modules, J: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the scatter over modules of their contributions to the right-hand side, (11, 11).
-
-    At the end of a shadow, the pixels of a module have a common error. As many parts as unknowns are lost.
-
-    Source: Liang and Zeger (1986), Biometrika 73(1), covariance of estimates from clusters.
-    """
-    parts = np.zeros((len(seen.place), J.shape[1]))
-    np.add.at(parts, seen.share.argmax(axis=1), J * residual[:, None])
-    return np.asarray(parts.T @ parts * len(parts) / (len(parts) - J.shape[1]))
-
-
 def _iterate(
     theta: FloatArray,
     P: FloatArray,
@@ -214,8 +206,10 @@ def _iterate(
     modules, damping = len(black), 1e-3
 
     def model(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        predicted, J = _intensity(theta, P, black)
-        off = np.where(used, value - predicted, np.maximum(value - predicted, 0.0))
+        share, D = _model(theta, P, black)
+        J = np.column_stack([theta[_A] * D[:, :8], np.ones(len(P)), share, theta[_A] * D[:, 8]])
+        difference = value - (theta[_B] + theta[_A] * share)
+        off = np.where(used, difference, np.maximum(difference, 0.0))
         weighted = off if light is None else light.without(off)
         return J, off, weighted, float(off @ weighted)
 
@@ -428,10 +422,3 @@ def _ln_likelihood(values: FloatArray, covariance: FloatArray, judged: BoolArray
     """Return the log density of the judged values, without its constant."""
     values, covariance = values[judged], covariance[np.ix_(judged, judged)]
     return -0.5 * float(values @ np.linalg.solve(covariance, values) + np.linalg.slogdet(covariance)[1])
-
-
-def _intensity(theta: FloatArray, P: FloatArray, black: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Return the intensities of the model, (n,), and their derivatives, (n, 11)."""
-    share, D = _model(theta, P, black)
-    J = np.column_stack([theta[_A] * D[:, :8], np.ones(len(P)), share, theta[_A] * D[:, 8]])
-    return theta[_B] + theta[_A] * share, J
