@@ -56,13 +56,8 @@ def find_files(
         SurveyFileError: there are too many files and folders to search.
         ValueError: the pattern is not a relative glob.
     """
-    given = Path(pattern)
-    parts = [
-        part for k, part in enumerate(given.parts) if given.parts[k - 1 : k] != (BELOW,) or part != BELOW
-    ]
-    if not parts or given.anchor or any(BELOW in part and part != BELOW for part in parts):
-        raise ValueError("not a relative glob")
-    found: set[Path] = set()
+    parts = parts_of_glob(pattern)
+    matches: set[Path] = set()
     waiting = [(folder, 0)]
     left = MAX_ENTRIES
     while waiting:
@@ -84,15 +79,30 @@ def find_files(
                 if is_folder and not child.is_symlink():
                     waiting.append((child, k))
                     if last and folders:
-                        found.add(child)
+                        matches.add(child)
             elif last:
                 if folders or not is_folder:
-                    found.add(child)
+                    matches.add(child)
             elif is_folder:
                 if child.is_symlink() or part == "..":
                     enter(child)
                 waiting.append((child, k + 1))
-    return sorted(found)
+    return sorted(matches)
+
+
+def parts_of_glob(pattern: str) -> list[str]:
+    """Return the parts of a glob between slashes, several `**` in a row as one.
+
+    Raises:
+        ValueError: the pattern is not a relative glob.
+    """
+    given = Path(pattern)
+    parts = [
+        part for k, part in enumerate(given.parts) if given.parts[k - 1 : k] != (BELOW,) or part != BELOW
+    ]
+    if not parts or given.anchor or any(BELOW in part and part != BELOW for part in parts):
+        raise ValueError("not a relative glob")
+    return parts
 
 
 def _entries(path: Path, part: str, *, hidden: bool) -> Iterator[tuple[Path, bool]]:

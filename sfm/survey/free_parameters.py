@@ -34,6 +34,7 @@ from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey
 
 MIN_PHOTOGRAPHS = 3  # in a free network; a pair determines almost no parameter of a camera
+FEWEST_PHOTOGRAPHS = {"control": 1}  # by the kind of datum, where it is not MIN_PHOTOGRAPHS
 MIN_DETERMINING_C = 4  # photographs of a free network that determine c
 # Relative sigma of c from EXIF data. Focusing from infinity to 1 : 5 changes c by twice as much, c = f (1 +
 # 1/5).
@@ -76,57 +77,58 @@ def choose_free_parameters(
     silent = [a for a, camera in enumerate(survey.cameras) if not camera.states_free]
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
-    alarm = survey.adjust.false_alarm
     names: Chosen = [None] * len(survey.cameras)
     for a in silent:
-        stated = survey.cameras[a]
-        further = OF_PLATES if plate_family(survey.targets) is not None else ()
-        names[a] = {*stated.may_be_free, *MODELS[stated.model].names_of(*further)}
+        names[a] = _candidates(survey, survey.cameras[a])
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
     images, points = select_supported(
         network, estimate, everything, min_points=MIN_IMAGE_POINTS,
         min_rays=np.full(len(network.points), MIN_RAYS),
     )  # fmt: skip
-    settings = survey.cameras
-    if images.sum() < (1 if datum == "control" else MIN_PHOTOGRAPHS):
-        names = [chosen if chosen is None else set() for chosen in names]
-    else:
+    settings = list(survey.cameras)
+    determined: list[Chosen] = []
+    if images.sum() >= FEWEST_PHOTOGRAPHS.get(datum, MIN_PHOTOGRAPHS):
         part, start = reduce_network(network, estimate, images, points, everything)
-        alone = None
+        trials = []
         if images.sum() >= MIN_DETERMINING_C:  # control may be wrong, and hide what the image points demand
-            alone = _determined_parameters(without_given(part), start, names, "free", alarm, extend=extend)
+            trials = [(without_given(part), "free")]
         elif datum != "control":
-            seen = set(silent) & set(part.camera.tolist())
-            settings = tuple(
-                _with_observed_c(stated, camera) if a in seen else stated
-                for a, (stated, camera) in enumerate(zip(settings, start.cameras, strict=True))
-            )
+            observed = sorted(set(silent) & set(part.camera.tolist()))
+            for a in observed:
+                settings[a] = _with_observed_c(settings[a], start.cameras[a])
             of_part = [
-                stated if a in seen else CameraSettings(name=stated.name) for a, stated in enumerate(settings)
+                stated if a in observed else CameraSettings(name=stated.name)  # stays as it was
+                for a, stated in enumerate(settings)
             ]
-            part, start = split_cameras(of_part, without_given(part), start)  # the others stay as they were
-            alone = _determined_parameters(part, start, names, "free", alarm, extend=extend)
-        if alone is None or (datum == "control" and not _has_each_c(start, names, alone)):
-            with_control = _determined_parameters(part, start, names, datum, alarm, extend=extend)
-            if alone is None or _has_each_c(start, names, with_control):
-                alone = with_control
-        names = [
-            chosen if chosen is None else chosen - set(dict(stated.weighted))
-            for stated, chosen in zip(settings, alone, strict=True)
-        ]
-    cameras = []
-    for stated, chosen in zip(settings, names, strict=True):
-        if chosen is not None:
-            in_order = tuple(name for name in MODELS[stated.model].names if name in chosen)
-            stated = stated.model_copy(update={"free": in_order})
-        cameras.append(stated)
+            part, start = split_cameras(of_part, without_given(part), start)
+            trials = [(part, "free")]
+        if datum == "control":
+            trials.append((part, datum))
+        alarm = survey.adjust.false_alarm
+        for tried, kind in trials:
+            determined.append(_determined_parameters(tried, start, names, kind, alarm, extend=extend))
+            if _has_each_c(start, names, determined[-1]):
+                break
+        else:
+            del determined[1:]  # control does not determine each c either
+    for a in silent:
+        chosen = (determined[-1][a] if determined else None) or set()
+        names[a] = chosen - dict(settings[a].weighted).keys()
+        in_order = tuple(name for name in MODELS[settings[a].model].names if name in names[a])
+        settings[a] = settings[a].model_copy(update={"free": in_order})
     remarks = [
         said
         for a in silent
-        for said in _remarks(cameras[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
+        for said in _remarks(settings[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
-    return FreeParameters(tuple(cameras), _with_free(estimate, names), tuple(remarks))
+    return FreeParameters(tuple(settings), _with_free(estimate, names), tuple(remarks))
+
+
+def _candidates(survey: Survey, settings: CameraSettings) -> set[str]:
+    """Return the parameters of a camera that may be free."""
+    further = MODELS[settings.model].names_of(*OF_PLATES) if plate_family(survey.targets) is not None else ()
+    return {*settings.may_be_free, *further}
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:

@@ -9,7 +9,7 @@ are reported.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,7 +100,7 @@ def plates_elsewhere(
     moved: dict[PlateFamily, frozenset[int]] = {}
     plates = plates_of(family)
     for plate in plates if len(plates) > 1 else ():
-        of_plate = range(plate.first_point, plate.last_point + 1)
+        of_plate = _points_of(plate)
         images = frozenset(
             image
             for image, codes in contested.elsewhere.items()
@@ -120,27 +120,24 @@ def remarks_on_contested(
     family: TargetFamily | None,
 ) -> tuple[Remark, ...]:
     """Return the remarks on plates that moved or do not fit, and on other codes at several positions."""
-    remarks = [
-        remark(
-            "plate_elsewhere",
-            photographs=[photographs.names[i] for i in sorted(images)],
-            points=[str(code) for code in range(plate.first_point, plate.last_point + 1)],
+
+    def names_of(images: Collection[int]) -> list[str]:
+        return [photographs.names[i] for i in sorted(images)]
+
+    remarks = []
+    of_moved: set[int] = set()
+    for plate, images in moved.items():
+        points_of_plate = _points_of(plate)
+        of_moved.update(points_of_plate)
+        remarks.append(
+            remark("plate_elsewhere", photographs=names_of(images), points=list(map(str, points_of_plate)))
         )
-        for plate, images in moved.items()
-    ]
-    of_moved = {code for plate in moved for code in range(plate.first_point, plate.last_point + 1)}
-    of_plates = {
-        code for plate in plates_of(family) for code in range(plate.first_point, plate.last_point + 1)
-    }
+    of_plates = set[int]().union(*map(_points_of, plates_of(family)))
     apart = sorted((contested.places.keys() & of_plates) - of_moved)
     if apart:
-        images = {image for code in apart for image in contested.places[code]}
+        showing = set[int]().union(*(contested.places[code] for code in apart))
         remarks.append(
-            remark(
-                "plate_points_apart",
-                points=[str(code) for code in apart],
-                photographs=[photographs.names[i] for i in sorted(images)],
-            )
+            remark("plate_points_apart", points=list(map(str, apart)), photographs=names_of(showing))
         )
     codes = sorted(contested.places.keys() - of_plates)
     away: set[int] = set()
@@ -156,11 +153,15 @@ def remarks_on_contested(
             remark(
                 "codes_at_several_places",
                 codes=[str(_number(code, naming)) for code in codes],
-                photographs=[photographs.names[i] for i in sorted(away)],
+                photographs=names_of(away),
                 points=sorted(points) or None,
             )
         )
     return tuple(remarks)
+
+
+def _points_of(plate: PlateFamily) -> range:
+    return range(plate.first_point, plate.last_point + 1)
 
 
 def _points_by_code(

@@ -20,17 +20,23 @@ from sfm.model.observations.tables import TABLES
 MAX_SHOWN = 60  # characters of a key
 MAX_LISTED = 10  # keys listed in one message
 FEW = 3  # a list of at most so many values has a fixed length
-_NEEDED = (
-    ("string_type", "a text in quotes"),
-    ("float_type", "a number"),
-    ("int_type", "a whole number"),
-    ("int_from_float", "a whole number"),
-    ("bool_type", "true or false"),
-    ("date_type", "a date without quotes, such as 2026-03-01"),
-    ("tuple_type", "a list in square brackets"),
-    ("finite_number", "a finite number"),
-    ("model_type", "a table"),
-)
+# What is needed by the kind of error of pydantic, with the numbers in its context.
+_NEEDED = {
+    "string_type": "a text in quotes",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "date_type": "a date without quotes, such as 2026-03-01",
+    "tuple_type": "a list in square brackets",
+    "finite_number": "a finite number",
+    "model_type": "a table",
+    "literal_error": "one of {expected}",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "less_than_equal": "at most {le:g}",
+    "too_short": "at least {min_length}",
+}
 
 
 def _pairs(value: Any) -> Any:
@@ -378,22 +384,14 @@ def first_error(path: Path | str, text: str, error: ValidationError, section: ty
         return f"{where}{listed(every, most=MAX_LISTED)} {'is' if len(every) == 1 else 'are'} missing"
     if kind == "tuple_type" and len(location) == 1 and isinstance(first["input"], dict):
         return f"{where}found [{key}], needed [[{key}]] in double brackets, since there may be several"
-    needed = dict(_NEEDED).get(kind)
-    if kind == "literal_error":
-        needed = f"one of {context['expected']}"
-    elif kind == "greater_than":
-        needed = f"more than {context['gt']:g}"
-    elif kind == "greater_than_equal":
-        least = context["ge"]
-        needed = "more than 0" if least > 0 >= first["input"] else f"at least {least:g}"
-    elif kind == "less_than_equal":
-        needed = f"at most {context['le']:g}"
+    if kind == "greater_than_equal" and context["ge"] > 0 >= first["input"]:
+        needed = "more than 0"
     elif kind == "too_long":
-        most = context["max_length"]
-        needed = f"{counted(most, 'value')}" if most <= FEW else f"at most {counted(most, 'value')}"
-    elif kind == "too_short":
-        needed = f"at least {context['min_length']}"
-    if needed is None:
+        most = counted(context["max_length"], "value")
+        needed = most if context["max_length"] <= FEW else f"at most {most}"
+    elif kind in _NEEDED:
+        needed = _NEEDED[kind].format(**context)
+    else:
         said = first["msg"].removeprefix("Value error, ")
         return f"{where}{key}: {said[0].lower()}{said[1:]}"
     return f"{where}{key}: found {_found(first['input'])}, needed {needed}"

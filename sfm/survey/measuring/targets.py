@@ -319,12 +319,8 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
         for size, rows in sorted(counted.items()):
             if size == main:
                 continue
-            ratio = (size[0] / size[1]) / (main[0] / main[1])
-            what = RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
-            what = UPRIGHT if size == main[::-1] else what
-            # at given values, which apply to the whole format only
-            held = bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
-            held = held and what != RESAMPLED
+            what = _kind(size, main)
+            held = _is_held(camera) and what != RESAMPLED
             if len(rows) < MIN_OWN or held:
                 reason = remark(
                     "photograph_of_other_size",
@@ -383,6 +379,18 @@ def _main_size(camera: CameraSettings, counted: dict[Size, list[int]]) -> Size |
     if camera.size_px is not None or not counted:
         return None
     return max(counted, key=lambda size: (len(counted[size]), -counted[size][0]))
+
+
+def _kind(size: Size, main: Size) -> str:
+    if size == main[::-1]:
+        return UPRIGHT
+    ratio = (size[0] / size[1]) / (main[0] / main[1])
+    return RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
+
+
+def _is_held(camera: CameraSettings) -> bool:
+    """Return whether a camera is held at given values, which apply to its whole format only."""
+    return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 
 
 def _resized(

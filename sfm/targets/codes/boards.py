@@ -317,14 +317,7 @@ def read_april_tags(grey: AnyArray, dictionary: str) -> tuple[IntArray, FloatArr
         Tags that were read exactly once; their corners start at any corner, the same for all tags.
     """
     modules = opencv_dictionary(dictionary).markerSize + 2 * min(APRIL_BORDERS)
-    different: list[FloatArray] = []  # each with another centre or size than those before
-    middles = np.zeros((0, 3))
-    for quad in _outlines(grey, MIN_MODULE_PX * modules):
-        middle = np.append(quad.mean(axis=0), np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
-        if (np.abs(middles - middle).max(axis=1, initial=0) > SPACING * middle[2]).all():
-            different.append(quad)
-            middles = np.vstack([middles, middle])
-    quads = np.array(different).reshape(-1, 4, 2)
+    quads = _unique(np.array(list(_outlines(grey, MIN_MODULE_PX * modules))).reshape(-1, 4, 2))
     side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).min(axis=1)
     xy = measure_saddles(
         grey, quads.reshape(-1, 2), np.repeat(MAX_HALF_SPACINGS * SPACING * side, 4), noise=1.0
@@ -368,6 +361,18 @@ def _outlines(grey: AnyArray, min_side_px: float) -> Iterator[FloatArray]:
                 if len(quad) == 4 and cv2.isContourConvex(quad) and cv2.contourArea(quad) > min_side_px**2:
                     clockwise = cv2.contourArea(quad, True) > 0  # y runs down
                     yield (quad if clockwise else quad[::-1]).astype(float)
+
+
+def _unique(quads: FloatArray) -> FloatArray:
+    """Return quadrilaterals without those that have about the centre and size of an earlier one."""
+    kept: list[FloatArray] = []
+    middles = np.zeros((0, 3))
+    for quad in quads:
+        middle = np.append(quad.mean(axis=0), np.sqrt(abs(cv2.contourArea(quad.astype(np.float32)))))
+        if (np.abs(middles - middle).max(axis=1, initial=0) > SPACING * middle[2]).all():
+            kept.append(quad)
+            middles = np.vstack([middles, middle])
+    return np.array(kept).reshape(-1, 4, 2)
 
 
 def _read(grey: AnyArray, quad: FloatArray, dictionary: cv2.aruco.Dictionary, border: int) -> tuple[int, int]:

@@ -323,14 +323,18 @@ def _marks(fits: EllipseFits, column: int, sound: BoolArray) -> FloatArray:
     spread = fits.statistics[:, goodness.SPREAD]
     if sound.sum() >= MIN_POPULATION:
         spread = np.maximum(np.median(spread[sound] / contrast[sound]) * contrast, goodness.ROUNDING)
-    p, q, r = fits.theta[:, P : R + 1].T
-    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
-    flattened = 2 * half / np.maximum(mean + half, 1e-12)
-    misfit = MISFIT * flattened * fits.theta[:, BLUR] / np.maximum(_least_curvature(fits.theta), 1e-12)
-    lacking = misfit * contrast * 2 * blur  # of undamaged ellipses, in a square of two blurs
+    lacking = _model_misfit(fits.theta) * contrast * 2 * blur
     marks = np.maximum((fits.statistics[:, column] - lacking) / spread, 1.0)
     squares = (fits.statistics[:, goodness.PIXELS] / blur**2).sum()
     return np.asarray(marks / -ndtri(FAMILY / (2 * max(squares, 1.0))))
+
+
+def _model_misfit(theta: FloatArray) -> FloatArray:
+    """Return the largest mean residual of undamaged ellipses in a square of two blurs, in contrasts, (k,)."""
+    p, q, r = theta[:, P : R + 1].T
+    mean, half = (p + r) / 2, np.hypot((p - r) / 2, q)
+    flattened = 2 * half / np.maximum(mean + half, 1e-12)
+    return np.asarray(MISFIT * flattened * theta[:, BLUR] / np.maximum(_least_curvature(theta), 1e-12))
 
 
 def _stands_out(value: FloatArray, usual: FloatArray) -> BoolArray:
