@@ -383,14 +383,12 @@ def write_ply(
     table = np.asarray(xyz) if sigma is None else np.hstack([xyz, sigma])
     kept = np.flatnonzero(np.isfinite(table).all(axis=1)).tolist()
     words = " ".join(unit.encode("ascii", "replace").decode().split())
-    lines = [
-        *("ply", "format ascii 1.0", f"comment kolinear, {words}" if words else "comment kolinear"),
-        *(f"comment name {names[j]}" for j in kept if names),
-        f"element vertex {len(kept)}",
-        *(f"property double {name}" for name in ("x", "y", "z", *(() if sigma is None else SIGMAS))),
-        *(f"property uchar {name}" for name in (COLOURS if colours else ())),
-        "end_header",
-    ]
+    lines = ["ply", "format ascii 1.0", f"comment kolinear, {words}" if words else "comment kolinear"]
+    lines += [f"comment name {names[j]}" for j in kept if names]
+    lines.append(f"element vertex {len(kept)}")
+    lines += [f"property double {name}" for name in ("x", "y", "z", *(() if sigma is None else SIGMAS))]
+    lines += [f"property uchar {name}" for name in (COLOURS if colours else ())]
+    lines.append("end_header")
     for j in kept:
         row = (*table[j].tolist(), *(colours[j] if colours else ()))
         lines.append(" ".join(map(repr, row)))

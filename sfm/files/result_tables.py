@@ -137,21 +137,32 @@ def _covariance_table(stem: str, what: str, parts: str) -> ResultTable:
 
 POINTS = ResultTable(
     "points",
-    *("name: id", "number: X Y Z", "optional: sX sY sZ"),
+    "name: id",
+    "number: X Y Z",
+    "optional: sX sY sZ",
     "further: rays code angle_deg rms_px limiting_sX limiting_sY limiting_sZ",
 )
 IMAGES = ResultTable(
     "images",
-    *("name: image", "number: X Y Z omega_deg phi_deg kappa_deg", "optional: sX sY sZ"),
-    *("further: somega_deg sphi_deg skappa_deg", "name: camera", "further: points rms_px coverage"),
+    "name: image",
+    "number: X Y Z omega_deg phi_deg kappa_deg",
+    "optional: sX sY sZ",
+    "further: somega_deg sphi_deg skappa_deg",
+    "name: camera",
+    "further: points rms_px coverage",
 )
 CAMERAS = ResultTable(
     "cameras", "name: camera parameter", "number: value", "optional: sigma", "further: unit"
 )
 IMAGE_POINTS = ResultTable(
     "image_points",
-    *("name: image point", "number: x_px y_px", "optional: sx_px sy_px", "optional: cxy_px2"),
-    *("further: vx_px vy_px", "flag: rejected", "label: source"),
+    "name: image point",
+    "number: x_px y_px",
+    "optional: sx_px sy_px",
+    "optional: cxy_px2",
+    "further: vx_px vy_px",
+    "flag: rejected",
+    "label: source",
 )
 CAMERAS_BALANCED = ResultTable("cameras_balanced", "further: camera parameter value sigma unit")
 TARGETS = ResultTable(
@@ -160,12 +171,18 @@ TARGETS = ResultTable(
 LEFT_OUT = ResultTable("left_out", "further: kind name image_points reason")
 GIVEN = ResultTable(
     "given",
-    *("name: kind name coordinate", "further: unit", "number: given", "further: difference"),
-    *("blank: sigma", "further: r w"),
+    "name: kind name coordinate",
+    "further: unit",
+    "number: given",
+    "further: difference",
+    "blank: sigma",
+    "further: r w",
 )
 RELIABILITY = ResultTable(
     "reliability",
-    *("name: image point", "further: vx_px vy_px rx ry", "blank: wx wy"),
+    "name: image point",
+    "further: vx_px vy_px rx ry",
+    "blank: wx wy",
     "further: taux tauy mdbx_px mdby_px extx exty weight rejected errorx_px errory_px",
 )
 VARIANCE_COMPONENTS = ResultTable("variance_components", "further: kind group observations redundancy sigma0")
@@ -175,7 +192,8 @@ RESIDUALS = ResultTable(
 )
 CONTROL_POINTS = ResultTable(
     "control_points",
-    *("name: use point coordinate", "blank: given sigma_prior"),
+    "name: use point coordinate",
+    "blank: given sigma_prior",
     "further: adjusted sigma_posterior difference test",
 )
 INTERIOR_CORRELATIONS = ResultTable("interior_correlations", "further: camera first second correlation")
@@ -217,8 +235,12 @@ def write_solution(
     POINTS.write(folder, network.points, estimate.points, point, of_points)
     IMAGES.write(
         folder,
-        *(network.images, np.hstack([estimate.position, angles]), position),
-        *(None if exterior is None else np.degrees(exterior[:, 3:]), names, of_images),
+        network.images,
+        np.hstack([estimate.position, angles]),
+        position,
+        None if exterior is None else np.degrees(exterior[:, 3:]),
+        names,
+        of_images,
     )
     sigmas = solution.interior_sigma or [np.full(len(camera.names), np.nan) for camera in estimate.cameras]
     CAMERAS.write_rows(
@@ -229,15 +251,21 @@ def write_solution(
             for row in zip(camera.names, camera.parameters, sigma, camera.units, strict=True)
         ),
     )
-    images, points = [network.images[i] for i in seen.image], [network.points[j] for j in seen.point]
+    names_of_points = (
+        [network.images[i] for i in seen.image],
+        [network.points[j] for j in seen.point],
+    )
     between = seen.stated_covariance
+    sources = None if seen.source is None else [network.sources[k].name for k in seen.source.tolist()]
     IMAGE_POINTS.write(
         folder,
-        *((images, points), seen.xy, known(seen.stated_sigma)),
-        [covariance or None for covariance in between.tolist()] if every or between.any() else None,
+        names_of_points,
+        seen.xy,
+        known(seen.stated_sigma),
+        known(np.where(between == 0, np.nan, between)),  # 0 is an empty cell
         residuals,
         rejected.astype(int) if every or rejected.any() else None,
-        None if seen.source is None else [network.sources[k].name for k in seen.source.tolist()],
+        sources,
     )
 
 

@@ -246,11 +246,14 @@ def unused_observations(
         there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is table.of}
         unused += [f"{table.kind} {label}" for label in labels.values() if label not in there]
     computed = [f"{kind.group} {name}" for kind in frames for name in kind.hidden]
-    return (
-        *([remark("names_missing", of="observations", names=unused)] if unused else []),
-        *([remark("rows_identical", rows=copied)] if copied else []),
-        *([remark("frame_points_computed", points=computed)] if computed else []),
-    )
+    remarks = []
+    if unused:
+        remarks.append(remark("names_missing", of="observations", names=unused))
+    if copied:
+        remarks.append(remark("rows_identical", rows=copied))
+    if computed:
+        remarks.append(remark("frame_points_computed", points=computed))
+    return tuple(remarks)
 
 
 def _names(table: ObservationTable, network: Network) -> tuple[str, ...]:

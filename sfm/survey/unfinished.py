@@ -92,6 +92,7 @@ def unfinished_survey(
         overlays = overlays if matched.overlays is None else matched.overlays
     reasons = _reasons_of(error) if start is None else start.failures
     left_out = () if matched is None else matched.left_out
+    remarks = (() if start is None else start.remarks) + (() if matched is None else matched.remarks)
     contradicting = (*measured.left_out, *(() if matched is None else matched.left_out_image_points))
     return UnfinishedSurvey(
         survey=survey.name,
@@ -100,7 +101,10 @@ def unfinished_survey(
         stage=clock.last,
         seconds=tuple(StageTime(stage, seconds) for stage, seconds in clock.seconds),
         images=measured.images,
-        failed=(*measured.failed, *(measured.not_in_result(*reason) for reason in (*reasons, *left_out))),
+        failed=(
+            *measured.failed,
+            *(measured.not_in_result(image, reason) for image, reason in (*reasons, *left_out)),
+        ),
         network=network,
         oriented=None if estimate is None else estimate.oriented,
         determined=None if estimate is None else estimate.determined,
@@ -109,8 +113,7 @@ def unfinished_survey(
         remarks=(
             *measured.remarks,
             *remarks_on_contradicting(contradicting),
-            *(() if start is None else start.remarks),
-            *(() if matched is None else matched.remarks),
+            *remarks,
         ),
         settings=settings_by_table(survey),
     )

@@ -358,10 +358,10 @@ class Flag(IntFlag):
 # Reasons for a rejection, from the most target-like candidates on: each has passed the tests of the reasons
 # after it, which `sfm.targets.measure` applies first. The last two do not mean a lost target.
 LIKELIEST_FIRST = (
-    *(Flag.NOT_ON_PLATE, Flag.POOR_FIT, Flag.THIN_BACKGROUND, Flag.LOBED, Flag.UNEVEN_EDGE, Flag.BLURRED),
-    *(Flag.LOW_CONTRAST, Flag.TOO_OBLIQUE, Flag.TOO_LARGE, Flag.NO_CONVERGENCE, Flag.CUT_BY_BORDER),
-    *(Flag.NOT_ELLIPTIC, Flag.TOO_SMALL, Flag.PART_OF_CODE, Flag.DUPLICATE),
-)
+    Flag.NOT_ON_PLATE, Flag.POOR_FIT, Flag.THIN_BACKGROUND, Flag.LOBED, Flag.UNEVEN_EDGE, Flag.BLURRED,
+    Flag.LOW_CONTRAST, Flag.TOO_OBLIQUE, Flag.TOO_LARGE, Flag.NO_CONVERGENCE, Flag.CUT_BY_BORDER,
+    Flag.NOT_ELLIPTIC, Flag.TOO_SMALL, Flag.PART_OF_CODE, Flag.DUPLICATE,
+)  # fmt: skip
 
 
 def count_flags(flags: IntArray) -> list[tuple[str, int]]:

@@ -293,8 +293,8 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
         [project(lens, X0, R, truth.points) for X0, R in zip(truth.position, truth.rotation, strict=True)]
     )
     ties = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (3 * n, 1, 1)))
-    arguments = (photographs, truth, camera, ties)
-    found = find_covering_points(*arguments, windows=Windows(15), side_px=15)
+    network = Network(("a", "b", "c"), camera, tuple(map(str, range(n))), ties)
+    found = find_covering_points(photographs, network, truth, windows=Windows(15), side_px=15)
     seen, count = found.image_points, np.bincount(found.image_points.point)
     assert (count == 3).sum() > 3 * n and set(count.tolist()) == {2, 3}
     # every reference is on whole pixels; no pixel of it is in two windows, and most pixels are in one
@@ -319,13 +319,14 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     height = found.points[:, 2] - render.height(found.points[:, 0], found.points[:, 1])
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
-    assert len(find_covering_points(*arguments, windows=Windows(15), side_px=15, references=[]).points) == 0
+    none = find_covering_points(photographs, network, truth, windows=Windows(15), side_px=15, references=[])
+    assert len(none.points) == 0
     assert len(seen) >= 0.95 * found.matched and remarks_on_disagreement(found) == ()
     # a photograph that is turned by 3 px: its windows are found, their rays do not meet the others
     turned = truth.rotation.copy()
     turned[2] = turned[2] @ rotation_from_vector(np.array([3 / lens.c_px, 0.0, 0.0]))
     apart = replace(truth, rotation=turned)
-    wrong = find_covering_points(photographs, apart, camera, ties, windows=Windows(15), side_px=15)
+    wrong = find_covering_points(photographs, network, apart, windows=Windows(15), side_px=15)
     assert wrong.matched > 100
     (found_wrong,) = remarks_on_disagreement(wrong)
     assert found_wrong.number("share") == pytest.approx(1 - len(wrong.residuals) / wrong.matched)

@@ -231,10 +231,9 @@ def test_windows_are_taken_whose_rays_together_are_precise(
     monkeypatch.setattr(surface_points, "find_covering_points", trial)
     network, truth = make_network(seed_of("trial"), images=2, points=20)
     truth = replace(truth, cameras=tuple(replace(one, size_px=(1024, 768)) for one in truth.cameras))
-    seen = network.image_points
-    assert surface_points._best_windows([], network, truth, seen, TiePointSettings(), 1) == windows
+    assert surface_points._best_windows([], network, truth, TiePointSettings(), 1) == windows
     given = TiePointSettings(window_px=15)
-    assert surface_points._best_windows([], network, truth, seen, given, 1).side_px == 15
+    assert surface_points._best_windows([], network, truth, given, 1).side_px == 15
 
 
 def test_windows_that_agree_off_the_surface_do_not_disagree(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,6 +145,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
     listed = tuple(point for point in left_out if point.point in known)
     unit = survey.unit if final.has_scale else NO_SCALE
     stated = None if model.stated_moment is None else model.stated_moment[settled.images]
+    of_photographs = () if settled.per_photograph is None else settled.per_photograph.remarks
     report_step("testing the assumptions")
     judged = judge_alternatives(final, unit=unit)
     return SolvedSurvey(
@@ -155,7 +156,7 @@ def solve_model(model: SurveyModel) -> SolvedSurvey:
         (*model.left_out, *_dropped_photographs(start, settled)),
         (
             *start.remarks,
-            *(() if settled.per_photograph is None else settled.per_photograph.remarks),
+            *of_photographs,
             *given.remarks,
             *finished.remarks,
             *settled.held,

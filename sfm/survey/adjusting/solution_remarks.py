@@ -49,12 +49,13 @@ def remarks_on_solution(
     sigma_of_c = [float(adjustment.interior_sigma(k)[0]) for k in range(len(adjustment.estimate.cameras))]
     missing = missing_control(survey, adjustment.network, left_out)
     absent = [name for name in survey.datum.points if name not in set(adjustment.network.points)]
+    no_datum = (remark("names_missing", of="datum", names=absent),) if absent else ()
     return (
         *adjustment.remarks,
         *remarks_on_left_out(
             tuple(point for point in left_out if point.point not in missing), network, _check_points(survey)
         ),
-        *([remark("names_missing", of="datum", names=absent)] if absent else []),
+        *no_datum,
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
         *remarks_on_pixel_sides(survey.cameras, adjustment.estimate.cameras),
         *datum_remarks(survey, adjustment.network, missing, has_scale=adjustment.has_scale),
@@ -270,19 +271,14 @@ def remarks_on_left_out(
         "points_not_determined": [point.point for point in listed if point.reason.severity == "note"],
     }
     measured = len(network.points)
-    return (
-        *([remark("points_left_out", points=len(automatic), measured=measured)] if automatic else []),
-        *(
-            remark(
-                kind,
-                points=names,
-                measured=measured,
-                checks=[name for name in names if name in checks] or None,
-            )
-            for kind, names in groups.items()
-            if names
-        ),
-    )
+    remarks = []
+    if automatic:
+        remarks.append(remark("points_left_out", points=len(automatic), measured=measured))
+    for kind, names in groups.items():
+        if names:
+            of_checks = [name for name in names if name in checks] or None
+            remarks.append(remark(kind, points=names, measured=measured, checks=of_checks))
+    return tuple(remarks)
 
 
 def remarks_on_principal_distances(

@@ -119,7 +119,10 @@ def read_calibrations(folder: Path) -> tuple[Calibration, ...]:
         adjusted = {name: s for name, (_, s) in of_camera.items() if np.isfinite(s) and s > 0}
         calibrations.append(
             Calibration(
-                *(stated.name, stated.model, stated.size_px, stated.pixel_mm),
+                stated.name,
+                stated.model,
+                stated.size_px,
+                stated.pixel_mm,
                 {name: value for name, (value, _) in of_camera.items()},
                 adjusted,
                 tuple(

@@ -340,7 +340,10 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) ->
     seen = network.interior
     keep = used[seen.camera]
     interior = InteriorObservations(
-        *(number[seen.camera[keep]], seen.parameter[keep], seen.value[keep], seen.sigma[keep]),
+        number[seen.camera[keep]],
+        seen.parameter[keep],
+        seen.value[keep],
+        seen.sigma[keep],
         None if seen.correlation is None else seen.correlation[np.ix_(keep, keep)],
     )
     observations = tuple(

@@ -224,8 +224,15 @@ def given_by(
             given_as = f"{FRAME} {group}"
         placed.append(
             PlacedEquipment(
-                *(placement.name, given_as, item.calibrated, item.temperature, *item.material),
-                *(temperature, temperature_sigma, (item.factor(temperature) - 1) / PPM),
+                name=placement.name,
+                given_as=given_as,
+                calibrated=item.calibrated,
+                calibration_temperature=item.temperature,
+                expansion=item.expansion,
+                expansion_sigma=item.expansion_sigma,
+                temperature=temperature,
+                temperature_sigma=temperature_sigma,
+                correction=(item.factor(temperature) - 1) / PPM,
             )
         )
     return GivenEquipment(tuple(bars), tuple(frames), tuple(placed))

@@ -261,7 +261,10 @@ def read_control(path: Path) -> KnownPoints:
     checks = CHECKS if CHECKS[0] in header else ()
     more = (*covariances, *checks)
     table = read_table(
-        *(path, ("id",), AXES, (*SIGMAS_OF_AXES, *more)),
+        path,
+        ("id",),
+        AXES,
+        optional=(*SIGMAS_OF_AXES, *more),
         aliases=(("point", "id"),),
         blank=(*AXES, *SIGMAS_OF_AXES, *more),
     )

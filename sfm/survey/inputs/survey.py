@@ -311,18 +311,14 @@ def survey_of_file(file: SurveyFile) -> Survey:
             for name in dict.fromkeys(rig.table for rig in file.rigs if rig.table is not None)
             for image, moment in read_moments(file.beside(name))
         },
-        tables=(
-            *(
-                read_observation_table(table.kind, file.beside(table.file), file.source)
-                for table in file.observation_tables
-            ),
-            *equipment.frames,
-        ),
+        tables=tuple(
+            read_observation_table(table.kind, file.beside(table.file), file.source)
+            for table in file.observation_tables
+        )
+        + equipment.frames,
         equipment=equipment.placed,
-        scale_bars=(
-            *(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars),
-            *equipment.bars,
-        ),
+        scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
+        + equipment.bars,
         observations=_given_image_points(file, control),
         marks=file.marks,
         diameters=read(read_diameters, file.targets.diameters),
@@ -375,10 +371,13 @@ def _given_by_equipment(file: SurveyFile) -> GivenEquipment:
                 f"{file.source}: [[equipment]] needs survey.equipment, the file that describes it"
             )
         return GivenEquipment()
-    path = file.beside(file.head.equipment)
     return given_by(
-        *(read_equipment(path, allow_outside=file.allow_outside), file.equipment, file.source, file.unit),
-        *(file.head.temperature, file.head.temperature_sigma),
+        read_equipment(file.beside(file.head.equipment), allow_outside=file.allow_outside),
+        file.equipment,
+        file.source,
+        file.unit,
+        file.head.temperature,
+        file.head.temperature_sigma,
     )
 
 

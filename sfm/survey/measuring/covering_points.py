@@ -25,7 +25,7 @@ from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, rows_of
+from sfm.model.network import ImagePoints, Network, rows_of
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.runtime.progress import give_back_memory, reported
 from sfm.runtime.threads import in_threads
@@ -90,9 +90,8 @@ class _Matched:
 
 def find_covering_points(
     photographs: Sequence[AnyArray],
+    network: Network,
     estimate: Estimate,
-    camera: IntArray,
-    seen: ImagePoints,
     *,
     windows: Windows,
     side_px: int,
@@ -104,9 +103,8 @@ def find_covering_points(
 
     Args:
         photographs: m photographs, (H, W) each; files are read when needed.
+        network: fitting image points of the tie points, which give the surface.
         estimate: orientation of the photographs, good to a few pixels, and the tie points.
-        camera: index of the camera of each photograph, (m,).
-        seen: image points of the fitting tie points, which give the surface.
         windows: side and model of the windows.
         side_px: side of the squares around the windows, px; no two squares share pixels.
         references: photographs to take points from; by default all, those with the most tie points first.
@@ -115,7 +113,7 @@ def find_covering_points(
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
-    m = len(photographs)
+    m, camera, seen = len(photographs), network.camera, network.image_points
     margin = windows.side_px // 2 + BORDER_PX
     tie_rows = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
@@ -142,7 +140,14 @@ def find_covering_points(
         if not of.any():
             return
         measured = match_squares(
-            *(grey, estimate, camera, squares.select(of), free[:, of], windows, threads), both_ways=not more
+            grey,
+            estimate,
+            camera,
+            squares.select(of),
+            free[:, of],
+            windows,
+            threads,
+            both_ways=not more,
         )
         new, used = _points_that_meet(measured.image_points, estimate, camera, rays)
         parts.append(new)

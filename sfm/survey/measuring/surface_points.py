@@ -29,7 +29,7 @@ from sfm.model.camera import project, tangents_from_pixel
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, without_given
+from sfm.model.network import Network, without_given
 from sfm.model.observations.kind import no_index
 from sfm.model.reduced_network import reduce_network
 from sfm.model.remarks.remark import Remark, remark, unless_note
@@ -114,16 +114,15 @@ def cover_photographs(
     path_of = files.path_of()
     paths = [path_of[name] for name in network.images]
     photographs = PhotographFiles(paths)
-    surface = seen.select(fits)
+    surface = replace(network, image_points=seen.select(fits))
     hidden = masked_pixels(Masks(survey.masks), network, estimate)
     if targets is not None:
         hidden = _with_targets(hidden, targets, survey.family, network, estimate)
-    windows = _best_windows(photographs, network, estimate, surface, settings, jobs, hidden)
+    windows = _best_windows(photographs, surface, estimate, settings, jobs, hidden)
     covered = find_covering_points(
         photographs,
-        estimate,
-        network.camera,
         surface,
+        estimate,
         windows=windows,
         side_px=_side(estimate, windows.side_px, settings.max_points),
         hidden=hidden,
@@ -218,9 +217,8 @@ def with_weights(network: Network, shown: FloatArray) -> Network:
 def _fitting_rays(network: Network, estimate: Estimate) -> BoolArray:
     """Return which rays of the tie points fit and belong to points that keep enough rays, (k,)."""
     seen = network.image_points
-    off = np.hypot(
-        *(project_points(estimate, network.camera, seen.image, estimate.points[seen.point]) - seen.xy).T
-    )
+    projected = project_points(estimate, network.camera, seen.image, estimate.points[seen.point])
+    off = np.hypot(projected[:, 0] - seen.xy[:, 0], projected[:, 1] - seen.xy[:, 1])
     known = np.isfinite(off)
     if not known.any():
         return np.asarray(known)
@@ -325,15 +323,14 @@ def _side(estimate: Estimate, window_px: int, most: int) -> int:
 
 def _best_windows(
     photographs: Sequence[AnyArray],
-    network: Network,
+    surface: Network,
     estimate: Estimate,
-    surface: ImagePoints,
     settings: TiePointSettings,
     jobs: int,
     hidden: CoveredPixels | None = None,
 ) -> Windows:
     """Return the windows of TRIED_WINDOWS whose rays together have the smallest standard deviation."""
-    most = np.argsort(-np.bincount(surface.image, minlength=len(photographs)), kind="stable")
+    most = np.argsort(-np.bincount(surface.image_points.image, minlength=len(photographs)), kind="stable")
     costs: list[tuple[Windows, float]] = []
     given = settings.window_px if "window_px" in settings.model_fields_set else None
     for windows in dict.fromkeys(replace(tried, side_px=given or tried.side_px) for tried in TRIED_WINDOWS):
@@ -341,9 +338,8 @@ def _best_windows(
         trial_side = max(TRIAL_SIDES * windows.side_px + 1, side)
         trial = find_covering_points(
             photographs,
-            estimate,
-            network.camera,
             surface,
+            estimate,
             windows=windows,
             side_px=trial_side,
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),

@@ -98,7 +98,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
     )
     refuse_ungrouped(survey.cameras, images, owner, survey.source)
     parts, outside_parts, first = [], [], 0
-    for table in tables:
+    for number, table in enumerate(tables):
         rows = slice(first, first + len(table))
         first = rows.stop
         camera = owner[image[rows]]
@@ -106,14 +106,15 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         outside_parts.append(refuse_outside(table, xy, cameras, camera))
         sigma = np.full(xy.shape, np.nan) if table.sigma is None else table.sigma
         stated = np.asarray(np.isfinite(sigma).all(axis=1)) | (table.sigma_px is not None)
-        parts.append(ImagePoints(image[rows], point[rows], xy, covariance, stated))
+        source = np.full(len(table), number)
+        parts.append(ImagePoints(image[rows], point[rows], xy, covariance, stated, source))
     seen, outside = ImagePoints.joined(parts), np.concatenate(outside_parts)
     gross = [f"{points[seen.point[k]]} in {images[seen.image[k]]}" for k in np.flatnonzero(outside)]
     refuse_unknown_photographs(survey, (*files.names, *images))
     # of photographs that are here, copies are found by their pictures
     copies = {} if len(files) else same_photographs(seen.image, seen.point, seen.xy, owner)
     every, used = images, _used_photographs(images, files, copies)
-    number = np.cumsum(used) - 1
+    number_of = np.cumsum(used) - 1
     failed = tuple(
         FailedImage(every[i], remark("copies", original=every[j], same="image points"))
         for i, j in copies.items()
@@ -121,20 +122,20 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
     sizes = [cameras[camera].size_px for camera in owner.tolist()]
     kept = used[seen.image] & ~outside
     kept &= Masks(survey.masks).visible_points(images, sizes, seen.image, seen.xy)
-    table_of = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
     images, owner = tuple(name for name, keep in zip(images, used, strict=True) if keep), owner[used]
-    seen = replace(seen.select(kept), image=number[seen.image[kept]], source=table_of[kept])
+    seen = replace(seen.select(kept), image=number_of[seen.image[kept]])
     merged, offsets = _merge_tables(seen, tables)
     if len(files):  # what the survey gives besides is part of the network of all sources
         network = Network(images, owner, points, merged.image_points)
     else:
         network = network_of(survey, images, owner, points, merged.image_points)
     times = Counter(zip(seen.image.tolist(), seen.point.tolist(), strict=True))
-    contradicting = tuple(
-        LeftOutPoint(name, times[i, j], remark("image_points_contradicting", image_points=name))
-        for i, j in merged.dropped
-        for name in [f"{points[j]} in {images[i]}"]
-    )
+    left_out = []
+    for i, j in merged.dropped:
+        name = f"{points[j]} in {images[i]}"
+        reason = remark("image_points_contradicting", image_points=name)
+        left_out.append(LeftOutPoint(name, times[i, j], reason))
+    left_out += [LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross]
     outside_remark = (remark("image_points_outside", image_points=gross),) if gross else ()
     return Measurements(
         network,
@@ -144,10 +145,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         failed,
         _overlays(network, files, readable),
         remarks=(*offsets, *merged.remarks(images, points), *outside_remark),
-        left_out=(
-            *contradicting,
-            *(LeftOutPoint(name, 1, remark("image_points_outside", image_points=name)) for name in gross),
-        ),
+        left_out=tuple(left_out),
     )
 
 

@@ -144,8 +144,9 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
     if len(parts) == 1:
         return replace(parts[0], network=_of_one_source(survey, parts[0].network))
     named = [part.network.points for part in parts]
-    parts = [replace(part, network=network) for part, network in zip(parts, _renamed(parts), strict=True)]
-    network, repeated = _joined(survey, [part.network for part in parts], named)
+    networks = _renamed(parts)
+    parts = [replace(part, network=renamed) for part, renamed in zip(parts, networks, strict=True)]
+    network, repeated = _joined(survey, networks, named)
     lost = {failed.image: failed for part in parts for failed in part.failed}
     seen = set(network.images)
     by_points = [  # they take part with given image points
@@ -164,8 +165,8 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
         next((part.files for part in parts if part.files is not None), None),
         next((part.photographs for part in parts if part.photographs is not None), None),
         next((part.naming for part in parts if part.naming.names), NO_NAMES),
-        (*(said for part in parts for said in part.remarks), *repeated.of_sources, *unread),
-        (*(point for part in parts for point in part.left_out), *repeated.left_out),
+        tuple(said for part in parts for said in part.remarks) + repeated.of_sources + unread,
+        tuple(point for part in parts for point in part.left_out) + repeated.left_out,
         tuple(parts),
     )
 
@@ -359,12 +360,12 @@ def _joined_correspondences(
         next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
         tuple(name for matched in completed for name in matched.no_circles),
-        (*(said for matched in completed for said in matched.remarks), *repeated.of_sources),
+        tuple(said for matched in completed for said in matched.remarks) + repeated.of_sources,
         start.point_failures,
         start.kind == "given",
         tuple(elsewhere.items()),
         tuple(dict.fromkeys(name for matched in completed for name in matched.suspected)),
-        (*(point for matched in completed for point in matched.left_out_image_points), *repeated.left_out),
+        tuple(point for matched in completed for point in matched.left_out_image_points) + repeated.left_out,
         _joined_overlays(
             [
                 part.overlays if matched.overlays is None else matched.overlays

@@ -37,10 +37,12 @@ class MergedImagePoints:
         same, averaged = (
             [f"{points[j]} in {images[i]}" for i, j in pairs] for pairs in (self.same, self.averaged)
         )
-        return (
-            *((remark("rows_identical", rows=same),) if same else ()),
-            *((remark("image_points_averaged", image_points=averaged),) if averaged else ()),
-        )
+        remarks = []
+        if same:
+            remarks.append(remark("rows_identical", rows=same))
+        if averaged:
+            remarks.append(remark("image_points_averaged", image_points=averaged))
+        return tuple(remarks)
 
 
 def merge_repeated(seen: ImagePoints) -> MergedImagePoints:

@@ -82,10 +82,11 @@ def place_cells(
     c, best_c = np.empty((len(IN_RING), cells)), np.empty((len(IN_RING), cells))
     nothing = np.zeros((2, cells))
     for k in range(len(xy)):
-        if not _sample(
-            *(image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, tilt[k]),
-            *(samples, sigma, ring_part, dot_part),
-        ):
+        is_inside = _sample(
+            image, xy[k], shape[k], levels[k], blur[k], 0.0, inner, outer, tilt[k],
+            samples, sigma, ring_part, dot_part,
+        )  # fmt: skip
+        if not is_inside:
             continue
         least, place = math.inf, 0.0
         for phase in range(PHASES):
@@ -163,10 +164,11 @@ def fit_cells(
                     tried[parameter] += sign * steps[parameter]
                     if abs(tried[1]) > MAX_SPREAD or abs(tried[2]) > _largest_glow(shape[k]):
                         continue
-                    if not _model(
-                        *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried),
-                        *(samples, sigma, ring_part, dot_part, W),
-                    ):
+                    is_inside = _model(
+                        image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, tried,
+                        samples, sigma, ring_part, dot_part, W,
+                    )  # fmt: skip
+                    if not is_inside:
                         continue
                     cost = _solve(samples, ring_part, dot_part, W, N, c)
                     cost += _SAMPLE_SIGMA**2 * ((tried[1:] / _SIGMAS) ** 2).sum()
@@ -179,10 +181,11 @@ def fit_cells(
                 if halved == _HALVINGS:
                     break
                 steps /= 2
-        if not _model(
-            *(image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, best),
-            *(samples, sigma, ring_part, dot_part, W),
-        ):
+        is_inside = _model(
+            image, xy[k], shape[k], levels[k], blur[k], inner, outer, tilt[k], bits, best,
+            samples, sigma, ring_part, dot_part, W,
+        )  # fmt: skip
+        if not is_inside:
             continue
         if _solve(samples, ring_part, dot_part, W, N, c) < math.inf:
             _compare(samples, ring_part, dot_part, W, N, c, out[k])
@@ -217,9 +220,10 @@ def _model(
     s = blur * math.exp(ring[3])
     near, far = _spread_ring(inner, outer, ring[1])
     without = _without_glow(shape, ring[2])
-    if not _sample(
-        *(image, xy, without, levels, s, ring[2], near, far, tilt, samples, sigma, ring_part, dot_part)
-    ):
+    is_inside = _sample(
+        image, xy, without, levels, s, ring[2], near, far, tilt, samples, sigma, ring_part, dot_part
+    )  # fmt: skip
+    if not is_inside:
         return False
     _mixture(sigma, ring[0], _shifts(bits, ring[1], ring[2] / s, near, far), W)
     return True

@@ -84,11 +84,8 @@ RINGS = {"arcs": 0, "ring12": 12, "ring14": 14, "ring20": 20, "even14": 14}
 # Rings of other makers that use all necklaces, without parity: a misread cell gives another valid code.
 NECKLACES = {"necklace8": 8, "necklace10": 10, "necklace12": 12}
 MIRRORED = "-mirrored"  # suffix of a name: cells are counted counter-clockwise in the image
-RING_NAMES = (
-    *RINGS,
-    *NECKLACES,
-    *(name + MIRRORED for name in (*RINGS, *NECKLACES) if name != "arcs"),
-)
+_ROUND = (*RINGS, *NECKLACES)
+RING_NAMES = _ROUND + tuple(name + MIRRORED for name in _ROUND if name != "arcs")
 
 
 def ring_family(name: str) -> CodeFamily:
