@@ -161,7 +161,11 @@ def fit_ellipse_model(
     halo = columns[goodness.HALO]
     flag[(halo > HALO) & (halo > HALO_SIGMAS * columns[goodness.HALO_SIGMA])] |= Flag.HALO.value
     glare = (columns[goodness.SATURATED] > FLARE_SATURATED) | (columns[goodness.GLARING] > FLARE_AROUND)
-    flag[glare | _changes(theta, gain)] |= Flag.FLARE.value
+    p, q, r, B, A = theta[:, 2:7].T
+    with np.errstate(divide="ignore", invalid="ignore"):  # of the background across the target
+        change = 2 * np.abs(p * r - q * q) ** -0.5 * np.abs(B) * np.hypot(*gain.T)
+        changes = change > FLARE_CHANGE * np.abs(A)
+    flag[glare | changes] |= Flag.FLARE.value
     return EllipseFit(
         xy=theta[:, :2],
         full_covariance=covariance,
@@ -179,15 +183,6 @@ def fit_ellipse_model(
         iterations=columns[goodness.STEPS].astype(np.int64),
         flag=flag,
     )
-
-
-def _changes(theta: FloatArray, gain: FloatArray) -> BoolArray:
-    """Return where the background changes across the target by a large part of the contrast, (k,)."""
-    p, q, r, B, A = theta[:, 2:7].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        radius = np.abs(p * r - q * q) ** -0.5
-        change = 2 * radius * np.abs(B) * np.hypot(*gain.T)
-        return np.asarray(change > FLARE_CHANGE * np.abs(A))
 
 
 def _shrink_gain(

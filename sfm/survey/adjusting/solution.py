@@ -7,7 +7,6 @@ assumptions are tested.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -432,12 +431,6 @@ def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Fin
     return choose(_finish(start, settled), (BETTER_START,), settle_again)
 
 
-def _with_better_start(final: _Final) -> Iterator[_Final]:
-    """Yield the final adjustment if it has another solution to start from."""
-    if final.others and final.others[0].converges:
-        yield final
-
-
 def _gain_of_start(before: _Final, again: _Final) -> float:
     """Return the gain of ln likelihood of all image points; both have the same parameters."""
     if not again.adjustment.converged:
@@ -459,7 +452,11 @@ def _report_start(before: _Final, again: _Final) -> _Final:
     return replace(again, remarks=(said,))
 
 
-BETTER_START = Choice(_with_better_start, _gain_of_start, report=_report_start)
+BETTER_START = Choice[_Final, _Final](  # of a final adjustment that has another solution to start from
+    lambda final: [final] if final.others and final.others[0].converges else [],
+    _gain_of_start,
+    report=_report_start,
+)
 
 
 def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment | None = None) -> _Final:

@@ -76,11 +76,11 @@ def find_contested_codes(
                 "photograph_of_second_object", codes=list(map(str, sorted(codes))), agreeing=others or None
             )
         left_out[image] = reason
-    main = {
-        code: place
-        for code, places in contested.items()
-        if (place := _majority_point(places, largest)) != UNNAMED
-    }
+    main = {}
+    for code, places in contested.items():
+        times = Counter(k for image, at in places.items() if image in largest for k in at if k != UNNAMED)
+        if times:
+            main[code] = min((-count, k) for k, count in times.items())[1]
     away = {image: frozenset(codes) for image, codes in elsewhere.items()}
     return ContestedCodes(contested, left_out, main, away)
 
@@ -229,12 +229,6 @@ def _points_of_group(
         code: frozenset[int]().union(*(at for image, at in places.items() if image in group)) - {UNNAMED}
         for code, places in contested.items()
     }
-
-
-def _majority_point(places: dict[int, frozenset[int]], group: frozenset[int]) -> int:
-    """Return the point at which most photographs of a group show a code, UNNAMED without one."""
-    counted = Counter(k for image, at in places.items() if image in group for k in at if k != UNNAMED)
-    return min(counted, key=lambda k: (-counted[k], k)) if counted else UNNAMED
 
 
 def _number(code: int, naming: Naming) -> int:

@@ -264,7 +264,12 @@ def split_cameras(
         images = np.flatnonzero(network.camera == a)
         first = len(variants)
         made, member = _photograph_cameras(settings, estimate.cameras[a], [network.images[i] for i in images])
-        variants += [_with_start_values(camera, settings, given) for camera in made]
+        for camera in made:  # a parameter that several cameras share starts from the survey file's camera
+            p = camera.parameters.copy()
+            for name, value in approximate_values(settings, camera.name, given).items():
+                s = camera.names.index(name)
+                p[s] = p[s] if camera.group_of(s) else value
+            variants.append(camera.with_parameters(p))
         owner[images] = first + member
         for name, (value, sigma) in settings.weighted:
             s = made[0].names.index(name)
@@ -309,19 +314,6 @@ def _correlation(
             "correlations of the weighted interior orientation: no such covariance matrix exists"
         )
     return R
-
-
-def _with_start_values(camera: Camera, settings: CameraSettings, given: StartCameras | None) -> Camera:
-    """Return the camera of a photograph or group with its given start values.
-
-    A parameter that several cameras share starts from the value of the survey file's camera.
-    """
-    p = camera.parameters.copy()
-    for name, value in approximate_values(settings, camera.name, given).items():
-        s = camera.names.index(name)
-        if not camera.group_of(s):
-            p[s] = value
-    return camera.with_parameters(p)
 
 
 def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) -> tuple[Network, Estimate]:

@@ -159,7 +159,7 @@ def tie_photographs(
         failed,
         tuple(replace(overlay, stored=detected[k][2]) for k, overlay in zip(read, drawn, strict=True)),
         files,
-        remarks=_remarks_on_pairs(len(matches), neighbours) + _remarks_on_still(tied.still, names),
+        remarks=_remarks_on_matching(len(matches), neighbours, tied.still, names),
     )
 
 
@@ -178,27 +178,31 @@ def _shown_tie_points(tied: TiePoints, shown: BoolArray) -> TiePoints:
     )
 
 
-def _remarks_on_pairs(pairs: int, neighbours: Sequence[IntArray]) -> tuple[Remark, ...]:
-    """Return the remark on the pairs of photographs that were matched, if these are not all pairs."""
-    m = len(neighbours[0])
-    possible = m * (m - 1) // 2
-    if pairs == possible:
-        return ()
-    by_position, in_sequence = (int((near >= 0).any(axis=1).sum()) or None for near in neighbours)
-    return (
-        remark(
-            "pairs_matched", pairs=pairs, possible=possible, by_position=by_position, in_sequence=in_sequence
-        ),
-    )
+def _remarks_on_matching(
+    pairs: int, neighbours: Sequence[IntArray], still: FloatArray, names: Sequence[str]
+) -> tuple[Remark, ...]:
+    """Return the remarks on matched pairs, if these are not all pairs, and on features that stand still.
 
-
-def _remarks_on_still(share: FloatArray, names: Sequence[str]) -> tuple[Remark, ...]:
-    """Return the remark on features that stand still, from their share in each photograph, (m,)."""
-    there = np.flatnonzero(share >= STILL_SHARE)
-    if not len(there):
-        return ()
-    stated = float(np.median(share[there]))
-    return (remark("still_features", share=stated, photographs=[names[i] for i in there.tolist()]),)
+    still: share of such features in each photograph, (m,).
+    """
+    remarks = []
+    possible = len(names) * (len(names) - 1) // 2
+    if pairs != possible:
+        by_position, in_sequence = (int((near >= 0).any(axis=1).sum()) or None for near in neighbours)
+        remarks.append(
+            remark(
+                "pairs_matched",
+                pairs=pairs,
+                possible=possible,
+                by_position=by_position,
+                in_sequence=in_sequence,
+            )
+        )
+    there = np.flatnonzero(still >= STILL_SHARE)
+    if len(there):
+        share = float(np.median(still[there]))
+        remarks.append(remark("still_features", share=share, photographs=[names[i] for i in there.tolist()]))
+    return tuple(remarks)
 
 
 def needed_rays(network: Network) -> IntArray:

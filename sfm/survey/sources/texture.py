@@ -7,7 +7,6 @@ from pathlib import Path
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.masks import Masks
 from sfm.survey.inputs.measurements import Measurements
-from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.survey.measuring.measured_store import MeasuredStore
@@ -37,10 +36,6 @@ def _cover(
     )
 
 
-def _settings(survey: Survey) -> tuple[tuple[str, Section], ...]:
-    return (("tie_points", survey.texture),)
-
-
 def _measure_one(
     survey: Survey | SurveyFile, image: str, path: Path, store: MeasuredStore
 ) -> tuple[dict[str, int], bool]:
@@ -48,4 +43,4 @@ def _measure_one(
     return {"features": len(natural)}, stored
 
 
-SOURCE = SurveySource(tie_photographs, _cover, _settings, _measure_one)
+SOURCE = SurveySource(tie_photographs, _cover, lambda survey: (("tie_points", survey.texture),), _measure_one)
