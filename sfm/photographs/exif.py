@@ -398,14 +398,18 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
     """
     _refuse_unconverted(path)
     with _PILLOW, warnings.catch_warnings(action="ignore"):
+        # Pillow's limit is below the size of aerial scans
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
                 raise PhotographError(f"{path.name}: not a file, a photograph is needed")
-            image = _unbounded_open(source)
+            image = Image.open(source, formats=FORMATS)
         except PhotographError:
             raise
         except Exception as error:  # Pillow fails on damaged headers in many ways
             raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
         with image:
             if image.width * image.height > MAX_PIXELS:
                 raise PhotographError(
@@ -413,16 +417,6 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
                     f"photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
                 )
             yield image
-
-
-def _unbounded_open(source: Path | io.BytesIO) -> Image.Image:
-    """Open a header without Pillow's limit, which is below the size of aerial scans."""
-    limit = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = None
-    try:
-        return Image.open(source, formats=FORMATS)
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
 
 
 def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:
@@ -467,22 +461,15 @@ def refuse_truncated(path: Path, data: bytes) -> None:
         # Inside a scan 0xff is always followed by 0 or a restart marker, so this is the end of the image.
         complete = data.find(b"\xff\xd9", at) >= 0
     elif data.startswith(b"\x89PNG\r\n\x1a\n"):
-        complete = _png_is_whole(data)
+        at, kind = 8, b""  # all chunks are within the file; OpenCV allocates memory for their claims
+        while at + 12 <= len(data) and kind != b"IEND":
+            kind = data[at + 4 : at + 8]
+            at += 12 + int.from_bytes(data[at : at + 4], "big")
+        complete = kind == b"IEND" and at <= len(data)
     else:
         return  # the decoder itself refuses truncated TIFF files
     if not complete:
         raise PhotographError(f"{path.name}: the file is truncated, its end is missing ({len(data)} bytes)")
-
-
-def _png_is_whole(data: bytes) -> bool:
-    """Return whether the chunks of a PNG are within the file; OpenCV allocates memory for their claims."""
-    at = 8
-    while at + 12 <= len(data):
-        kind = data[at + 4 : at + 8]
-        at += 12 + int.from_bytes(data[at : at + 4], "big")
-        if kind == b"IEND":
-            return at <= len(data)
-    return False
 
 
 def _reason(path: Path, error: Exception) -> str:

@@ -114,8 +114,9 @@ def choose_free_parameters(
             del determined[1:]  # control does not determine each c either
     for a in silent:
         chosen = (determined[-1][a] if determined else None) or set()
-        names[a] = chosen - dict(settings[a].weighted).keys()
-        in_order = tuple(name for name in MODELS[settings[a].model].names if name in names[a])
+        free = chosen.difference(dict(settings[a].weighted))
+        in_order = tuple(name for name in MODELS[settings[a].model].names if name in free)
+        names[a] = free
         settings[a] = settings[a].model_copy(update={"free": in_order})
     remarks = [
         said

@@ -474,7 +474,12 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
         camera.name for camera in final.estimate.cameras if camera.name in asked and not camera.free[0]
     )
     report_step("looking for other solutions")
-    starts = _solutions_of_pair(final)
+    starts: tuple[Estimate, ...] = ()
+    if len(final.network.images) <= 2 and final.datum != "control":  # control decides between those of a pair
+        accepted = replace(final.network, image_points=final.network.image_points.select(~final.rejected))
+        critical = -float(normal_ppf(final.test_alpha / 2))
+        tolerance_px = critical * max(final.sigma0, 1.0) * final.sigma_px
+        starts = pair_solutions(accepted, final.estimate, tolerance_px=tolerance_px)
     if before is not None and len(before.network.points) == len(final.network.points):
         starts = (*starts, before.estimate)
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
@@ -489,17 +494,6 @@ def _free_network_in_frame(before: Estimate, free: Estimate, task: Task, given: 
     lost = task.needed == 1  # control seen by one photograph: its given coordinates determine it
     points = np.where((lost & ~free.determined)[:, None], before.points, free.points)
     return replace(free, points=points)
-
-
-def _solutions_of_pair(final: Adjustment) -> tuple[Estimate, ...]:
-    """Return the solutions that the image points of a pair allow; empty with control, which decides."""
-    if len(final.network.images) > 2 or final.datum == "control":
-        return ()
-    accepted = replace(final.network, image_points=final.network.image_points.select(~final.rejected))
-    critical = -float(normal_ppf(final.test_alpha / 2))
-    return pair_solutions(
-        accepted, final.estimate, tolerance_px=critical * max(final.sigma0, 1.0) * final.sigma_px
-    )
 
 
 def _place_settled(start: _Prepared, settled: StableAdjustment) -> tuple[Adjustment, ControlCheck | None]:

@@ -44,11 +44,6 @@ def _pairs(value: Any) -> Any:
     return tuple(value.items()) if isinstance(value, dict) else value
 
 
-def _as_list(value: Any) -> Any:
-    """Turn a single text into a list."""
-    return (value,) if isinstance(value, str) else value
-
-
 def _odd(value: int) -> int:
     if value % 2 == 0:
         raise ValueError(f"found {value}, needed an odd number")
@@ -90,7 +85,9 @@ Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
 Names = Annotated[tuple[Name, ...], Field(strict=False)]
 Globs = Annotated[
-    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_GLOBS), BeforeValidator(_as_list)
+    tuple[Name, ...],
+    Field(strict=False, min_length=1, max_length=MAX_GLOBS),
+    BeforeValidator(lambda v: (v,) if isinstance(v, str) else v),
 ]
 Value = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Values = Annotated[
