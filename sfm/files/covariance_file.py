@@ -148,7 +148,14 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
     path = folder / ARRAYS
     if not path.is_file():
         return result
-    known = _stored_arrays(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise SurveyFileError(f"{path}: arrays of more than {MAX_BYTES} bytes, no more are read")
+        with np.load(path, allow_pickle=False) as arrays:
+            known = {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
+    except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
+        raise SurveyFileError(f"{path}: not an array of NumPy") from error
     images, cameras = result.network.images, result.estimate.cameras
     free = [int(camera.free.sum()) for camera in cameras]
     interior = tuple(known.get(f"interior_{k}", np.zeros((0, 0))) for k in range(len(cameras)))
@@ -174,15 +181,3 @@ def read_covariances(folder: Path, result: Solution) -> Solution:
     if not (fits and all(Q.dtype == np.float64 for Q in matrices)):
         raise SurveyFileError(f"{path}: its photographs or cameras are not those of the tables beside it")
     return solution
-
-
-def _stored_arrays(path: Path) -> dict[str, AnyArray]:
-    """Return the arrays of a file that are read back, by name."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise SurveyFileError(f"{path}: arrays of more than {MAX_BYTES} bytes, no more are read")
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files if name not in ("points", "point_names")}
-    except (OSError, ValueError, EOFError, SyntaxError, KeyError, zipfile.BadZipFile) as error:
-        raise SurveyFileError(f"{path}: not an array of NumPy") from error

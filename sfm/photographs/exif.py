@@ -11,7 +11,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -118,6 +118,13 @@ def read_metadata(path: str | Path) -> Metadata:
     orientation = exif.get(ExifTags.Base.Orientation, 1)
     width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
     height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
+    taken = None
+    with suppress(ValueError):  # cameras state no time zone
+        text = _text(camera.get(ExifTags.Base.DateTimeOriginal))
+        taken = datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S")
+        digits = _text(camera.get(ExifTags.Base.SubsecTimeOriginal)) or ""
+        if digits.isdecimal():
+            taken = taken.replace(microsecond=int(f"{digits:0<6.6}"))
     return Metadata(
         size_px=size,
         make=_text(exif.get(ExifTags.Base.Make)),
@@ -129,7 +136,7 @@ def read_metadata(path: str | Path) -> Metadata:
         serial=_text(camera.get(ExifTags.Base.BodySerialNumber)),
         lens=_text(camera.get(ExifTags.Base.LensModel)),
         taken_px=(round(width), round(height)) if width and height else None,
-        taken=_moment(camera),
+        taken=taken,
         position=satellite_position(gps, xmp if isinstance(xmp, bytes) else b""),
     )
 
@@ -140,17 +147,6 @@ def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:
         return exif.get_ifd(which)
     except Exception:  # see `read_metadata`
         return {}
-
-
-def _moment(camera: Any) -> datetime | None:
-    """Return the time of exposure, with the fraction of the second if it is stated."""
-    text = _text(camera.get(ExifTags.Base.DateTimeOriginal))
-    try:
-        moment = datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S")  # cameras state no time zone
-    except ValueError:
-        return None
-    digits = _text(camera.get(ExifTags.Base.SubsecTimeOriginal)) or ""
-    return moment.replace(microsecond=int(f"{digits:0<6.6}")) if digits.isdecimal() else moment
 
 
 def _pixel_from_exif(

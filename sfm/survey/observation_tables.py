@@ -141,7 +141,14 @@ def observation_table(kind: str, table: CsvTable) -> ObservationTable:
     d = min(len(of.components), len(columns))  # lines have one standard deviation for both offsets
     sigma = table.values[:, -d:]
     table.refuse(sigma, ~(sigma > 0), columns[-d:], "more than 0, the standard deviation")
-    refuse_tiny_sigmas(table, sigma, columns[-d:], _sizes(of, table.values[:, len(of.numbers) : -d], d))
+    # length, or extent of the positions, that each standard deviation belongs to, (n, d)
+    size = table.values[:, len(of.numbers) : -d]
+    if not size.shape[1]:
+        size = np.zeros((len(size), d))  # offsets of 0
+    else:
+        extent = np.broadcast_to(np.ptp(size, axis=0).max(), size.shape) if of.components == AXES else size
+        size = np.where(np.isin(of.components, of.angles), 0.0, extent)
+    refuse_tiny_sigmas(table, sigma, columns[-d:], size)
     if "length" in of.components:
         table.refuse(table.values[:, :1], table.values[:, :1] <= 0, columns[:1], "more than 0, a length")
     if issubclass(of, Group) and len(of.texts) == 2:  # a second set of directions is another table
@@ -160,15 +167,6 @@ def observation_table(kind: str, table: CsvTable) -> ObservationTable:
     q = len(of.numbers)
     value[:, q:] *= to_rad[: value.shape[1] - q]
     return ObservationTable(kind, value, to_rad[:d] * sigma, table)
-
-
-def _sizes(of: type[TableKind], value: FloatArray, d: int) -> FloatArray:
-    """Return the length, or the extent of the positions, that each standard deviation belongs to, (n, d)."""
-    if not value.shape[1]:  # offsets of 0
-        return np.zeros((len(value), d))
-    if of.components == AXES:
-        value = np.broadcast_to(np.ptp(value, axis=0).max(), value.shape)
-    return np.asarray(np.where(np.isin(of.components, of.angles), 0.0, value))
 
 
 def bars_of(table: ObservationTable, number: int) -> list[ScaleBar]:

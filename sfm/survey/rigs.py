@@ -261,8 +261,8 @@ def mounts_of(rigs: Mapping[str, Sequence[int]], network: Network, estimate: Est
     free, names = np.zeros((a, 6), dtype=bool), [""] * a
     at: dict[tuple[int, int], int] = {}
     if network.moment is not None:
-        for i in np.flatnonzero(estimate.oriented):
-            at[int(network.moment[i]), int(network.camera[i])] = int(i)
+        for i in np.flatnonzero(estimate.oriented).tolist():
+            at[int(network.moment[i]), int(network.camera[i])] = i
     for rig, (reference, *left) in rigs.items():
         known = [reference]
         names[reference] = rig

@@ -61,7 +61,6 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
-from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import (
@@ -252,10 +251,13 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     chosen = choose_free_parameters(
         survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum
     )
-    cameras = tuple(
-        _with_c_per_photograph(camera) if camera.name in varying else camera for camera in chosen.cameras
-    )
-    survey, estimate = replace(survey, cameras=cameras), chosen.estimate
+    cameras = list(chosen.cameras)
+    for a, settings in enumerate(cameras):
+        parameters = MODELS[settings.model].parameters
+        focal = tuple(parameter.name for parameter in parameters if parameter.role is Role.FOCAL)
+        if settings.name in varying and set(focal) <= set(settings.free):
+            cameras[a] = settings.model_copy(update={"per_photograph": focal})
+    survey, estimate = replace(survey, cameras=tuple(cameras)), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
     # image points of a source that gives a photograph enough determine it
@@ -275,16 +277,6 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         frame,
         (*unused, *chosen.remarks),
     )
-
-
-def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
-    """Return the settings with c per photograph, if it is adjusted."""
-    focal = tuple(
-        parameter.name for parameter in MODELS[settings.model].parameters if parameter.role is Role.FOCAL
-    )
-    if not set(focal) <= set(settings.free):
-        return settings
-    return settings.model_copy(update={"per_photograph": focal})
 
 
 def _free_network(start: _Prepared) -> StableAdjustment | None:
@@ -315,18 +307,6 @@ def _has_no_identity(survey: Survey) -> bool:
     """Return whether the points are on a plate that looks alike when turned: it alone identifies them."""
     plate = plate_family(survey.targets)
     return plate is not None and plate.is_ambiguous
-
-
-def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork | None:
-    """Return the free network that judges given values; None without one that can."""
-    # a camera that had to be held at its start value gives the network a wrong shape
-    if free is None or free.held:
-        return None
-    adjustment, network = free.adjustment, start.task.network
-    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
-    if network.has_common_errors and (given_any or network.observations):
-        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
-    return FreeNetwork(adjustment)
 
 
 def _with_confirmed_values(
@@ -360,7 +340,13 @@ def _with_confirmed_values(
         checks_scale=bool(np.isfinite(scale_sigma(others, start.estimate))),
         false_alarm=survey.adjust.false_alarm,
     )
-    reference = _reference(start, free)
+    reference = None
+    if free is not None and not free.held:  # with a camera held at its start value it has a wrong shape
+        adjustment, of_survey = free.adjustment, start.task.network
+        given_any = len(of_survey.control) or len(of_survey.scale_bars) or len(of_survey.exterior)
+        if of_survey.has_common_errors and (given_any or of_survey.observations):
+            adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
+        reference = FreeNetwork(adjustment)
     place = None if free is None else partial(_placing, start, free)
     given = judge_given(network, reference, settings, mounts=mounts, place=place)
     needed = task.needed.copy()

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.model.display import agreeing, counted, listed
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import PLANAR_POINTS
@@ -90,7 +90,15 @@ def sides_not_found(family: TargetFamily | None, photographs: MeasuredPhotograph
         seen = np.zeros(plate.count, dtype=bool)
         for code, on_plate in zip(codes, on, strict=True):
             seen[code[on_plate]] = True
-        lost = _missing_sides(plate, seen)
+        step = 2 if plate.name == "aprilgrid" else 1  # rows of corners of a tag
+        number = np.arange(plate.count).reshape(plate.rows, plate.columns)
+        lost = {}  # the innermost of the outer rows and columns of each side without any seen point
+        for name, lines in (("row", number), ("column", number.T)):
+            for end, inwards in (("first", lines), ("last", lines[::-1])):
+                count = int(seen[inwards].any(axis=1).argmax())
+                if count >= step:
+                    side = f"{end} {name}" if count == 1 else f"{end} {count} {name}s"
+                    lost[side] = _Line(inwards[count - step], inwards[count])
         views = dict.fromkeys(lost, 0)
         for k, (code, on_plate) in enumerate(zip(codes, on, strict=True)):
             size = photographs.cameras[photographs.camera[k]].size_px
@@ -111,20 +119,6 @@ class _Line(NamedTuple):
 
     outer: IntArray  # points of the missing line
     neighbour: IntArray  # points of its neighbour
-
-
-def _missing_sides(plate: PlateFamily, seen: BoolArray) -> dict[str, _Line]:
-    """Return the innermost of the outer rows and columns of each side without any seen point."""
-    step = 2 if plate.name == "aprilgrid" else 1  # rows of corners of a tag
-    number = np.arange(plate.count).reshape(plate.rows, plate.columns)
-    sides = {}
-    for name, lines in (("row", number), ("column", number.T)):
-        for end, inwards in (("first", lines), ("last", lines[::-1])):
-            count = int(seen[inwards].any(axis=1).argmax())
-            if count >= step:
-                side = f"{end} {name}" if count == 1 else f"{end} {count} {name}s"
-                sides[side] = _Line(inwards[count - step], inwards[count])
-    return sides
 
 
 def _in_view(

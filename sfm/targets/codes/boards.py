@@ -91,7 +91,13 @@ def find_boards(
             xy, code = name_corners(*tags[plate.dictionary], plate)
             half = windows_beside(xy, plate)
         elif plate.name == "charuco":
-            xy, code = _charuco(grey, plate)
+            xy, code = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+            for board in charuco_patterns(plate):
+                corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+                if ids is not None and len(ids):  # empty for a board with its tags in the other squares
+                    xy = np.asarray(corners, dtype=float).reshape(-1, 2)
+                    code = np.asarray(ids).reshape(-1).astype(np.int64)
+                    break
             half = min(MAX_HALF_SPACINGS, (1 - plate.tag_share) / 2) * _spacing(xy)  # up to the tags
         else:
             xy, code = _checkerboard(grey, plate)
@@ -147,16 +153,6 @@ def reduce_photograph(grey: AnyArray, largest_px: int) -> tuple[AnyArray, float]
         return grey, scale
     height, width = (max(1, round(scale * side)) for side in grey.shape)
     return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)), scale
-
-
-def _charuco(grey: AnyArray, plate: PlateFamily) -> tuple[FloatArray, IntArray]:
-    """Return the crossings of a ChArUco board and their points."""
-    for board in charuco_patterns(plate):
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
-        if ids is not None and len(ids):  # empty for a board with its tags in the other squares
-            code = np.asarray(ids).reshape(-1).astype(np.int64)
-            return np.asarray(corners, dtype=float).reshape(-1, 2), code
-    return np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
 
 
 def charuco_patterns(plate: PlateFamily) -> list[cv2.aruco.CharucoBoard]:
