@@ -168,13 +168,18 @@ def _common_rig(
             if turns not in rigs or rig.rank < rigs[turns].rank:
                 rigs[turns] = rig
     best, *others = sorted(rigs.values(), key=lambda rig: rig.rank)
+    return best if _is_certain(best, others, len(seen), level) else None
+
+
+def _is_certain(best: _Rig, others: Sequence[_Rig], pairs: int, level: float) -> bool:
+    """Return whether most pairs agree with the best one, and no other fits as well (F test)."""
     agreeing = int(best.agrees.sum())
-    if agreeing < 2 or 2 * agreeing <= len(seen):
-        return None
+    if agreeing < 2 or 2 * agreeing <= pairs:
+        return False
     redundancy = OF_A_RIG * (agreeing - 1)
-    limit = float(f_isf(level, redundancy, redundancy)) * best.squares(best.agrees)
+    limit = float(f_isf(level, redundancy, redundancy))
     rivals = [other for other in others if (other.turn != best.turn)[best.agrees].any()]
-    return best if all(other.squares(best.agrees) > limit for other in rivals) else None
+    return all(other.squares(best.agrees) > limit * best.squares(best.agrees) for other in rivals)
 
 
 class _Views:
