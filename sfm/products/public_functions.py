@@ -203,7 +203,7 @@ def compare(
         >>> sfm.compare(result, result).point_difference.max() < 1e-9
         np.True_
     """
-    first, second = (solution_of(one, "compare").with_joint_covariance for one in (a, b))
+    first, second = (solution_of(result, "compare").with_joint_covariance for result in (a, b))
     return compare_results(
         first, second, align=align, control=(control,) if isinstance(control, str) else tuple(control)
     )
@@ -337,12 +337,12 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
 
 def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
     """Return a function that writes the compared solution as a COLMAP model; None without a comparison."""
-    both = result.comparison
-    if both is None:
+    comparison = result.comparison
+    if comparison is None:
         return None
     from adapters.colmap.camera_models import write_model
 
-    return lambda folder: write_model(folder, both.network, both.adjustment.estimate)
+    return lambda folder: write_model(folder, comparison.network, comparison.adjustment.estimate)
 
 
 @contextmanager

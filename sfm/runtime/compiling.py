@@ -99,15 +99,15 @@ def inlined_fast(function: Callable[P, R]) -> Callable[P, R]:
 
 def sources_of(*modules: str) -> dict[str, str]:
     """Return the sources of modules and of all modules of this package that they import, by name."""
-    found: dict[str, str] = {}
+    sources: dict[str, str] = {}
     left = list(modules)
     while left:
         name = left.pop()
-        source = None if name in found else _source(name)
+        source = None if name in sources else _source(name)
         if source is not None:
-            found[name] = source
+            sources[name] = source
             left += _imported(name)
-    return found
+    return sources
 
 
 @cache
@@ -134,11 +134,11 @@ def _source(name: str) -> str | None:
 @cache
 def _imported(name: str) -> tuple[str, ...]:
     """Return the modules of this package that a module imports, and names in them that may be modules too."""
-    found = []
+    imported = []
     for module, names in IMPORT.findall(_source(name) or ""):
-        found.append(module)
-        found += [f"{module}.{word}" for word in re.findall(r"\w+", names)]
-    return tuple(found)
+        imported.append(module)
+        imported += [f"{module}.{word}" for word in re.findall(r"\w+", names)]
+    return tuple(imported)
 
 
 @contextmanager

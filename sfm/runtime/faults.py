@@ -84,7 +84,9 @@ def keep_traceback(error: Exception) -> Path | None:
 def _is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or an error that caused it, is a lack of memory."""
     while error is not None:
-        said = isinstance(error, ImportError | RuntimeError) and any(one in str(error) for one in NO_MEMORY)
+        said = isinstance(error, ImportError | RuntimeError) and any(
+            sentence in str(error) for sentence in NO_MEMORY
+        )
         if said or isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
             return True
         error = error.__cause__ or error.__context__

@@ -146,5 +146,5 @@ def _libc_function(function: str) -> Callable[..., int] | None:
     """Return a function of the C library, or None if it does not exist."""
     if sys.platform != "linux":
         return None
-    found: Callable[..., int] | None = getattr(ctypes.CDLL(None), function, None)
-    return found
+    entry: Callable[..., int] | None = getattr(ctypes.CDLL(None), function, None)
+    return entry

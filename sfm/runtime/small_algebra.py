@@ -156,8 +156,8 @@ def _subtract_pair(_: Any, flat: Any, at: Any, stride: Any, Y: Any, s: Any, t: A
             )
             value = builder.load(pointer, align=ALIGNED)
             for r in range(3):
-                one = _repeated(builder, builder.load(_pointer(builder, rows, first, 6 * r + q)))
-                value = builder.fsub(value, builder.fmul(one, others[r], flags=FUSED), flags=FUSED)
+                factor = _repeated(builder, builder.load(_pointer(builder, rows, first, 6 * r + q)))
+                value = builder.fsub(value, builder.fmul(factor, others[r], flags=FUSED), flags=FUSED)
             builder.store(value, pointer, align=ALIGNED)
         return context.get_dummy_value()
 
@@ -192,8 +192,8 @@ def _add_product(_: Any, YQ: Any, s: Any, Y: Any, t: Any, flat: Any, at: Any, st
                 builder, builder.gep(numbers, [builder.add(at, builder.mul(stride, _integer(q)))])
             )
             for r in range(3):
-                one = _repeated(builder, builder.load(_pointer(builder, rows, second, 6 * r + q)))
-                values[r] = builder.fadd(values[r], builder.fmul(one, row, flags=FUSED), flags=FUSED)
+                factor = _repeated(builder, builder.load(_pointer(builder, rows, second, 6 * r + q)))
+                values[r] = builder.fadd(values[r], builder.fmul(factor, row, flags=FUSED), flags=FUSED)
         for pointer, value in zip(pointers, values, strict=True):
             builder.store(value, pointer, align=ALIGNED)
         return context.get_dummy_value()
@@ -228,8 +228,8 @@ def _load_six(builder: Any, pointer: Any) -> Any:
 def _repeated(builder: Any, number: Any) -> Any:
     """Return a vector that repeats one number six times."""
     nothing, lane = ir.Constant(SIX, ir.Undefined), ir.IntType(32)
-    one = builder.insert_element(nothing, number, ir.Constant(lane, 0))
-    return builder.shuffle_vector(one, nothing, ir.Constant(ir.VectorType(lane, 6), [0] * 6))
+    first = builder.insert_element(nothing, number, ir.Constant(lane, 0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(lane, 6), [0] * 6))
 
 
 @compiled

@@ -51,14 +51,14 @@ def own_threads(threads: int | None = None) -> Iterator[None]:
             pool.set_num_threads(number)
 
 
-def at_once(one: Callable[[], T], other: Callable[[], T]) -> tuple[T, T]:
+def at_once(first: Callable[[], T], other: Callable[[], T]) -> tuple[T, T]:
     """Return the results of two functions; they run at the same time if a second thread is available."""
     second = _second.get()
     if second is None:
-        return one(), other()
+        return first(), other()
     running = second.submit(other)
     try:
-        result = one()
+        result = first()
     finally:
         running.exception()  # wait for its end, even if the first failed
     return result, running.result()

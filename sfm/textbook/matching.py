@@ -74,7 +74,7 @@ def match_pyramid(
         scale = 2.0**-level
         coarsest = level == levels - 1
         reach = round((search_px - side) * scale) + 2 if coarsest else 2 * FINE_REACH
-        found = match_ncc(
+        of_level = match_ncc(
             pyramids[0][level],
             pyramids[1][level],
             a * scale,
@@ -84,10 +84,10 @@ def match_pyramid(
             limits=NccLimits(min_correlation=min_correlation),
         )
         if matches is not None:  # a match that failed on a level above keeps the flag of that level
-            flag = np.where(matches.flag != 0, matches.flag, found.flag)
-            found = replace(found, flag=flag, xy=np.where((flag == 0)[:, None], found.xy, np.nan))
-        matches = found
-        b = np.where(np.isfinite(found.xy), found.xy / scale, b)
+            flag = np.where(matches.flag != 0, matches.flag, of_level.flag)
+            of_level = replace(of_level, flag=flag, xy=np.where((flag == 0)[:, None], of_level.xy, np.nan))
+        matches = of_level
+        b = np.where(np.isfinite(of_level.xy), of_level.xy / scale, b)
     assert matches is not None
     scale_left, scale_right = FULL_SCALE_8 / full_scale(left), FULL_SCALE_8 / full_scale(right)
     return replace(matches, gain=matches.gain * scale_left / scale_right, offset=matches.offset / scale_right)

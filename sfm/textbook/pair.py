@@ -143,12 +143,12 @@ def _base_frame(base: FloatArray) -> FloatArray:
 
 def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return base and rotation without start values; of a planar scene, the solution that fits better."""
-    found = relative_orientations(first, second, tolerance=FIVE_POINT_TOLERANCE)
-    if found[0].kind == "infinite":
+    solutions = relative_orientations(first, second, tolerance=FIVE_POINT_TOLERANCE)
+    if solutions[0].kind == "infinite":
         raise GeometryError(
             "relative orientation: a rotation alone explains the rays, there is no base to determine"
         )
-    best = min(found, key=lambda one: one.rms)
+    best = min(solutions, key=lambda solution: solution.rms)
     return best.base, best.rotation
 
 

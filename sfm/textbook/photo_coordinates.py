@@ -354,16 +354,16 @@ def orient_fiducials(
     if spread[0] == 0 or (kind == AFFINE and spread[1] <= MIN_SINGULAR_RATIO * spread[0]):
         raise GeometryError("fiducial marks: the marks coincide or lie on one line")
     x, y = (m - centre).T
-    one, zero = np.ones(n), np.zeros(n)
+    ones, zeros = np.ones(n), np.zeros(n)
     if kind == SIMILARITY:
         # unknowns a, b, tx, ty: xf = a x - b y + tx, yf = b x + a y + ty
-        A = np.concatenate([np.stack([x, -y, one, zero], axis=1), np.stack([y, x, zero, one], axis=1)])
+        A = np.concatenate([np.stack([x, -y, ones, zeros], axis=1), np.stack([y, x, zeros, ones], axis=1)])
     else:
         # unknowns a11, a12, tx, a21, a22, ty
         A = np.concatenate(
             [
-                np.stack([x, y, one, zero, zero, zero], axis=1),
-                np.stack([zero, zero, zero, x, y, one], axis=1),
+                np.stack([x, y, ones, zeros, zeros, zeros], axis=1),
+                np.stack([zeros, zeros, zeros, x, y, ones], axis=1),
             ]
         )
     l = np.concatenate([f[:, 0], f[:, 1]])

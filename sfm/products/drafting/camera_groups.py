@@ -121,8 +121,8 @@ def _divide(
     part: what stands for the camera in the name of each photograph; none where it is missing.
     """
     groups: dict[tuple[object, ...], list[str]] = defaultdict(list)
-    for name, one in sorted(metadata.items()):
-        groups[*_camera_data(one), part.get(name, "")].append(name)
+    for name, exif in sorted(metadata.items()):
+        groups[*_camera_data(exif), part.get(name, "")].append(name)
     largest = max((len(names) for names in groups.values()), default=0)
     kept: list[list[str]] = []
     left_out: list[tuple[str, str]] = []
@@ -145,19 +145,19 @@ def _rig_by_times(timed: TimedRig, cameras: Mapping[str, Sequence[str]]) -> Prop
     return ProposedRig(timed.cameras, BY_TIMES, len(shared), example, timed.tolerance_s)
 
 
-def _camera_data(one: Metadata) -> tuple[object, ...]:
+def _camera_data(exif: Metadata) -> tuple[object, ...]:
     """Return what tells cameras and their settings apart."""
-    return one.make, one.model, one.serial, one.lens, _rounded(one.focal_mm), one.size_px
+    return exif.make, exif.model, exif.serial, exif.lens, _rounded(exif.focal_mm), exif.size_px
 
 
 def _is_one_camera(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
     """Return whether serial numbers show that one camera took what the names give to several."""
     of: dict[object, set[str]] = defaultdict(set)
     for name, part in named.camera.items():
-        one = metadata[name]
-        if one.serial:
-            of[one.make, one.model, one.serial].add(part)
-    return any(len(some) > 1 for some in of.values())
+        exif = metadata[name]
+        if exif.serial:
+            of[exif.make, exif.model, exif.serial].add(part)
+    return any(len(parts) > 1 for parts in of.values())
 
 
 def _are_apart(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
@@ -172,7 +172,7 @@ def _are_apart(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
             of[part][named.moment[name]] = taken.timestamp()
     reference, *others = sorted(of.values(), key=len, reverse=True) or [{}]
     for times in others:
-        ahead = np.array([times[one] - reference[one] for one in times if one in reference])
+        ahead = np.array([times[moment] - reference[moment] for moment in times if moment in reference])
         if len(ahead) > 1 and (np.abs(ahead - np.median(ahead)) > MAX_APART_S).mean() > 0.5:
             return True
     return False
@@ -226,19 +226,24 @@ def _group(
         c_source,
         assumed,
         next(
-            (f"EXIF data: {one}" for one in (first.lens, first.model) if one and FISHEYE_NAME.search(one)), ""
+            (
+                f"EXIF data: {text}"
+                for text in (first.lens, first.model)
+                if text and FISHEYE_NAME.search(text)
+            ),
+            "",
         ),
         _remarks(label, {name: metadata[name] for name in names}),
     )
 
 
-def _pixel(one: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]:
+def _pixel(exif: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]:
     """Return the side of a pixel, mm, and its source."""
-    if one.pixel_mm is not None:
-        return sum(one.pixel_mm) / 2, "EXIF data"
-    width = sensor_width(one.make, one.model) if one.make and one.model else None
+    if exif.pixel_mm is not None:
+        return sum(exif.pixel_mm) / 2, "EXIF data"
+    width = sensor_width(exif.make, exif.model) if exif.make and exif.model else None
     if width is not None:
-        return width / max(one.size_px), f"{one.make} {one.model} in COLMAP's list of cameras"
+        return width / max(exif.size_px), f"{exif.make} {exif.model} in COLMAP's list of cameras"
     return None, ""
 
 
@@ -246,9 +251,9 @@ def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...
     """Return remarks on photographs of a camera that were resampled."""
     remarks = []
     resampled = {
-        name: one.taken_px
-        for name, one in photographs.items()
-        if one.taken_px and sorted(one.taken_px) != sorted(one.size_px)
+        name: exif.taken_px
+        for name, exif in photographs.items()
+        if exif.taken_px and sorted(exif.taken_px) != sorted(exif.size_px)
     }
     if resampled:
         name, taken = next(iter(resampled.items()))
@@ -265,18 +270,18 @@ def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...
     return tuple(remarks)
 
 
-def _reason_left_out(one: Metadata, main: Metadata) -> str:
+def _reason_left_out(alone: Metadata, main: Metadata) -> str:
     """Return why the only photograph of a camera is left out."""
-    if one.size_px == main.size_px[::-1] and (one.make, one.model) == (main.make, main.model):
+    if alone.size_px == main.size_px[::-1] and (alone.make, alone.model) == (main.make, main.model):
         return "the only one stored upright; a photograph turned by a program has lost its camera"
-    if one.size_px != main.size_px:
+    if alone.size_px != main.size_px:
         return (
-            f"the only one of {one.size_px[0]} x {one.size_px[1]} px, the others have "
+            f"the only one of {alone.size_px[0]} x {alone.size_px[1]} px, the others have "
             f"{main.size_px[0]} x {main.size_px[1]} px"
         )
-    if _rounded(one.focal_mm) != _rounded(main.focal_mm):
-        return f"the only one with c = {one.focal_mm or 0:g} mm, the others have {main.focal_mm or 0:g} mm"
-    camera = " ".join(filter(None, (one.make, one.model, one.serial)))
+    if _rounded(alone.focal_mm) != _rounded(main.focal_mm):
+        return f"the only one with c = {alone.focal_mm or 0:g} mm, the others have {main.focal_mm or 0:g} mm"
+    camera = " ".join(filter(None, (alone.make, alone.model, alone.serial)))
     return f"the only one of camera {camera}" if camera else "the only one whose name is like this"
 
 
@@ -286,7 +291,7 @@ def _rounded(focal: float | None) -> float | None:
 
 def _labels(firsts: Sequence[Metadata], parts: Sequence[str]) -> list[str]:
     """Return unique names of the cameras: the part of the file names that stands for each, or the model."""
-    models = [_word(one.model or "") for one in firsts]
+    models = [_word(exif.model or "") for exif in firsts]
     plain = [
         part if part and not part.isdigit() else "-".join(filter(None, (model or (part and "camera"), part)))
         for model, part in zip(models, map(_word, _without_common(parts)), strict=True)
@@ -307,10 +312,12 @@ def _word(text: str) -> str:
 def _without_common(parts: Sequence[str]) -> list[str]:
     """Return paths of folders without the folders that all of them have."""
     split = [PurePosixPath(part).parts for part in parts]
-    differing = [j for j in range(min(map(len, split), default=0)) if len({one[j] for one in split}) > 1]
+    differing = [
+        j for j in range(min(map(len, split), default=0)) if len({folders[j] for folders in split}) > 1
+    ]
     return [
-        "/".join(one[j] for j in differing) if differing else part
-        for one, part in zip(split, parts, strict=True)
+        "/".join(folders[j] for j in differing) if differing else part
+        for folders, part in zip(split, parts, strict=True)
     ]
 
 

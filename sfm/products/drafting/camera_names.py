@@ -62,28 +62,28 @@ def cameras_in_names(names: Sequence[str]) -> NamedCameras | None:
         names: names of photographs with their folders, such as cam0/0001.png, each once.
     """
     parts = {name: _parts(name) for name in names}
-    shapes = Counter(tuple(one.kind for one in parts[name]) for name in names)
+    shapes = Counter(tuple(part.kind for part in parts[name]) for name in names)
     shape, count = shapes.most_common(1)[0] if shapes else ((), 0)
     if 2 * count <= len(names):
         return None
-    alike = [name for name in names if tuple(one.kind for one in parts[name]) == shape]
+    alike = [name for name in names if tuple(part.kind for part in parts[name]) == shape]
     dated = np.any([_dated(name, parts[name]) for name in alike], axis=0)
     proposals = [
         (
             _strength([parts[name] for name in alike], k),
-            -len(set(found.camera.values())),
-            len(found.camera),
-            found,
+            -len(set(proposal.camera.values())),
+            len(proposal.camera),
+            proposal,
         )
         for k, kind in enumerate(shape)
         if kind in (FOLDER, LETTERS, DIGITS)
         and not dated[k]
-        and (found := _proposal(alike, parts, k)) is not None
+        and (proposal := _proposal(alike, parts, k)) is not None
     ]
     if not proposals:
         return None
-    best = max(proposals, key=lambda one: one[:3])
-    groupings = {_grouping(found.camera) for *rank, found in proposals if tuple(rank) == best[:3]}
+    best = max(proposals, key=lambda proposal: proposal[:3])
+    groupings = {_grouping(proposal.camera) for *rank, proposal in proposals if tuple(rank) == best[:3]}
     return best[3] if len(groupings) == 1 else None
 
 
@@ -98,7 +98,7 @@ def divisions_by_names(names: Sequence[str]) -> list[dict[str, str]]:
     """
     parts = {name: _parts(name) for name in names}
     divisions = []
-    for k in range(min((len(one) for one in parts.values()), default=0)):
+    for k in range(min((len(name_parts) for name_parts in parts.values()), default=0)):
         word = {name: of_name[k].text for name, of_name in parts.items()}
         if {of_name[k].kind for of_name in parts.values()} not in ({FOLDER}, {LETTERS}):
             continue
@@ -141,7 +141,7 @@ def _strength(rows: Sequence[tuple[Part, ...]], k: int) -> int:
         words = [[parts[k - 1].text if kind == DIGITS and k else parts[k].text] for parts in rows]
         if kind == DIGITS and len(set(map(tuple, words))) > 1:  # the word before the number is a part itself
             return 0
-    if all(any(CAMERA_WORDS.fullmatch(word) for word in some) for some in words):
+    if all(any(CAMERA_WORDS.fullmatch(word) for word in name_words) for name_words in words):
         return 2
     return 0 if kind == DIGITS else 1
 
@@ -153,19 +153,19 @@ def _proposal(names: Sequence[str], parts: Mapping[str, tuple[Part, ...]], k: in
     for name in names:
         if times[parts[name][k].text] >= MIN_OF_CAMERA:
             of[parts[name][k].text].append(name)
-    camera = {name: value for value, some in of.items() for name in some}
+    camera = {name: value for value, members in of.items() for name in members}
     if len(of) < 2 or 2 * len(camera) <= len(names):
         return None
     if _strength([parts[name] for name in names], k) == 0:
         serial = min(map(len, of)) >= MIN_SERIAL_DIGITS and len(of) ** 2 < len(names)
         if len(of) > 2 and not serial:
             return None
-    shape = [one.kind for one in parts[names[0]]]
+    shape = [part.kind for part in parts[names[0]]]
     varying = [
         j
         for j, kind in enumerate(shape)
         if kind in (FOLDER, LETTERS, DIGITS)
-        and any(len({parts[name][j].text for name in some}) > 1 for some in of.values())
+        and any(len({parts[name][j].text for name in members}) > 1 for members in of.values())
     ]
     for chosen in _runs(varying, k):
         moment = {name: tuple(parts[name][j].text for j in chosen) for name in camera}
@@ -176,7 +176,7 @@ def _proposal(names: Sequence[str], parts: Mapping[str, tuple[Part, ...]], k: in
             pattern = _pattern([parts[name] for name in camera], chosen, k)
             if not pattern and _is_in_order(of, moment):
                 pattern = IN_ORDER
-            return NamedCameras(camera, {name: "-".join(one) for name, one in moment.items()}, pattern)
+            return NamedCameras(camera, {name: "-".join(texts) for name, texts in moment.items()}, pattern)
     if shape[k] == FOLDER and len(varying) == 1 and shape[varying[0]] == DIGITS:
         return _by_clock(of, {name: int(parts[name][varying[0]].text) for name in camera})
     return None
@@ -194,21 +194,21 @@ def _runs(varying: Sequence[int], k: int) -> list[tuple[int, ...]]:
 
 def _is_in_order(of: Mapping[str, Sequence[str]], moment: Mapping[str, tuple[str, ...]]) -> bool:
     """Return whether the names of each camera, in their order, are of the same moments."""
-    return len({tuple(moment[name] for name in sorted(some)) for some in of.values()}) == 1
+    return len({tuple(moment[name] for name in sorted(members)) for members in of.values()}) == 1
 
 
 def _by_clock(of: Mapping[str, Sequence[str]], clock: Mapping[str, int]) -> NamedCameras | None:
     """Return cameras whose photographs are numbered by a clock, if all take one moment after another."""
-    ranked = [sorted(some) for some in of.values()]
-    if len({len(some) for some in ranked}) > 1:
+    ranked = [sorted(members) for members in of.values()]
+    if len({len(members) for members in ranked}) > 1:
         return None
-    taken = np.array([[clock[name] for name in some] for some in ranked], dtype=float)
+    taken = np.array([[clock[name] for name in members] for members in ranked], dtype=float)
     low, high = taken.min(axis=0), taken.max(axis=0)
     gap, spread = low[1:] - high[:-1], np.maximum(high[1:] - low[1:], high[:-1] - low[:-1])
     if (gap <= 0).any() or (spread > MAX_SPREAD * gap).any():
         return None
-    camera = {name: value for value, some in of.items() for name in some}
-    moment = {name: f"{rank + 1}" for some in ranked for rank, name in enumerate(some)}
+    camera = {name: value for value, members in of.items() for name in members}
+    moment = {name: f"{rank + 1}" for members in ranked for rank, name in enumerate(members)}
     return NamedCameras(camera, moment, IN_ORDER)
 
 

@@ -105,9 +105,9 @@ def _paired_at(reference: FloatArray, times: FloatArray) -> float | None:
         reference: sorted times of the photographs of one camera, s.
         times: sorted times of those of the other, s.
     """
-    whole = _is_whole(reference) or _is_whole(times)
+    in_seconds = _is_whole(reference) or _is_whole(times)
     # whole seconds of one moment differ by one of two neighbouring numbers
-    half, wider = (0.5, 1.0) if whole else (TRIGGER_S, 0.0)
+    half, wider = (0.5, 1.0) if in_seconds else (TRIGGER_S, 0.0)
     differences = np.sort((times[:, None] - reference).ravel())
     last = np.searchsorted(differences, differences + 2 * half + ROUNDING_S, side="right") - 1
     count = last - np.arange(len(differences))

@@ -116,7 +116,7 @@ def draft_survey(
     paths = [folder / name for name in used]
     trial = try_targets(paths, folder=folder, masks=masks, store=store, progress=progress)
     name = as_plain(folder.resolve().name) or "survey"
-    positions = sum(metadata[one].position is not None for one in used)
+    positions = sum(metadata[photograph].position is not None for photograph in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
     if trial.plate is not None:
         silent = _text(name, grouping, trial, pitch, left_out, positions, masked, unused, models=False)
@@ -258,7 +258,7 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> 
         *(["c_assumed = true  # remove this once c_mm and pixel_mm are known"] if camera.assumed else []),
         *(_model_lines(camera, free) if models else ()),
     ]
-    return lines + [f"# {as_plain(one.text)}" for one in camera.remarks]
+    return lines + [f"# {as_plain(said.text)}" for said in camera.remarks]
 
 
 def _rig_lines(rig: ProposedRig) -> list[str]:
@@ -421,7 +421,7 @@ def _findings(
     grouping: Grouping, trial: TargetTrial, positions: int, masked: str, unused: str
 ) -> tuple[tuple[str, str], ...]:
     """Return the findings for the terminal."""
-    found = [
+    findings = [
         (
             f"camera {camera.name}",
             f"{counted(len(camera.photographs), 'photograph')}, {camera.size_px[0]} x "
@@ -431,9 +431,13 @@ def _findings(
         )
         for camera in grouping.cameras
     ]
-    found += [(f"lens of {one.name}", f"fisheye, {one.fisheye}") for one in grouping.cameras if one.fisheye]
+    findings += [
+        (f"lens of {camera.name}", f"fisheye, {camera.fisheye}")
+        for camera in grouping.cameras
+        if camera.fisheye
+    ]
     if grouping.rig is not None:
-        found.append(
+        findings.append(
             (
                 "rig",
                 f"{' and '.join(grouping.rig.cameras)}, {counted(grouping.rig.moments, 'moment')} by the "
@@ -442,27 +446,27 @@ def _findings(
             )
         )
     if trial.plate is not None:
-        found.append(("targets", "; ".join(map(_described, trial.plates))))
-        found += [("left out", f"{_described(plate)} ({why})") for plate, why in trial.left_out]
+        findings.append(("targets", "; ".join(map(_described, trial.plates))))
+        findings += [("left out", f"{_described(plate)} ({why})") for plate, why in trial.left_out]
     elif trial.codes != "none":
         repeated = (
             f"{counted(len(trial.repeated), 'code')} that two of {len(trial.photographs)} photographs have"
         )
-        found.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
+        findings.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
-        found.append(("targets", "none with codes: points of natural texture"))
+        findings.append(("targets", "none with codes: points of natural texture"))
     if masked:
-        found.append(("masks", f"in {masked}; {unused or 'what is black in them is ignored'}"))
+        findings.append(("masks", f"in {masked}; {unused or 'what is black in them is ignored'}"))
     if positions:
-        found.append(
+        findings.append(
             ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")
         )
-    return tuple(found)
+    return tuple(findings)
 
 
 def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tuple[Remark, ...]:
     """Return the remarks on photographs, cameras and targets."""
-    remarks = [one for camera in grouping.cameras for one in camera.remarks]
+    remarks = [said for camera in grouping.cameras for said in camera.remarks]
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
         remarks.append(remark("camera_assumed", cameras=assumed))
@@ -474,7 +478,7 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
     if np.isfinite(trial.blur_px):
         remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
     if trial.ringed:
-        most = max(trial.ringed, key=lambda one: len(one.crops))
+        most = max(trial.ringed, key=lambda dots: len(dots.crops))
         remarks.append(
             remark("rings_not_read", photograph=most.photograph, dots=most.dots, ringed=len(most.crops))
         )

@@ -58,9 +58,9 @@ def with_lens_models(
     except (GeometryError, PhotographError):  # the survey states the reason
         return cameras
     taken = {
-        name: f"likelier: {one.number('fitting'):.0f} of {one.number('total'):.0f} image points fit it, "
-        f"{one.number('before'):.0f} a central perspective"
-        for one in of_kind(oriented.measured.remarks, "fisheye_taken")
-        for name in one.names("camera")
+        name: f"likelier: {said.number('fitting'):.0f} of {said.number('total'):.0f} image points fit it, "
+        f"{said.number('before'):.0f} a central perspective"
+        for said in of_kind(oriented.measured.remarks, "fisheye_taken")
+        for name in said.names("camera")
     }
     return tuple(replace(camera, fisheye=taken.get(camera.name, camera.fisheye)) for camera in cameras)

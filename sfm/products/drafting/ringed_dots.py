@@ -67,7 +67,9 @@ def picture_of_rings(ringed: Sequence[Ringed]) -> bytes:
     """
     if not ringed:
         return b""
-    crops = list(max(ringed, key=lambda one: len(one.crops)).crops[: SHOWN_ROWS * SHOWN_COLUMNS])
+    crops = list(
+        max(ringed, key=lambda photograph: len(photograph.crops)).crops[: SHOWN_ROWS * SHOWN_COLUMNS]
+    )
     crops += [np.full_like(crops[0], 255)] * (-len(crops) % SHOWN_COLUMNS)
     rows = [np.hstack(crops[k : k + SHOWN_COLUMNS]) for k in range(0, len(crops), SHOWN_COLUMNS)]
     return cv2.imencode(".png", np.vstack(rows))[1].tobytes()

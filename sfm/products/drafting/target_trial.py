@@ -294,7 +294,7 @@ def _side_by_side(
     A plate that does not look alike when turned comes first.
     """
     used, left_out = list[PlateFamily](), list[tuple[PlateFamily, str]]()
-    for plate in sorted(plates, key=lambda one: one.is_ambiguous):
+    for plate in sorted(plates, key=lambda plate: plate.is_ambiguous):
         try:
             group_plates([*used, plate] if used else [])
         except GeometryError as error:
@@ -357,7 +357,9 @@ def _repeated_rings(readers: Sequence[RingReader], families: Mapping[str, int]) 
 
 def _largest_lattice(photographs: Sequence[Targets]) -> tuple[int, int] | None:
     """Return the rows and columns of the largest lattice of circles; None without one of a plate's size."""
-    sizes = [size for one in photographs if (size := lattice_size(one.xy[one.is_circle])) is not None]
+    sizes = [
+        size for targets in photographs if (size := lattice_size(targets.xy[targets.is_circle])) is not None
+    ]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
@@ -383,7 +385,7 @@ def _tags_and_boards(
     family, largest = _shared_family(read)
     if not family:
         return "", boards
-    seen = [one.get(largest, NO_TAGS) for one in read]
+    seen = [tags.get(largest, NO_TAGS) for tags in read]
     charuco = search_charuco([*tried, *others], family, seen)
     return family, boards if charuco is None else (charuco,)
 
@@ -394,7 +396,7 @@ def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:
     Where two dictionaries read as many tags, the smaller one is right: chance reads fewer of its tags.
     """
     repeated = {
-        family: _shared_numbers([one.get(family, NO_TAGS)[0] for one in read])
+        family: _shared_numbers([tags.get(family, NO_TAGS)[0] for tags in read])
         for family in LARGEST_DICTIONARIES
     }
     largest = max(repeated, key=lambda name: (len(repeated[name]), -tag_family(name).count))
@@ -405,7 +407,9 @@ def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:
 
 def _shared_numbers(photographs: Sequence[IntArray]) -> IntArray:
     """Return the numbers that at least two photographs have."""
-    number, times = np.unique(np.concatenate([np.unique(one) for one in photographs]), return_counts=True)
+    number, times = np.unique(
+        np.concatenate([np.unique(numbers) for numbers in photographs]), return_counts=True
+    )
     return np.asarray(number[times > 1])
 
 
@@ -416,7 +420,7 @@ def _dot_plate(plain: Sequence[Targets], others: Sequence[Path], files: _Files) 
         circle = targets.is_circle
         return targets.xy[circle], np.sqrt(targets.semi_axes[circle].prod(axis=1)), targets.polarity[circle]
 
-    seen = [circles(one) for one in plain]
+    seen = [circles(targets) for targets in plain]
     if any(shows_a_lattice(xy) for xy, _, _ in seen):
         seen += [circles(files.measure(path, "none")) for path in others]
     return search_dots(seen)
@@ -451,13 +455,13 @@ def _look(grey: AnyArray) -> _Look:
     """
     height, width = grey.shape
     top, left = max(height - LOOK_PX, 0) // 2, max(width - LOOK_PX, 0) // 2
-    whole, middle = reduce_photograph(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
+    small, middle = reduce_photograph(grey, LOOK_PX)[0], grey[top : top + LOOK_PX, left : left + LOOK_PX]
     reduced, middle = reduce_photograph(grey, FEW_PX)[0], np.ascontiguousarray(middle)
-    many = [find_targets(picture, min_diameter_px=MANY_DIAMETER_PX) for picture in (whole, middle)]
+    many = [find_targets(picture, min_diameter_px=MANY_DIAMETER_PX) for picture in (small, middle)]
     circles = max(map(len, many))
-    if any(map(_shows_rings, (whole, middle), many)):  # read faster than tags of a whole photograph
+    if any(map(_shows_rings, (small, middle), many)):  # read faster than tags of a whole photograph
         return _Look(True, circles)
-    for picture in (whole, grey):
+    for picture in (small, grey):
         tags = read_dictionaries(picture)
         if any(len(number) >= MIN_CODES for number, _ in tags.values()):
             return _Look(True, 0, tags)
@@ -468,7 +472,7 @@ def _look(grey: AnyArray) -> _Look:
     if (
         shows_a_lattice(few.xy)
         or _shows_rings(reduced, few)
-        or any(map(_shows_concentric_tags, (whole, middle, reduced)))
+        or any(map(_shows_concentric_tags, (small, middle, reduced)))
     ):
         return _Look(True, circles, tags)
     part = part_of_checkerboard(grey)
@@ -524,8 +528,8 @@ def _repeated_codes(photographs: Sequence[IntArray]) -> tuple[int, ...]:
 
 def _polarity(photographs: Sequence[Targets]) -> str:
     """Return the polarity of the coded targets, "auto" if there are both."""
-    found = {int(p) for targets in photographs for p in targets.polarity[targets.code >= 0]}
-    return {-1: "dark", 1: "bright"}[found.pop()] if len(found) == 1 else "auto"
+    polarities = {int(p) for targets in photographs for p in targets.polarity[targets.code >= 0]}
+    return {-1: "dark", 1: "bright"}[polarities.pop()] if len(polarities) == 1 else "auto"
 
 
 def _blur(photographs: Sequence[Targets]) -> float:

@@ -142,26 +142,28 @@ def lay_out_sheet(
                 "needed more than 1 and the second larger"
             )
         codes = replace(codes, inner=ring_radii[0], outer=ring_radii[1])
-    whole = {TagFamily: "square", ConcentricFamily: "outer edge"}.get(type(codes), "")
+    word = {TagFamily: "square", ConcentricFamily: "outer edge"}.get(type(codes), "")
     ring = codes.outer * diameter_mm if isinstance(codes, CodeFamily) else diameter_mm
     across, down = CLEAR * ring, CLEAR * ring + LABEL_MM
     columns = int((width - 2 * MARGIN_MM) // across)
     rows = int((height - 2 * MARGIN_MM - FOOT_MM) // down)
     if columns < 1 or rows < 1:
         raise SurveyFileError(
-            f"targets: a {'tag' if whole else 'ring'} of {ring:.1f} mm with its surroundings does not fit "
+            f"targets: a {'tag' if word else 'ring'} of {ring:.1f} mm with its surroundings does not fit "
             f"on {page} ({width:g} x {height:g} mm)"
         )
     pages = []
     for first in range(0, len(numbers), columns * rows):
-        some = np.asarray(numbers[first : first + columns * rows], dtype=np.int64)
-        k = np.arange(len(some))
+        page_numbers = np.asarray(numbers[first : first + columns * rows], dtype=np.int64)
+        k = np.arange(len(page_numbers))
         left = (width - columns * across) / 2 + across / 2
         top = height - MARGIN_MM - across / 2
         centre = np.column_stack([left + across * (k % columns), top - down * (k // columns)])
-        marks = [_target(at, diameter_mm / 2, int(n), codes) for at, n in zip(centre, some, strict=True)]
-        pages.append(Page(some, centre, join_marks(marks)))
-    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark, whole)
+        marks = [
+            _target(at, diameter_mm / 2, int(n), codes) for at, n in zip(centre, page_numbers, strict=True)
+        ]
+        pages.append(Page(page_numbers, centre, join_marks(marks)))
+    return Sheet(codes.name, diameter_mm, ring, (width, height), tuple(pages), dark, word)
 
 
 def _target(at: FloatArray, half: float, number: int, codes: Family) -> Marks:

@@ -111,10 +111,10 @@ def orient(
     accepted[accepted] = fits
     solved = merge_estimate(adjusted.estimate, images, points)
     of_model = points[: len(network.points)]
-    whole, _ = whole_model(
+    model, _ = whole_model(
         network, came, adjusted.estimate, windows, images, of_model, TOLERANCE_FACTOR * spread
     )
-    return OrientedKeyPoints(windows, window_px, anew, rows, rays, solved, whole, accepted, spread, lost)
+    return OrientedKeyPoints(windows, window_px, anew, rows, rays, solved, model, accepted, spread, lost)
 
 
 def refuse_undetermined(part: Network, adjusted: Adjustment, lost: list[tuple[str, int]]) -> None:
@@ -151,7 +151,7 @@ def reasons_of(windows: Windows, rows: IntArray, *, few: int, masked: int) -> li
 
 def by_count(reasons: list[tuple[str, int]]) -> tuple[tuple[str, int], ...]:
     """Return the reasons with a number above 0, the most frequent first."""
-    return tuple((why, count) for why, count in sorted(reasons, key=lambda one: -one[1]) if count)
+    return tuple((why, count) for why, count in sorted(reasons, key=lambda reason: -reason[1]) if count)
 
 
 def describe_reasons(reasons: tuple[tuple[str, int], ...]) -> str:
@@ -198,9 +198,11 @@ def whole_model(
     enough = met.rays >= MIN_RAYS
     xyz[enough] = met.points[enough]
     original = seen.select(other & ~enough[seen.point])
-    found = intersect_image_points(original, network.camera, oriented, n_points=n, tolerance_px=np.inf).points
-    again = np.isfinite(found).all(axis=1)
-    xyz[again] = found[again]
+    intersected = intersect_image_points(
+        original, network.camera, oriented, n_points=n, tolerance_px=np.inf
+    ).points
+    again = np.isfinite(intersected).all(axis=1)
+    xyz[again] = intersected[again]
     return replace(oriented, points=xyz), rows[met.used & enough[anew.point]]
 
 
@@ -276,19 +278,19 @@ def measure_model_targets(
     oriented = np.flatnonzero(estimate.oriented)
     paths = photograph_paths(network, estimate, images_dir)
     names = tuple(network.images[i] for i in oriented)
-    found = []
+    in_photographs = []
     progress.stage("targets", len(oriented))
     for i, name in zip(oriented.tolist(), names, strict=True):
         size = estimate.cameras[network.camera[i]].size_px
         photograph = read_of_size(paths[i], name, size, channel=survey.targets.channel)
-        found.append(targets_in(photograph, survey.targets, family))
+        in_photographs.append(targets_in(photograph, survey.targets, family))
         progress.advance(name)
     photographs = MeasuredPhotographs(
         names,
         tuple(paths[i] for i in oriented),
         network.camera[oriented],
         estimate.cameras,
-        tuple(found),
+        tuple(in_photographs),
         (),
     )
     naming = name_coded(photographs)
@@ -342,11 +344,11 @@ def _intersect_targets(
 ) -> tuple[Network, FloatArray, int]:
     """Return the network without contradicting image points, all targets, and the number of these points."""
     seen = network.image_points
-    found = intersect_image_points(
+    intersected = intersect_image_points(
         seen, network.camera, estimate, n_points=len(network.points), tolerance_px=tolerance_px
     )
-    lost = ~found.used & np.isfinite(found.points[seen.point]).all(axis=1)
-    return replace(network, image_points=seen.select(found.used)), found.points, int(lost.sum())
+    lost = ~intersected.used & np.isfinite(intersected.points[seen.point]).all(axis=1)
+    return replace(network, image_points=seen.select(intersected.used)), intersected.points, int(lost.sum())
 
 
 def _object_frame(
@@ -381,7 +383,7 @@ def _object_frame(
     scale = object_scale(targets, Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), points))
     if not scale > 0:
         if given or survey.scale_bars:
-            missing = "; ".join(one.text.rstrip(".") for one in remarks)
+            missing = "; ".join(lost_names.text.rstrip(".") for lost_names in remarks)
             raise GeometryError(f"nothing gives the model its scale; {missing}")
         return Similarity(1.0, np.eye(3), np.zeros(3)), (remark("scale_undefined", unit=survey.unit),)
     return Similarity(scale, np.eye(3), np.zeros(3)), tuple(remarks)

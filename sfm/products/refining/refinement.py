@@ -306,10 +306,10 @@ def refine_model(
         (oriented.accepted & images[anew.image_points.image] & points[anew.image_points.point])[:k]
     ]
     points = points[: len(network.points)]
-    whole, further = whole_model(network, estimate, final.estimate, windows, images, points, tolerance_px)
+    model, further = whole_model(network, estimate, final.estimate, windows, images, points, tolerance_px)
     taken = np.zeros(len(seen), dtype=bool)
     taken[adjusted], taken[further] = ~final.rejected[: len(adjusted)], True
-    rejected = ~taken & (_residual_px(network, whole, windows) > tolerance_px)
+    rejected = ~taken & (_residual_px(network, model, windows) > tolerance_px)
     rejected[adjusted] = final.rejected[: len(adjusted)]
     left = int((np.isfinite(windows.xy).all(axis=1) & ~taken & ~rejected).sum())
     return Refinement(
@@ -318,7 +318,7 @@ def refine_model(
         before,
         readjusted,
         final,
-        whole,
+        model,
         adjusted,
         further,
         windows.xy,
@@ -332,12 +332,12 @@ def refine_model(
     )
 
 
-def _residual_px(network: Network, whole: Estimate, windows: Windows) -> FloatArray:
+def _residual_px(network: Network, model: Estimate, windows: Windows) -> FloatArray:
     """Return the larger residual of each new image point, px, NaN if its point has few rays, (k,)."""
     seen = network.image_points
     measured = np.isfinite(windows.xy).all(axis=1)
     rays = np.bincount(seen.point[measured], minlength=len(network.points))
-    v = project_points(whole, network.camera, seen.image, whole.points[seen.point]) - windows.xy
+    v = project_points(model, network.camera, seen.image, model.points[seen.point]) - windows.xy
     return np.where(rays[seen.point] >= MIN_RAYS, np.abs(v).max(axis=1), np.nan)
 
 
@@ -354,7 +354,7 @@ def refinement_text(result: Refinement) -> str:
         f"RMS after     {result.after_px:.4f} px\n"
         f"sigma0        {result.adjustment.sigma0_px:.4f} px (redundancy {result.adjustment.redundancy})\n"
         + _describe_targets(result)
-        + "".join(f"{one.severity}: {one.text}\n" for one in result.remarks)
+        + "".join(f"{said.severity}: {said.text}\n" for said in result.remarks)
     )
 
 
@@ -387,8 +387,8 @@ def _references(network: Network, estimate: Estimate, usable: BoolArray) -> IntA
     count = np.bincount(seen.point[np.isfinite(scale)], minlength=len(reference))
     order = np.lexsort([scale, seen.point])
     first = np.searchsorted(seen.point[order], np.arange(len(reference)))
-    some = (count >= MIN_RAYS) & estimate.determined
-    reference[some] = order[first[some] + count[some] // 2]
+    usable_points = (count >= MIN_RAYS) & estimate.determined
+    reference[usable_points] = order[first[usable_points] + count[usable_points] // 2]
     return reference
 
 

@@ -127,14 +127,14 @@ def match_windows(
         warp = plane_warps(estimate, camera, i, image, at, points, normal, window_px / 2)
         moved = np.einsum("kij,kj->ki", linear_part(warp), at - seen.xy[template_of[matched]])
         others, number_of = np.unique(image, return_inverse=True)
-        for j, some in zip(others.tolist(), rows_of(number_of, len(others)), strict=True):
-            to = matched[some]
+        for j, in_photograph in zip(others.tolist(), rows_of(number_of, len(others)), strict=True):
+            to = matched[in_photograph]
             match = match_lsm(
                 photographs.grey(i),
                 photographs.grey(j),
                 place[to],
-                seen.xy[to] + moved[some],
-                start=warp[some],
+                seen.xy[to] + moved[in_photograph],
+                start=warp[in_photograph],
                 settings=LsmSettings(
                     window_px=window_px, max_shift_px=limits.shift_px, min_correlation=limits.correlation
                 ),
@@ -146,9 +146,9 @@ def match_windows(
             at_template[seen.point[to[good]]] += back @ half @ back.transpose(0, 2, 1)
             number[seen.point[to[good]]] += 1
         progress.advance(network.images[i])
-    some = np.flatnonzero(number)
-    xy[reference[some]] = place[reference[some]]
-    covariance[reference[some]] = at_template[some] / number[some, None, None]
+    measured = np.flatnonzero(number)
+    xy[reference[measured]] = place[reference[measured]]
+    covariance[reference[measured]] = at_template[measured] / number[measured, None, None]
     return Windows(shrink * (xy + 0.5) - 0.5, shrink**2 * covariance, flag)
 
 
@@ -185,12 +185,12 @@ def best_size(
     seen = network.image_points
     template = seen.image[keys.reference[seen.point[rows]]]
     most = np.argsort(-np.bincount(template, minlength=len(network.images)), kind="stable")
-    some = rows[np.isin(template, most[:TRIAL_PHOTOGRAPHS])]
+    trial_rows = rows[np.isin(template, most[:TRIAL_PHOTOGRAPHS])]
     costs = []
     for size in sizes:
-        found = match_windows(keys, estimate, size, rows=some)
-        used, v = _rays_that_meet(network, estimate, found, tolerance_px)
-        apart = points_apart(replace(seen, xy=found.xy), used, size.side_px, n_points=len(network.points))
+        windows = match_windows(keys, estimate, size, rows=trial_rows)
+        used, v = _rays_that_meet(network, estimate, windows, tolerance_px)
+        apart = points_apart(replace(seen, xy=windows.xy), used, size.side_px, n_points=len(network.points))
         number = int((used & apart[seen.point]).sum())
         enough = len(v) >= TRIAL_RAYS
         costs.append(MAD_TO_SIGMA * float(np.median(np.abs(v))) / np.sqrt(number) if enough else np.inf)
@@ -225,17 +225,17 @@ def match_reduced(
     asked = np.bincount(seen.point[rows], minlength=n)
     rays = np.bincount(seen.point[_rays_that_meet(network, estimate, windows, tolerance_px)[0]], minlength=n)
     for shrink in [coarser for coarser in SHRINKS if coarser > size.shrink]:
-        some = rows[(rays < asked)[seen.point[rows]]]
-        if not len(some):
+        again = rows[(rays < asked)[seen.point[rows]]]
+        if not len(again):
             break
-        found = match_windows(keys, estimate, size._replace(shrink=shrink), rows=some)
-        used, _ = _rays_that_meet(network, estimate, found, tolerance_px)
+        reduced = match_windows(keys, estimate, size._replace(shrink=shrink), rows=again)
+        used, _ = _rays_that_meet(network, estimate, reduced, tolerance_px)
         now = np.bincount(seen.point[used], minlength=n)
         taken = np.flatnonzero((now > rays)[seen.point])
         xy[taken], covariance[taken], flag[taken] = (
-            found.xy[taken],
-            found.covariance[taken],
-            found.flag[taken],
+            reduced.xy[taken],
+            reduced.covariance[taken],
+            reduced.flag[taken],
         )
         rays = np.maximum(rays, now)
     return Windows(xy, covariance, flag)

@@ -82,9 +82,9 @@ def fill_face(
         for x in range(box[2] // n, box[3] // n):
             i, j = y * n - box[0], x * n - box[2]
             ahead, cell = on_plane(rays, H, y, x, 0.5, 0.5, 1.0)
-            whole = area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
+            inside = area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0
             shade = 0.0
-            if whole > 0:
+            if inside > 0:
                 texture = 0.0
                 if amplitude > 0:
                     texture = amplitude * smooth_noise(cell.a / grain, cell.b / grain, seed)
@@ -92,8 +92,8 @@ def fill_face(
             for r in range(n):
                 for c in range(n):
                     value[i + r, j + c] = shade
-                    cover[i + r, j + c] = whole
-                    if 0 < whole < 1:
+                    cover[i + r, j + c] = inside
+                    if 0 < inside < 1:
                         ahead, cell = on_plane(rays, H, y, x, (c + 0.5) / n, (r + 0.5) / n, 1.0 / n)
                         cover[i + r, j + c] = (
                             area_inside(RECTANGLE, cell, 0.0, 0.0, rectangle) if ahead else 0.0

@@ -118,13 +118,13 @@ def render_photographs(
     rays = corner_rays(camera)
     sources = np.random.default_rng(seed).spawn(len(positions))
 
-    def one(i: int) -> tuple[AnyArray, ProjectedTargets]:
+    def render_station(i: int) -> tuple[AnyArray, ProjectedTargets]:
         return render_photograph(
             scene, camera, positions[i], rotations[i], optics=optics, rng=sources[i], rays=rays
         )
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        rendered = list(pool.map(one, range(len(positions))))
+        rendered = list(pool.map(render_station, range(len(positions))))
     return [photograph for photograph, _ in rendered], [truth for _, truth in rendered]
 
 
@@ -216,13 +216,13 @@ SQUARE = np.concatenate(
 
 def _windows(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
     """Return first and last row and column of the cells around points (k, p, 2), (k, 4); in whole pixels."""
-    whole = (0, shape[0], 0, shape[1])
+    everywhere = (0, shape[0], 0, shape[1])
     in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
     seen = np.where(in_front[:, None, None], xy, 0.0)
     low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, shape[::-1])
     high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, shape[::-1])
-    found = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
-    return np.where(in_front[:, None], found, whole)  # partly behind the camera: can be anywhere
+    around = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
+    return np.where(in_front[:, None], around, everywhere)  # partly behind the camera: can be anywhere
 
 
 def _lamp(scene: Scene, face: int) -> Lamp:

@@ -187,8 +187,8 @@ def read_scene(path: Path) -> Staging:
     marks: list[Marks] = []
     targets: list[tuple[int, float, float, float, int]] = []
     for k, face in enumerate(file.face):
-        marks += [_rectangle(k, one) for one in face.rectangle]
-        marks += [_printed_lines(k, one, rng) for one in face.print]
+        marks += [_rectangle(k, rectangle) for rectangle in face.rectangle]
+        marks += [_printed_lines(k, printed, rng) for printed in face.print]
         for grid in face.grid:
             _place_grid(path, k, face.name, grid, family, marks, targets)
     row = np.array(targets, dtype=float).reshape(-1, 5)
@@ -239,30 +239,30 @@ def _faces(given: list[_Face]) -> Faces:
     )
 
 
-def _rectangle(face: int, one: _Rectangle) -> Marks:
-    half = np.array([one.size]) / 2
-    turn, value = np.array([np.radians(one.turn_deg)]), np.array([one.reflectance])
-    return rectangles(face, np.array([one.centre]), half, turn, value)
+def _rectangle(face: int, rectangle: _Rectangle) -> Marks:
+    half = np.array([rectangle.size]) / 2
+    turn, value = np.array([np.radians(rectangle.turn_deg)]), np.array([rectangle.reflectance])
+    return rectangles(face, np.array([rectangle.centre]), half, turn, value)
 
 
-def _printed_lines(face: int, one: _Print, rng: np.random.Generator) -> Marks:
+def _printed_lines(face: int, printed: _Print, rng: np.random.Generator) -> Marks:
     """Return lines of words that look like print from a distance."""
     centre, half = [], []
-    for line in range(one.lines):
-        x, y = 0.0, -1.8 * one.height * line
-        while x < one.length:
+    for line in range(printed.lines):
+        x, y = 0.0, -1.8 * printed.height * line
+        while x < printed.length:
             for _ in range(int(rng.integers(*WORD_LETTERS))):
                 upright = rng.random() < 0.7
                 size = (0.12, 0.5) if upright else (0.3, 0.1)
-                centre.append((x, y + (0.0 if upright else rng.choice([-0.35, 0.0, 0.35]) * one.height)))
-                half.append((size[0] * one.height, size[1] * one.height))
-                x += (0.45 if upright else 0.75) * one.height
-            x += 0.6 * one.height
-    turn = np.radians(one.turn_deg)
+                centre.append((x, y + (0.0 if upright else rng.choice([-0.35, 0.0, 0.35]) * printed.height)))
+                half.append((size[0] * printed.height, size[1] * printed.height))
+                x += (0.45 if upright else 0.75) * printed.height
+            x += 0.6 * printed.height
+    turn = np.radians(printed.turn_deg)
     cos, sin = np.cos(turn), np.sin(turn)
-    at = np.array(centre) @ np.array([[cos, sin], [-sin, cos]]) + one.at
+    at = np.array(centre) @ np.array([[cos, sin], [-sin, cos]]) + printed.at
     count = len(at)
-    return rectangles(face, at, np.array(half), np.full(count, turn), np.full(count, one.reflectance))
+    return rectangles(face, at, np.array(half), np.full(count, turn), np.full(count, printed.reflectance))
 
 
 def _place_grid(

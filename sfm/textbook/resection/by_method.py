@@ -83,15 +83,17 @@ def resect(task: Task, method: str) -> ResectionResult:
     """
     if method not in _FUNCTIONS:
         raise GeometryError(f"resect: method '{method}', expected one of {', '.join(_FUNCTIONS)}, all")
-    found = _FUNCTIONS[method](task)
-    solutions = tuple(one for one in found.solutions if np.isfinite(one.rms) or method == "robust")
+    result = _FUNCTIONS[method](task)
+    solutions = tuple(
+        solution for solution in result.solutions if np.isfinite(solution.rms) or method == "robust"
+    )
     if not solutions:
         raise GeometryError(f"{method}: points lie behind the camera in every solution")
     lines: tuple[LineFit, ...] = ()
     if len(task.points) >= 4 and method in ON_A_LINE:
         lines = choose_by_line(solutions, task.tangents)[1]
     warning = cylinder_warning(solutions[0].position, task.points[:3]) if method in ON_A_CYLINDER else ""
-    return replace(found, solutions=solutions, line_fit=lines, warning=warning)
+    return replace(result, solutions=solutions, line_fit=lines, warning=warning)
 
 
 @checked_arguments()
@@ -105,18 +107,18 @@ def resect_by_all(task: Task) -> dict[str, ResectionResult | GeometryError]:
 
     Source: document 001, sec. 4.1 (comparison of the methods).
     """
-    found: dict[str, ResectionResult | GeometryError] = {}
+    results: dict[str, ResectionResult | GeometryError] = {}
     for method in _FUNCTIONS:
-        first = found.get("fischler-bolles")
+        first = results.get("fischler-bolles")
         if task.start is None and method == "church" and isinstance(first, ResectionResult):
             started = replace(task, start=first.solutions[0].position)
         else:
             started = task
         try:
-            found[method] = resect(started, method)
+            results[method] = resect(started, method)
         except GeometryError as error:
-            found[method] = error
-    return found
+            results[method] = error
+    return results
 
 
 def _closed_form(
@@ -255,7 +257,7 @@ def signs_warning(task: Task, opposite: Task) -> str:
     if np.array_equal(task.tangents, opposite.tangents):
         return ""
     try:
-        rms, other = (_robust(one).solutions[0].rms for one in (task, opposite))
+        rms, other = (_robust(signed).solutions[0].rms for signed in (task, opposite))
     except GeometryError:
         return ""
     lead = 2 * task.tangents.size * float(np.log(rms / max(other, np.finfo(float).tiny)))

@@ -81,8 +81,8 @@ def resect_church(tangents: FloatArray, points: FloatArray, position: FloatArray
         raise GeometryError(
             "church: the iteration ended on the mirror side of the points, start on the other side"
         )
-    found = solution_of(position, U @ Vt, uv, xyz)
-    return ChurchResection(found.position, found.rotation, found.residuals, np.array(history))
+    solution = solution_of(position, U @ Vt, uv, xyz)
+    return ChurchResection(solution.position, solution.rotation, solution.residuals, np.array(history))
 
 
 def _directions(X: FloatArray, position: FloatArray) -> FloatArray:

@@ -67,7 +67,7 @@ def _refine(
     """Return the orientation by least squares over the correct points, and ln of its likelihood."""
     residuals = start.residuals
     used, likelihood = _select_points(residuals, field)
-    X0, R, found = start.position, start.rotation, None
+    X0, R, fitted = start.position, start.rotation, None
     for _ in range(ROUNDS):
         try:
             trial = resect_least_squares(uv[used], xyz[used], X0, R)
@@ -75,25 +75,25 @@ def _refine(
             break
         trial_residuals, trial_N = _residuals_and_normals(uv, xyz, used, trial)
         selected, trial_likelihood = _select_points(trial_residuals, field)
-        if found is not None and trial_likelihood <= likelihood:
+        if fitted is not None and trial_likelihood <= likelihood:
             break
-        found, residuals, likelihood, N = trial, trial_residuals, trial_likelihood, trial_N
+        fitted, residuals, likelihood, N = trial, trial_residuals, trial_likelihood, trial_N
         X0, R = trial.position, trial.rotation
         inliers, used = used, selected
         if (inliers == selected).all():
             break
-    if found is None:
+    if fitted is None:
         return start, -np.inf
     return (
         replace(
             start,
-            position=found.position,
-            rotation=found.rotation,
+            position=fitted.position,
+            rotation=fitted.rotation,
             inliers=inliers,
             residuals=residuals,
-            rms=found.rms,
-            sigma0=found.sigma0,
-            sigma=found.sigma0,
+            rms=fitted.rms,
+            sigma0=fitted.sigma0,
+            sigma=fitted.sigma0,
             normal_matrix=N,
         ),
         likelihood,
@@ -123,11 +123,13 @@ def _select_points(residuals: FloatArray, field: float) -> tuple[BoolArray, floa
 
 
 def _residuals_and_normals(
-    uv: FloatArray, xyz: FloatArray, used: BoolArray, found: Resection
+    uv: FloatArray, xyz: FloatArray, used: BoolArray, resection: Resection
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals of all points, tangents, NaN behind the camera, (n, 2), and N of the used points."""
     n = len(uv)
     N, residuals = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((n, 2))
     weights = np.ascontiguousarray(np.broadcast_to(np.eye(2), (n, 2, 2)))
-    pose_normals(uv, xyz, weights, used, found.position, found.rotation, N, np.empty(UNKNOWNS), residuals)
+    pose_normals(
+        uv, xyz, weights, used, resection.position, resection.rotation, N, np.empty(UNKNOWNS), residuals
+    )
     return residuals, N

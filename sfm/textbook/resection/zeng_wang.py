@@ -60,10 +60,12 @@ def resect_zeng_wang(tangents: FloatArray, points: FloatArray) -> tuple[Resectio
     """
     uv, xyz = checked_points("zeng-wang", tangents, points, needed=MIN_POINTS)
     poses = resect_triples_zeng_wang(rays_from_tangents(uv[:MIN_POINTS])[None], xyz[None, :MIN_POINTS])
-    found = [solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])]
-    if not found:
+    solutions = [
+        solution_of(poses.position[0, s], poses.rotation[0, s], uv, xyz) for s in range(poses.count[0])
+    ]
+    if not solutions:
         raise GeometryError("zeng-wang: no camera sees the first three points at these angles")
-    return sort_solutions(found)
+    return sort_solutions(solutions)
 
 
 def resect_triples_zeng_wang(rays: FloatArray, points: FloatArray) -> Poses:
@@ -354,7 +356,7 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
     equations. They are linearised and iterated.
     """
     uv, xyz = checked_points("rampal", tangents, points, needed=MIN_POINTS)
-    found: list[ResectionSolution] = []
+    solutions: list[ResectionSolution] = []
     failure = GeometryError("rampal: no solution")
     for triple in islice(combinations(range(len(xyz)), 3), MAX_TRIPLES):
         order = [*triple, *(i for i in range(len(xyz)) if i not in triple)]
@@ -365,11 +367,14 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
             continue
         solution = solution_of(position, rotation_from_position(uv, xyz, position), uv, xyz)
         size = np.linalg.norm(xyz - xyz.mean(axis=0), axis=1).max()
-        if all(np.linalg.norm(solution.position - one.position) > MAX_SAME_DISTANCE * size for one in found):
-            found.append(solution)
-    if not found:
+        if all(
+            np.linalg.norm(solution.position - other.position) > MAX_SAME_DISTANCE * size
+            for other in solutions
+        ):
+            solutions.append(solution)
+    if not solutions:
         raise failure
-    return sort_solutions(found)
+    return sort_solutions(solutions)
 
 
 def _rampal_position(uv: FloatArray, xyz: FloatArray) -> FloatArray:
