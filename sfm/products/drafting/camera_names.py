@@ -148,17 +148,15 @@ def _strength(rows: Sequence[tuple[Part, ...]], k: int) -> int:
 
 def _proposal(names: Sequence[str], parts: Mapping[str, tuple[Part, ...]], k: int) -> NamedCameras | None:
     """Return the cameras if part k of the names stands for them; None if the names do not pair up."""
-    times = Counter(parts[name][k].text for name in names)
-    of: dict[str, list[str]] = defaultdict(list)
+    with_text: dict[str, list[str]] = defaultdict(list)
     for name in names:
-        if times[parts[name][k].text] >= MIN_OF_CAMERA:
-            of[parts[name][k].text].append(name)
-    camera = {name: value for value, members in of.items() for name in members}
-    if len(of) < 2 or 2 * len(camera) <= len(names):
+        with_text[parts[name][k].text].append(name)
+    of = {text: members for text, members in with_text.items() if len(members) >= MIN_OF_CAMERA}
+    if len(of) < 2 or 2 * sum(map(len, of.values())) <= len(names):
         return None
-    if _strength([parts[name] for name in names], k) == 0:
+    if len(of) > 2 and _strength([parts[name] for name in names], k) == 0:
         serial = min(map(len, of)) >= MIN_SERIAL_DIGITS and len(of) ** 2 < len(names)
-        if len(of) > 2 and not serial:
+        if not serial:
             return None
     shape = [part.kind for part in parts[names[0]]]
     varying = [
@@ -167,34 +165,50 @@ def _proposal(names: Sequence[str], parts: Mapping[str, tuple[Part, ...]], k: in
         if kind in (FOLDER, LETTERS, DIGITS)
         and any(len({parts[name][j].text for name in members}) > 1 for members in of.values())
     ]
-    for chosen in _runs(varying, k):
-        moment = {name: tuple(parts[name][j].text for j in chosen) for name in camera}
-        if len({(camera[name], moment[name]) for name in camera}) < len(camera):
-            continue  # it does not tell the photographs of a camera apart
-        cameras_of = Counter(moment.values())
-        if 2 * sum(cameras_of[moment[name]] > len(of) / 2 for name in camera) >= len(names):
-            pattern = _pattern([parts[name] for name in camera], chosen, k)
-            if not pattern and _is_in_order(of, moment):
-                pattern = IN_ORDER
-            return NamedCameras(camera, {name: "-".join(texts) for name, texts in moment.items()}, pattern)
-    if shape[k] == FOLDER and len(varying) == 1 and shape[varying[0]] == DIGITS:
-        return _by_clock(of, {name: int(parts[name][varying[0]].text) for name in camera})
-    return None
+    named = _by_shared_parts(of, parts, varying, k, len(names) / 2)
+    if named is None and shape[k] == FOLDER and [shape[j] for j in varying] == [DIGITS]:
+        clock = {name: int(parts[name][varying[0]].text) for members in of.values() for name in members}
+        return _by_clock(of, clock)
+    return named
 
 
-def _runs(varying: Sequence[int], k: int) -> list[tuple[int, ...]]:
-    """Return the parts that may be the moment: runs on one side of the camera, short ones first, then all."""
+def _by_shared_parts(
+    of: Mapping[str, Sequence[str]],
+    parts: Mapping[str, tuple[Part, ...]],
+    varying: Sequence[int],
+    k: int,
+    fewest: float,
+) -> NamedCameras | None:
+    """Return cameras whose photographs of a moment share parts of their names; None if fewer do.
+
+    The parts that may be the moment are runs on one side of the camera, short ones first, then all.
+
+    Args:
+        of: photographs of each camera.
+        parts: parts of the name of each photograph.
+        varying: parts that the photographs of a camera do not have in common.
+        k: part that stands for the camera.
+        fewest: photographs that must share their moment with those of most cameras.
+    """
+    camera = {name: text for text, members in of.items() for name in members}
     runs = [
         varying[first : first + length]
         for length in range(1, len(varying) + 1)
         for first in range(len(varying) - length + 1)
     ]
-    return [tuple(run) for run in runs if not run[0] < k < run[-1]] + [tuple(varying)]
-
-
-def _is_in_order(of: Mapping[str, Sequence[str]], moment: Mapping[str, tuple[str, ...]]) -> bool:
-    """Return whether the names of each camera, in their order, are of the same moments."""
-    return len({tuple(moment[name] for name in sorted(members)) for members in of.values()}) == 1
+    for chosen in [run for run in runs if not run[0] < k < run[-1]] + [varying]:
+        moment = {name: tuple(parts[name][j].text for j in chosen) for name in camera}
+        if len({(camera[name], moment[name]) for name in camera}) < len(camera):
+            continue  # it does not tell the photographs of a camera apart
+        cameras_of = Counter(moment.values())
+        if sum(cameras_of[moment[name]] > len(of) / 2 for name in camera) < fewest:
+            continue
+        pattern = _pattern([parts[name] for name in camera], chosen, k)
+        orders = {tuple(moment[name] for name in sorted(members)) for members in of.values()}
+        if not pattern and len(orders) == 1:  # of each camera, the names are of the same moments
+            pattern = IN_ORDER
+        return NamedCameras(camera, {name: "-".join(texts) for name, texts in moment.items()}, pattern)
+    return None
 
 
 def _by_clock(of: Mapping[str, Sequence[str]], clock: Mapping[str, int]) -> NamedCameras | None:
@@ -212,7 +226,7 @@ def _by_clock(of: Mapping[str, Sequence[str]], clock: Mapping[str, int]) -> Name
     return NamedCameras(camera, moment, IN_ORDER)
 
 
-def _pattern(rows: Sequence[tuple[Part, ...]], chosen: tuple[int, ...], k: int) -> str:
+def _pattern(rows: Sequence[tuple[Part, ...]], chosen: Sequence[int], k: int) -> str:
     """Return the expression that finds some parts in the names; empty if the camera is between them."""
     first, last = chosen[0], chosen[-1]
     if first < k < last:

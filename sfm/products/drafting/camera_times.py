@@ -57,13 +57,13 @@ def rig_of_times(cameras: Mapping[str, Sequence[str]], metadata: Mapping[str, Me
         times = {name: time for name in names if (time := metadata[name].taken) is not None}
         if len(times) == len(names) > 1:
             taken[camera] = times
-    one_of = {camera: metadata[cameras[camera][0]] for camera in taken}
-    rigs = [_rig(reference, taken, one_of) for reference in sorted(taken)]
+    exif_of = {camera: metadata[cameras[camera][0]] for camera in taken}
+    rigs = [_rig(reference, taken, exif_of) for reference in sorted(taken)]
     return max((rig for rig in rigs if rig is not None), key=lambda rig: len(rig.moment), default=None)
 
 
 def _rig(
-    reference: str, taken: Mapping[str, Mapping[str, datetime]], one_of: Mapping[str, Metadata]
+    reference: str, taken: Mapping[str, Mapping[str, datetime]], exif_of: Mapping[str, Metadata]
 ) -> TimedRig | None:
     """Return the rig of a reference camera and all cameras whose photographs pair up with its own."""
     first = min(taken[reference].values())
@@ -71,31 +71,37 @@ def _rig(
         camera: np.sort([(time - first).total_seconds() for time in times.values()])
         for camera, times in taken.items()
     }
-    mounted = []
-    for camera in sorted(set(taken) - {reference}):
-        ahead = _paired_at(seconds[reference], seconds[camera])
-        # Copies, and photographs of one release of one body, are of one time too.
-        near = ahead is not None and abs(ahead) <= USUAL_S
-        a, b = one_of[reference], one_of[camera]
-        alike = (a.make, a.model) == (b.make, b.model)
-        is_one = alike and (a.serial == b.serial if a.serial and b.serial else near)
-        if ahead is not None and not is_one:
-            mounted.append(camera)
+    mounted = [
+        camera
+        for camera in sorted(set(taken) - {reference})
+        if (ahead := _paired_at(seconds[reference], seconds[camera])) is not None
+        and not _is_one_camera(exif_of[reference], exif_of[camera], ahead)
+    ]
     rig = (reference, *mounted)
     shortest = min(float(np.diff(seconds[camera]).min()) for camera in rig)
     exact = not any(_is_whole(seconds[camera]) for camera in rig) and shortest < 4 * USUAL_S
     tolerance = TRIGGER_S if exact else USUAL_S
     corrected = dict(taken[reference])
     for camera in mounted:
-        ahead, *others = clock_offsets(
+        offset, *others = clock_offsets(
             list(taken[reference].values()), list(taken[camera].values()), tolerance
         )
-        if ahead and others:  # a survey of this rig would be refused
+        if offset and others:  # a survey of this rig would be refused
             return None
-        corrected |= {name: time - timedelta(seconds=ahead) for name, time in taken[camera].items()}
+        corrected |= {name: time - timedelta(seconds=offset) for name, time in taken[camera].items()}
     moment = named_moments(corrected, tolerance)
     placed = {(camera, moment[name]) for camera in rig for name in taken[camera]}
     return TimedRig(rig, moment, tolerance) if mounted and len(placed) == len(moment) else None
+
+
+def _is_one_camera(a: Metadata, b: Metadata, ahead: float) -> bool:
+    """Return whether photographs that pair up at a difference of clocks, s, may be of one camera.
+
+    Copies, and photographs of one release of one body, are of one time too.
+    """
+    if (a.make, a.model) != (b.make, b.model):
+        return False
+    return a.serial == b.serial if a.serial and b.serial else abs(ahead) <= USUAL_S
 
 
 def _paired_at(reference: FloatArray, times: FloatArray) -> float | None:

@@ -118,18 +118,35 @@ def draft_survey(
     name = as_plain(folder.resolve().name) or "survey"
     positions = sum(metadata[photograph].position is not None for photograph in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
+    content = _Content(name, grouping, trial, pitch, left_out, positions, masked, unused)
     if trial.plate is not None:
-        silent = _text(name, grouping, trial, pitch, left_out, positions, masked, unused, models=False)
+        silent = _text(content, models=False)
         cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
-        grouping = replace(grouping, cameras=cameras)
+        content = replace(content, grouping=replace(grouping, cameras=cameras))
     return Draft(
-        name,
-        _text(name, grouping, trial, pitch, left_out, positions, masked, unused),
-        _findings(grouping, trial, positions, masked, unused),
-        _remarks(grouping, trial, pitch),
-        left_out,
-        picture_of_rings(trial.ringed),
+        name, _text(content), _findings(content), _remarks(content), left_out, picture_of_rings(trial.ringed)
     )
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What a folder contains, as a draft states it."""
+
+    name: str  # of the survey
+    grouping: Grouping
+    trial: TargetTrial
+    pitch: float | None  # of a plate, mm; None if it is assumed
+    left_out: tuple[tuple[str, str], ...]  # (photograph, reason)
+    positions: int  # number of photographs with a position in their EXIF data
+    masked: str  # where the masks are, relative to the folder; "" without any
+    unused: str  # why the masks are not used, "" if they are
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Free parameters of the cameras; empty for texture, where the adjustment chooses them."""
+        if self.trial.plate is not None:
+            return FREE_BY_PLATES
+        return FREE_BY_TARGETS if self.trial.codes != "none" else ()
 
 
 def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
@@ -188,39 +205,30 @@ def _has_photographs(folder: Path) -> bool:
         return False
 
 
-def _text(
-    name: str,
-    grouping: Grouping,
-    trial: TargetTrial,
-    pitch: float | None,
-    left_out: Sequence[tuple[str, str]],
-    positions: int,
-    masked: str,
-    unused: str,
-    *,
-    models: bool = True,
-) -> str:
+def _text(content: _Content, *, models: bool = True) -> str:
+    """Return the text of the survey file, with or without the models of the cameras."""
+    grouping, trial, pitch = content.grouping, content.trial, content.pitch
     lines = [
         "# Drafted from the photographs; every value may be changed, and what is measured already is kept.",
         "[survey]",
-        f"name = {_quoted(name)}",
+        f"name = {_quoted(content.name)}",
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
-    if masked:
-        commented = "# " if unused else ""
-        lines.append(f"{commented}masks = {_quoted(masked)}  # what is black there is ignored")
+    if content.masked:
+        commented = "# " if content.unused else ""
+        lines.append(f"{commented}masks = {_quoted(content.masked)}  # what is black there is ignored")
     for camera in grouping.cameras:
-        lines += ["", *_camera_lines(camera, _free_parameters(trial), models=models)]
+        lines += ["", *_camera_lines(camera, content.free, models=models)]
     if grouping.rig is not None:
         lines += ["", *_rig_lines(grouping.rig)]
-    if left_out:
+    if content.left_out:
         lines += ["", "# Left out:"]
-        lines += [f"#   {name}: {as_plain(why)}" for name, why in left_out]
+        lines += [f"#   {name}: {as_plain(why)}" for name, why in content.left_out]
     lines += ["", *_target_lines(trial, pitch)]
     if trial.plate is None:
         lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
         lines += ["", *_example_lines(trial)]
-        lines += _position_lines(positions) if positions else []
+        lines += _position_lines(content.positions) if content.positions else []
     else:
         lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
         for plate in trial.plates[1:]:
@@ -239,13 +247,6 @@ def _text(
     return "\n".join(lines) + "\n"
 
 
-def _free_parameters(trial: TargetTrial) -> tuple[str, ...]:
-    """Return the free parameters of the cameras; empty for texture, where the adjustment chooses them."""
-    if trial.plate is not None:
-        return FREE_BY_PLATES
-    return FREE_BY_TARGETS if trial.codes != "none" else ()
-
-
 def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> list[str]:
     globs = camera.globs[0] if len(camera.globs) == 1 else list(camera.globs)
     lines = [
@@ -255,14 +256,16 @@ def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> 
         f"images = {json.dumps(globs, ensure_ascii=False)}",
         f"pixel_mm = [{camera.pixel_mm[0]:.7g}, {camera.pixel_mm[1]:.7g}]  # {as_plain(camera.pixel_source)}",
         f"c_mm = {camera.c_mm:.6g}  # start value: {camera.c_source}",
-        *(["c_assumed = true  # remove this once c_mm and pixel_mm are known"] if camera.assumed else []),
-        *(_model_lines(camera, free) if models else ()),
     ]
+    if camera.assumed:
+        lines.append("c_assumed = true  # remove this once c_mm and pixel_mm are known")
+    if models:
+        lines += _model_lines(camera, free)
     return lines + [f"# {as_plain(said.text)}" for said in camera.remarks]
 
 
 def _rig_lines(rig: ProposedRig) -> list[str]:
-    return [
+    lines = [
         f"# {_what_pairs(rig).capitalize()} pair up: {counted(rig.moments, 'moment')}, "
         f"as {as_plain(' and '.join(rig.example))}.",
         "# Check that the cameras are fixed to one another and triggered together; else remove this section.",
@@ -270,12 +273,10 @@ def _rig_lines(rig: ProposedRig) -> list[str]:
         'name = "rig"',
         f"cameras = {json.dumps(list(rig.cameras))}  # the first is the reference",
         f"moment = {_quoted(rig.moment)}  # {MOMENTS.get(rig.moment, MOMENT_IN_NAMES)}",
-        *(
-            []
-            if rig.tolerance_s == USUAL_S
-            else [f"tolerance_s = {rig.tolerance_s:g}  # of times of one moment"]
-        ),
     ]
+    if rig.tolerance_s != USUAL_S:
+        lines.append(f"tolerance_s = {rig.tolerance_s:g}  # of times of one moment")
+    return lines
 
 
 def _what_pairs(rig: ProposedRig) -> str:
@@ -417,10 +418,9 @@ def _position_lines(positions: int) -> list[str]:
     ]
 
 
-def _findings(
-    grouping: Grouping, trial: TargetTrial, positions: int, masked: str, unused: str
-) -> tuple[tuple[str, str], ...]:
+def _findings(content: _Content) -> tuple[tuple[str, str], ...]:
     """Return the findings for the terminal."""
+    grouping, trial = content.grouping, content.trial
     findings = [
         (
             f"camera {camera.name}",
@@ -455,17 +455,18 @@ def _findings(
         findings.append(("targets", f"{trial.codes}, {trial.polarity}; {repeated}"))
     else:
         findings.append(("targets", "none with codes: points of natural texture"))
-    if masked:
-        findings.append(("masks", f"in {masked}; {unused or 'what is black in them is ignored'}"))
-    if positions:
-        findings.append(
-            ("positions", f"in EXIF data of {counted(positions, 'photograph')}, not used as observations")
-        )
+    if content.masked:
+        use = content.unused or "what is black in them is ignored"
+        findings.append(("masks", f"in {content.masked}; {use}"))
+    if content.positions:
+        stating = counted(content.positions, "photograph")
+        findings.append(("positions", f"in EXIF data of {stating}, not used as observations"))
     return tuple(findings)
 
 
-def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tuple[Remark, ...]:
+def _remarks(content: _Content) -> tuple[Remark, ...]:
     """Return the remarks on photographs, cameras and targets."""
+    grouping, trial = content.grouping, content.trial
     remarks = [said for camera in grouping.cameras for said in camera.remarks]
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
@@ -473,7 +474,7 @@ def _remarks(grouping: Grouping, trial: TargetTrial, pitch: float | None) -> tup
     if len(grouping.cameras) > 1:
         each = [f"{camera.name} ({len(camera.photographs)})" for camera in grouping.cameras]
         remarks.append(remark("several_cameras", cameras=each))
-    if trial.plate is not None and pitch is None:
+    if trial.plate is not None and content.pitch is None:
         remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
         remarks += unless_note(remark("targets_blurred", blur=(trial.blur_px, "px")))
