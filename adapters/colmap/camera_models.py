@@ -26,7 +26,7 @@ from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shorten
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
-from sfm.model.conventions import BoolArray, IntArray
+from sfm.model.conventions import BoolArray
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import ImagePoints, Network
@@ -231,7 +231,12 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     )
     points = np.array([scene.point3D(j).xyz for j in point_ids]).reshape(-1, 3)
     if mounts is not None:
-        moment = _moments_of(images, network, mounts)
+        frames = [
+            (image.frame_id,) if mounts.rig[a] else ("", i)
+            for i, (image, a) in enumerate(zip(images, network.camera, strict=True))
+        ]
+        number = {frame: t for t, frame in enumerate(dict.fromkeys(frames))}
+        moment = np.array([number[frame] for frame in frames], dtype=np.int64)
         refuse_moments("frames", [camera.name for camera in cameras], network, mounts, moment)
         network = replace(network, moment=moment)
     return network, Estimate(cameras, position, M.transpose(0, 2, 1).copy(), points, mounts)
@@ -275,16 +280,6 @@ def _image_points_of(image_ids: list[int], images: list[Any], point_ids: list[in
         np.tile(np.eye(2), (len(table), 1, 1)),
         np.zeros(len(table), dtype=bool),
     )
-
-
-def _moments_of(images: list[Any], network: Network, mounts: Mounts) -> IntArray:
-    """Return the moment of each photograph: its frame, or its own for a camera without a rig."""
-    frames = [
-        (image.frame_id,) if mounts.rig[a] else ("", i)
-        for i, (image, a) in enumerate(zip(images, network.camera, strict=True))
-    ]
-    number = {frame: t for t, frame in enumerate(dict.fromkeys(frames))}
-    return np.array([number[frame] for frame in frames], dtype=np.int64)
 
 
 def _mounts_of(scene: Any, camera_ids: list[int]) -> Mounts | None:

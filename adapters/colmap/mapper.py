@@ -90,23 +90,19 @@ def map_photographs(
             network, estimate = read_model(work / "best")
     except (RuntimeError, ValueError, OSError) as error:
         raise BackendError(f"COLMAP's mapper failed: {one_line(error)}") from error
-    return MapperBaseline(
-        network,
-        estimate,
-        sum(len(names) for names in cameras),
-        _rms(network, estimate),
-        time.perf_counter() - begun,
-    )
-
-
-def _rms(network: Network, estimate: Estimate) -> float:
     seen = network.image_points
     squares = []
     for i, rows in enumerate(rows_of(seen.image, len(network.images))):
         camera = estimate.cameras[network.camera[i]]
         xy = project(camera, estimate.position[i], estimate.rotation[i], estimate.points[seen.point[rows]])
         squares.append(((xy - seen.xy[rows]) ** 2).ravel())
-    return float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    return MapperBaseline(
+        network,
+        estimate,
+        sum(len(names) for names in cameras),
+        float(np.sqrt(np.nanmean(np.concatenate(squares)))),
+        time.perf_counter() - begun,
+    )
 
 
 def sensor_width_mm(make: str, model: str) -> float | None:

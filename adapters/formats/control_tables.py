@@ -77,8 +77,15 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         _GivenValue(kind, name, coordinate, value, sigma)
         for kind, name, coordinate, (value, sigma) in zip(*table.texts, table.values.tolist(), strict=True)
     ]
+    index = {name: j for j, name in enumerate(network.points)}
+    bars = [
+        (*ends, bar.value, bar.sigma)
+        for bar in given
+        if bar.kind == "scale bar" and (ends := _ends(bar.name, index)) is not None
+    ]
+    rows = np.array(bars, dtype=float).reshape(-1, 4)
     return GivenValues(
-        _scale_bars(given, network),
+        ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
         _control(given, network),
         _interior(given),
         _exterior(given, network),
@@ -95,17 +102,6 @@ class _GivenValue(NamedTuple):
     coordinate: str
     value: float
     sigma: float
-
-
-def _scale_bars(given: list[_GivenValue], network: Network) -> ScaleBars:
-    index = {name: j for j, name in enumerate(network.points)}
-    bars = [
-        (*ends, bar.value, bar.sigma)
-        for bar in given
-        if bar.kind == "scale bar" and (ends := _ends(bar.name, index)) is not None
-    ]
-    rows = np.array(bars, dtype=float).reshape(-1, 4)
-    return ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
 
 
 def _ends(name: str, index: dict[str, int]) -> tuple[int, int] | None:

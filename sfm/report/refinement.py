@@ -53,6 +53,7 @@ def page(refinement: Refinement, *, numbers: Numbers, title: str) -> Page:
     figures = f"RMS of the key points {px[0]} px before, {px[1]} px after"
     bad = f"Not dependable: {figures}"
     unit = "object units" if refinement.targets is None else refinement.targets.unit
+    names = [numbers.point_ids[j] for j in np.flatnonzero(refinement.points)]
     return Page(
         "refinement",
         "Refinement of a COLMAP model",
@@ -65,7 +66,7 @@ def page(refinement: Refinement, *, numbers: Numbers, title: str) -> Page:
             Section("Cameras", *_cameras(refinement, numbers)),
             Section("Photographs", *_photographs(refinement, numbers, unit)),
         ),
-        files=(_points(refinement, numbers),),
+        files=(_coordinates(refinement, "point3D_id", names, np.arange(len(names)), "sigma_points"),),
     )
 
 
@@ -242,12 +243,6 @@ def _photographs(refinement: Refinement, numbers: Numbers, unit: str) -> tuple[P
         "with all digits; sigma_points.csv and sigma_cameras.csv contain those of points and cameras."
     )
     return Table(heads, rows, "sigma_images"), note
-
-
-def _points(refinement: Refinement, numbers: Numbers) -> Table:
-    """Return the adjusted points, for a file."""
-    names = [numbers.point_ids[j] for j in np.flatnonzero(refinement.points)]
-    return _coordinates(refinement, "point3D_id", names, np.arange(len(names)), "sigma_points")
 
 
 def _coordinates(

@@ -147,23 +147,19 @@ def _reasons(adjusters: AdjusterComparison) -> list[str]:
     """Return the reasons why two adjusters do not agree."""
     reasons = [*adjusters.comparison.exceeded]
     if reasons and adjusters.adjustment.converged:
-        reasons.append(_other_minimum(adjusters))
+        ours, theirs = adjusters.comparison.cost
+        lower = program_name("kolinear" if ours < theirs else adjusters.backend)
+        ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
+        reasons.append(
+            f"continuing from {program_name(adjusters.backend)}'s solution does not lead to Kolinear's: "
+            f"there are two minima, and that of {lower} is lower, by a factor of {ratio:.6g} in the sum of "
+            "squares"
+        )
     if not adjusters.adjustment.converged:
         reasons.append("Kolinear did not converge in this model")
     if not adjusters.backend_converged:
         reasons.append(f"{program_name(adjusters.backend)} did not converge")
     return reasons
-
-
-def _other_minimum(adjusters: AdjusterComparison) -> str:
-    """Return in words which of two minima is lower."""
-    ours, theirs = adjusters.comparison.cost
-    lower = program_name("kolinear" if ours < theirs else adjusters.backend)
-    ratio = max(ours, theirs) / min(ours, theirs) if min(ours, theirs) > 0 else np.inf
-    return (
-        f"continuing from {program_name(adjusters.backend)}'s solution does not lead to Kolinear's: there "
-        f"are two minima, and that of {lower} is lower, by a factor of {ratio:.6g} in the sum of squares"
-    )
 
 
 def pipeline_parts(f: Findings) -> Iterator[Part]:

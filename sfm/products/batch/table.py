@@ -117,7 +117,15 @@ class BatchTable:
     def _render(self) -> RenderableType:
         """Return the present table."""
         now = time.monotonic()
-        table = RichTable(box=None, padding=(0, 2, 0, 0), caption=self._sum(now), caption_justify="left")
+        run = self._done + self._failed - self._kept
+        begun = sum(line.photographs / line.total for line in self._lines.values() if line.total)
+        run_share = (run + MEASURING_SHARE * begun) / max(1, run + self._left)
+        text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
+        if self._failed:
+            text += f", {self._failed} failed"
+        if run_share >= MIN_DONE_SHARE and self._left:
+            text += f", about {_duration((now - self._begun) * (1 / run_share - 1))} left"
+        table = RichTable(box=None, padding=(0, 2, 0, 0), caption=text, caption_justify="left")
         for name in ("survey", "stage", "photographs", "seconds"):
             table.add_column(name, justify="right" if name in ("photographs", "seconds") else "left")
         for row in self._recent:
@@ -130,17 +138,6 @@ class BatchTable:
             seconds = "" if line.begun is None else f"{now - line.begun:.0f}"
             table.add_row(Text(name), Text(line.stage), count, seconds)
         return table
-
-    def _sum(self, now: float) -> str:
-        run = self._done + self._failed - self._kept
-        begun = sum(line.photographs / line.total for line in self._lines.values() if line.total)
-        run_share = (run + MEASURING_SHARE * begun) / max(1, run + self._left)
-        text = f"{self._done + self._failed} of {self._done + self._failed + self._left} surveys"
-        if self._failed:
-            text += f", {self._failed} failed"
-        if run_share >= MIN_DONE_SHARE and self._left:
-            text += f", about {_duration((now - self._begun) * (1 / run_share - 1))} left"
-        return text
 
 
 def outcome_of(row: SurveyRow) -> str:

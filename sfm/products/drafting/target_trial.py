@@ -260,13 +260,14 @@ def _decided(seen: _Seen) -> TargetTrial:
     coded = seen.is_coded and not seen.plates
     measured = seen.measure(best) if coded and best in RING_NAMES else seen.measured or seen.plain
     unknown = not coded and not seen.plates
+    blur = np.concatenate([targets.blur for targets in measured])
     return TargetTrial(
         best if coded else seen.plates[0].name if seen.plates else "none",
         _polarity(measured) if coded else "auto",
         tuple(_name(code, best) for code in counts[best]) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda row: -row[1])),
         float(np.median([targets.is_circle.sum() for targets in measured])),
-        _blur(measured),
+        float(np.median(blur)) if len(blur) else float("nan"),
         seen.names,
         min(int((targets.code >= 0).sum()) for targets in measured) if coded else 0,
         seen.plates,
@@ -530,11 +531,6 @@ def _polarity(photographs: Sequence[Targets]) -> str:
     """Return the polarity of the coded targets, "auto" if there are both."""
     polarities = {int(p) for targets in photographs for p in targets.polarity[targets.code >= 0]}
     return {-1: "dark", 1: "bright"}[polarities.pop()] if len(polarities) == 1 else "auto"
-
-
-def _blur(photographs: Sequence[Targets]) -> float:
-    blur = np.concatenate([targets.blur for targets in photographs])
-    return float(np.median(blur)) if len(blur) else float("nan")
 
 
 def _name(code: int, family: str) -> str:

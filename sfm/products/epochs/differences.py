@@ -128,7 +128,10 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
     C, shared = (_correlation_of_joint if together else _correlation_of_shared)(first, second, pairs)
     points = replace(pairs_of_results(a, b, pairs, scale)[0], C=C)
     difference, Q = points.differences(moved)
-    held_alike, held_apart = _held_cameras(a, b)
+    ours, theirs = _held_values(a), _held_values(b)
+    held = tuple(dict.fromkeys((*ours, *theirs)))  # cameras with nonzero values held in an epoch
+    held_alike = tuple(name for name in held if ours.get(name) == theirs.get(name))
+    held_apart = tuple(name for name in held if name not in held_alike)
     return Differences(
         names=(first.name, second.name),
         unit=a.unit,
@@ -160,14 +163,6 @@ def _others(result: Solution, paired: IntArray) -> tuple[str, ...]:
     left[paired] = False
     left &= result.estimate.determined
     return tuple(result.network.points[j] for j in np.flatnonzero(left))
-
-
-def _held_cameras(a: Solution, b: Solution) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return cameras with the same nonzero values held in both epochs, and other cameras with held values."""
-    ours, theirs = _held_values(a), _held_values(b)
-    names = tuple(dict.fromkeys((*ours, *theirs)))
-    alike = tuple(name for name in names if name in ours and name in theirs and ours[name] == theirs[name])
-    return alike, tuple(name for name in names if name not in alike)
 
 
 def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:

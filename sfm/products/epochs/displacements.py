@@ -108,10 +108,15 @@ def find_displacements(
         reference=reference,
         alpha=alpha,
     )
+    # A stable point is tested by the drop of Omega, any other point by a separate test in the datum.
+    shift = {a: detectable_shift(a, POWER, 3, differences.redundancy) for a in set(tested.level.tolist())}
+    variance = point_blocks(tested.covariance, 3)
+    variance[tested.stable] = np.linalg.inv(tested.weights[tested.stable])
+    worst = np.sqrt(np.linalg.eigvalsh(variance)[:, -1].clip(0))
     return Displacements(
         differences=differences,
         congruency=tested,
-        detectable=_detectable(tested, differences.redundancy),
+        detectable=worst * np.array([shift[a] for a in tested.level.tolist()]),
         cause=find_cause(
             differences.pairs,
             reference=tested.reference,
@@ -144,15 +149,3 @@ def detectable_shift(alpha: float, power: float, m: int, redundancy: int | None)
         missed = float(ncfdtr(m, freedom, middle, limit))
         low, high = (middle, high) if missed > 1 - power else (low, middle)
     return math.sqrt(high)
-
-
-def _detectable(tested: Congruency, redundancy: int | None) -> FloatArray:
-    """Return the smallest detectable displacement of each point in its worst direction, (n,).
-
-    A stable point is tested by the drop of Omega, any other point by a separate test in the datum.
-    """
-    shift = {a: detectable_shift(a, POWER, 3, redundancy) for a in set(tested.level.tolist())}
-    variance = point_blocks(tested.covariance, 3)
-    variance[tested.stable] = np.linalg.inv(tested.weights[tested.stable])
-    worst = np.sqrt(np.linalg.eigvalsh(variance)[:, -1].clip(0))
-    return np.asarray(worst * np.array([shift[a] for a in tested.level.tolist()]))

@@ -46,7 +46,6 @@ from sfm.products.geometry.tolerance import (
 from sfm.products.inspection.features_file import (
     AlignmentSettings,
     FeaturesFile,
-    HeldSettings,
     ShapeSettings,
     ToleranceSettings,
 )
@@ -182,7 +181,11 @@ class _Work:
         self.patterns = {group.name: group.points for group in features.groups}
         self.shapes: dict[str, ShapeFit] = {}
         self.tables = {name: _nominal(paths[name]) for name in features.tables()}
-        self.rays = _rays(result)
+        network, estimate = result.network, result.estimate
+        seen = network.image_points
+        number = np.cumsum(estimate.determined) - 1  # of a point among those with coordinates
+        kept = estimate.oriented[seen.image] & estimate.determined[seen.point]
+        self.rays = number[seen.point[kept]], estimate.position[seen.image[kept]]
 
     def measured(self) -> Measurement:
         features = self.features
@@ -224,13 +227,16 @@ class _Work:
         weights = settings.weights or self.features.measure.weights
 
         def fitted(offset: float) -> ShapeFit:
+            held = {key: value for key, value in settings.hold.model_dump().items() if value is not None}
+            if "half_angle_deg" in held:
+                held["half_angle"] = float(np.deg2rad(held.pop("half_angle_deg")))
             return fit_shape(
                 self.points,
                 settings.kind,
                 rows,
                 name=settings.name,
                 weights=weights,
-                hold=_held(settings.hold),
+                hold=held,
                 robust=settings.robust,
                 offset=offset,
             )
@@ -435,13 +441,6 @@ class _Work:
                 yield remark("shape_points_left_out", shape=shape, points=left)
 
 
-def _held(hold: HeldSettings) -> dict[str, float | tuple[float, ...]]:
-    held = {key: value for key, value in hold.model_dump().items() if value is not None}
-    if "half_angle_deg" in held:
-        held["half_angle"] = float(np.deg2rad(held.pop("half_angle_deg")))
-    return held
-
-
 def _nominal(path: Path) -> Nominal:
     """Read nominal points; a table with standard deviations gives their covariance."""
     table = read_table(path, ("id",), ("X", "Y", "Z"), SIGMAS, ignored=None, blank=SIGMAS)
@@ -454,12 +453,3 @@ def _nominal(path: Path) -> Nominal:
             raise SurveyFileError(f"{path}: standard deviations of some points only, expected all or none")
         covariance = np.eye(3) * sigma[:, None, :] ** 2
     return Nominal(names, table.values[:, :3].copy(), covariance)
-
-
-def _rays(result: Solution) -> tuple[IntArray, FloatArray]:
-    """Return the point, counted among those with coordinates, and the camera position of each ray."""
-    network, estimate = result.network, result.estimate
-    seen = network.image_points
-    number = np.cumsum(estimate.determined) - 1
-    kept = estimate.oriented[seen.image] & estimate.determined[seen.point]
-    return number[seen.point[kept]], estimate.position[seen.image[kept]]

@@ -149,18 +149,27 @@ def describe_plan(
         design: the design of the stations; None for given stations.
     """
     seen = prediction.sight.seen
-    coded = np.union1d(choose_coded(seen), _observed(prediction))
+    network = prediction.adjustment.network
+    # Points with observations besides image points need a code as their name.
+    observed = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
+    named = np.isin(prediction.point, np.concatenate([*observed, np.zeros(0, dtype=np.int64)]))
+    coded = np.union1d(choose_coded(seen), np.flatnonzero(named))
     camera = prediction.cameras[0]
     m, n = np.nonzero(seen)
     rays = prediction.stations.position[m] - prediction.planned.xyz[n]
     width = camera.size_px[0]
+    cosine = (rays * prediction.planned.normals[n]).sum(axis=1) / np.linalg.norm(rays, axis=1)
+    known = cosine[np.isfinite(cosine)]  # of the angles between rays and normals
+    tilt_deg = seeing.max_incidence_deg
+    if len(known):
+        tilt_deg = math.degrees(math.acos(min(float(known.min()), 1.0)))
     size = compute_target_size(
         p=MIN_PIXELS,
         w_mm=width * float(camera.pixel_mm[0]),
         d=float(np.linalg.norm(rays, axis=1).max()),
         c_mm=camera.c_px * float(np.mean(camera.pixel_mm)),
         n=width,
-        tilt_deg=min(_tilt(rays, prediction.planned.normals[n], seeing), STEEPEST_DEG),
+        tilt_deg=min(tilt_deg, STEEPEST_DEG),
     )
     return Plan(
         name,
@@ -189,20 +198,6 @@ def describe_plan(
             focus=None if seeing.depth is None else seeing.depth.focus,
         ),
     )
-
-
-def _observed(prediction: Prediction) -> IntArray:
-    """Return the points with observations besides image points; they need a code as their name."""
-    network = prediction.adjustment.network
-    points = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
-    return np.flatnonzero(np.isin(prediction.point, np.concatenate([*points, np.zeros(0, dtype=np.int64)])))
-
-
-def _tilt(rays: FloatArray, normals: FloatArray, seeing: Seeing) -> float:
-    """Return the largest angle between a ray and the normal of its point, deg."""
-    cosine = (rays * normals).sum(axis=1) / np.linalg.norm(rays, axis=1)
-    known = cosine[np.isfinite(cosine)]
-    return math.degrees(math.acos(min(float(known.min()), 1.0))) if len(known) else seeing.max_incidence_deg
 
 
 def verdict_of_plan(plan: Plan) -> Verdict:

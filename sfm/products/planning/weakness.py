@@ -28,7 +28,6 @@ from sfm.adjustment.quality.statistics import Correlation, correlations
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -197,11 +196,15 @@ def calibratability(prediction: Prediction, seeing: Seeing, camera_index: int = 
     sigma = a.interior_sigma(camera_index)[camera.free]
     xy = a.network.image_points.xy[a.network.camera[a.network.image_points.image] == camera_index]
     rows = {f"{n} of camera {camera.name}" for n in names}
+    # A small shift of the principal point cannot be distinguished from a rotation of the camera, and need not
+    # be. Therefore the effect of a rotation is removed.
+    places = xy[:: 1 + len(xy) // MAX_PLACES]
+    Q = projection_covariance(camera, a.covariance.interior[camera_index], places, places)
     return Calibratability(
         camera=camera.name,
         parameters=names,
         sigma=np.where(sigma > 0, sigma, np.nan),
-        contribution=_angle_sigma_px(camera, a.covariance.interior[camera_index], xy) / prediction.sigma_px,
+        contribution=float(np.sqrt(np.nanmean(np.einsum("kii->ki", Q)))) / prediction.sigma_px,  # RMS
         cost=free.rms_sigma / fixed.rms_sigma,
         rolled=rolled_share(R),
         convergence_deg=float(np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1).min()))),
@@ -231,17 +234,6 @@ def rolled_share(rotation: FloatArray) -> float:
     return float(min(upright.mean(), 1 - upright.mean()))
 
 
-def _angle_sigma_px(camera: Camera, covariance: FloatArray, xy: FloatArray) -> float:
-    """Return the RMS effect of the uncertainty of the interior orientation on the angles between rays, px.
-
-    A small shift of the principal point cannot be distinguished from a rotation of the camera, and need not
-    be. Therefore the effect of a rotation is removed.
-    """
-    places = xy[:: 1 + len(xy) // MAX_PLACES]
-    Q = projection_covariance(camera, covariance, places, places)
-    return float(np.sqrt(np.nanmean(np.einsum("kii->ki", Q))))
-
-
 @dataclass(frozen=True)
 class Contribution:
     """Contribution of a kind of observation of a plan, or of its rig."""
@@ -269,7 +261,14 @@ def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
     parts = []
     if a.estimate.mounts is not None and a.network.moment is not None:
         moments = len(np.unique(a.network.moment))
-        parts.append(_contribution_of(a, RIG, moments, *_without_rig(a.network, a.estimate)))
+        network, _ = _without(replace(a.network, moment=None), a.estimate, MountObservations.name)
+        seen = network.incidence(np.ones(len(network.image_points), dtype=bool)).toarray() > 0
+        images, points = np.zeros(len(network.images), dtype=bool), np.zeros(len(network.points), dtype=bool)
+        left = select_usable(seen)  # photographs that can be oriented alone
+        images[left[0]], points[left[1]] = True, True
+        every = np.ones(len(network.image_points), dtype=bool)
+        network, start = reduce_network(network, replace(a.estimate, mounts=None), images, points, every)
+        parts.append(_contribution_of(a, RIG, moments, network, start))
     for name in dict.fromkeys(kind.name for kind in a.network.kinds if len(kind)):
         count = sum(len(kind) for kind in a.network.kinds if kind.name == name)
         parts.append(_contribution_of(a, name, count, *_without(a.network, a.estimate, name)))
@@ -316,17 +315,6 @@ def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, 
         scale_bars=ScaleBars() if name == ScaleBars.name else network.scale_bars,
         observations=tuple(kind for kind in network.observations if kind.name != name),
     ), estimate
-
-
-def _without_rig(network: Network, estimate: Estimate) -> tuple[Network, Estimate]:
-    """Return a network without the rig, of the photographs that can be oriented alone."""
-    network, _ = _without(replace(network, moment=None), estimate, MountObservations.name)
-    seen = network.incidence(np.ones(len(network.image_points), dtype=bool)).toarray() > 0
-    images, points = np.zeros(len(network.images), dtype=bool), np.zeros(len(network.points), dtype=bool)
-    left = select_usable(seen)
-    images[left[0]], points[left[1]] = True, True
-    every = np.ones(len(network.image_points), dtype=bool)
-    return reduce_network(network, replace(estimate, mounts=None), images, points, every)
 
 
 def _determined(a: Adjustment) -> BoolArray:

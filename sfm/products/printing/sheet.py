@@ -197,20 +197,15 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
         names = [path if count == 1 else path.with_stem(f"{path.stem}-{k + 1}") for k in range(count)]
         contents = [_svg(sheet, k).encode() for k in range(count)]
     for name in names:
-        _refuse_other_files(name)
+        with disk_errors(f"{name}: the sheet cannot be written"):
+            if name.is_dir():
+                raise OutputError(f"{name}: is a folder, needed the name of a file")
+            if name.exists() and not (name.is_file() and CHECK.encode() in _head(name)):
+                raise OutputError(f"{name}: exists and is not an earlier sheet, needed another name")
     with ExitStack() as files:
         for name, content in zip(names, contents, strict=True):
             files.enter_context(whole_file(name, "the sheet", replaces=True)).write_bytes(content)
     return tuple(names)
-
-
-def _refuse_other_files(path: Path) -> None:
-    """Raise OutputError if the path exists and is not an earlier sheet, which would be lost."""
-    with disk_errors(f"{path}: the sheet cannot be written"):
-        if path.is_dir():
-            raise OutputError(f"{path}: is a folder, needed the name of a file")
-        if path.exists() and not (path.is_file() and CHECK.encode() in _head(path)):
-            raise OutputError(f"{path}: exists and is not an earlier sheet, needed another name")
 
 
 def _head(path: Path) -> bytes:

@@ -400,7 +400,12 @@ def project_targets(
     )
     across = np.linalg.norm(outline_px - np.roll(outline_px, OUTLINE // 2, axis=1), axis=2)
     diameter = across.max(axis=1, initial=0.0)
-    return ProjectedTargets(centre, _centre_of_area(outline_px), diameter, inside & front & ~hidden)
+    p = outline_px - outline_px[:, :1]  # the centre of area is computed about the first corner
+    q = np.roll(p, -1, axis=1)
+    cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    moment = ((p + q) * cross[..., None]).sum(axis=1)
+    centre_of_area = outline_px[:, 0] + moment / (3 * cross.sum(axis=1))[:, None]
+    return ProjectedTargets(centre, centre_of_area, diameter, inside & front & ~hidden)
 
 
 def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -> bool:
@@ -418,15 +423,6 @@ def _hidden(scene: Scene, position: FloatArray, points: FloatArray, face: int) -
         if (within & (part > 0) & (part < 1 - 1e-9)).any():
             return True
     return False
-
-
-def _centre_of_area(polygon: FloatArray) -> FloatArray:
-    """Return the centres of area of polygons, (n, k, 2), computed about their first corners."""
-    p = polygon - polygon[:, :1]
-    q = np.roll(p, -1, axis=1)
-    cross = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
-    moment = ((p + q) * cross[..., None]).sum(axis=1)
-    return np.asarray(polygon[:, 0] + moment / (3 * cross.sum(axis=1))[:, None])
 
 
 if __name__ == "__main__":

@@ -292,10 +292,16 @@ def residual_figure(shown: PlotData) -> Figure:
         keep = slice(None, None, max(1, len(xy) // MAX_ARROWS))
         _arrows(panels[k, 0], xy[keep], v[keep] * factor, BLUE)
         _show_format(panels[k, 0], camera.size_px, f"{name}: {len(xy)} residuals, × {factor:g}")
-        centres, means = _cell_means(xy, v, width, height)
-        if len(centres):
-            factor = _round_factor(0.6 * width / CELLS / max(_typical(means), 1e-12))
-            _arrows(panels[k, 1], centres, means * factor, RED)
+        side = max(width, height) / CELLS
+        columns = int(np.ceil(width / side))
+        cell = (xy // side).astype(int) @ (1, columns)
+        number, index, count = np.unique(cell, return_inverse=True, return_counts=True)
+        mean = np.stack([np.bincount(index, weights=v[:, a]) / count for a in (0, 1)], axis=1)
+        centre = (np.stack([number % columns, number // columns], axis=1) + 0.5) * side
+        mean, centre = mean[count >= 3], centre[count >= 3]
+        if len(centre):
+            factor = _round_factor(0.6 * width / CELLS / max(_typical(mean), 1e-12))
+            _arrows(panels[k, 1], centre, mean * factor, RED)
         _show_format(panels[k, 1], camera.size_px, f"{name}: mean of each cell, × {factor:g}")
     return figure
 
@@ -322,7 +328,10 @@ def distribution_figure(shown: PlotData) -> Figure:
     ring = np.clip(np.digitize(distance, edges) - 1, 0, 11)
     middle = (edges[1:] + edges[:-1]) / 2
     for values, colour, label in ((along, RED, "radial"), (across, BLUE, "tangential")):
-        mean, rms = _ring_means(values, ring)
+        count = np.bincount(ring, minlength=12).astype(float)
+        count[count == 0] = np.nan  # in an empty ring
+        mean = np.bincount(ring, weights=values, minlength=12) / count
+        rms = np.sqrt(np.bincount(ring, weights=values**2, minlength=12) / count)
         radial.plot(middle, rms, "-o", color=colour, markersize=3, label=f"{label} RMS")
         radial.plot(middle, mean, "--", color=colour, linewidth=1, label=f"{label} mean")
     radial.axhline(0, color="black", linewidth=0.5)
@@ -398,25 +407,6 @@ def _pyramids(shown: PlotData, images: IntArray, camera: PlotCamera, size: float
 
 def _arrows(panel: Axes, xy: FloatArray, v: FloatArray, colour: str) -> None:
     panel.quiver(*xy.T, *v.T, color=colour, angles="xy", scale_units="xy", scale=1, width=0.0015, headwidth=4)
-
-
-def _cell_means(xy: FloatArray, v: FloatArray, width: int, height: int) -> tuple[FloatArray, FloatArray]:
-    """Return centre and mean residual of each cell of the format with at least three residuals."""
-    side = max(width, height) / CELLS
-    columns = int(np.ceil(width / side))
-    cell = (xy // side).astype(int) @ (1, columns)
-    number, index, count = np.unique(cell, return_inverse=True, return_counts=True)
-    mean = np.stack([np.bincount(index, weights=v[:, a]) / count for a in (0, 1)], axis=1)
-    centre = (np.stack([number % columns, number // columns], axis=1) + 0.5) * side
-    return centre[count >= 3], mean[count >= 3]
-
-
-def _ring_means(values: FloatArray, ring: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean and RMS of the values in each of the 12 rings, NaN in an empty ring."""
-    count = np.bincount(ring, minlength=12).astype(float)
-    count[count == 0] = np.nan
-    mean = np.bincount(ring, weights=values, minlength=12) / count
-    return mean, np.sqrt(np.bincount(ring, weights=values**2, minlength=12) / count)
 
 
 def _typical(v: FloatArray) -> float:

@@ -423,21 +423,16 @@ def measurement_viewer(measurement: Measurement, result: Solution) -> Viewer | N
         unit=measurement.unit,
     )
     scene = scene_of_stored(moved)
-    deviation = _worst_deviation(measurement)[:n]
-    if np.isfinite(deviation).any():
-        scene = replace(scene, deviation=deviation)
-    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
-
-
-def _worst_deviation(measurement: Measurement) -> FloatArray:
-    """Return the largest deviation of each point from tolerances, or else from shapes; NaN without any."""
     worst = np.full(len(measurement.points.names), np.nan)
     judged: list[Deviations | ShapeFit] = [*measurement.tolerances] or [*measurement.shapes]
     for fit in judged:
         value = fit.value if isinstance(fit, Deviations) else fit.deviation
         larger = ~(np.abs(value) <= np.abs(worst[fit.points]))
         worst[fit.points[larger]] = value[larger]
-    return worst
+    deviation = worst[:n]
+    if np.isfinite(deviation).any():
+        scene = replace(scene, deviation=deviation)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
 
 
 def plan_viewer(plan: Plan) -> Viewer:

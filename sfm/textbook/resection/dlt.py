@@ -90,17 +90,12 @@ def resect_dlt(
     depths = X @ P[2, :3] + P[2, 3]
     if not ((depths > 0).all() or (depths < 0).all()):
         raise GeometryError("dlt: the points lie on both sides of the camera they define")
-    P = np.diag([size, size, 1.0]) @ P @ _centred(origin, extent)
-    powers = np.array([2, 4, 6, 1, 1])
-    return _decompose(P, k / size**powers, xy, xyz, columns)
-
-
-def _centred(origin: FloatArray, extent: float) -> FloatArray:
-    """Return the 4x4 matrix from object coordinates to centred and scaled ones."""
-    H = np.eye(4)
+    H = np.eye(4)  # from object coordinates to centred and scaled ones
     H[:3] /= extent
     H[:3, 3] = -origin / extent
-    return H
+    P = np.diag([size, size, 1.0]) @ P @ H
+    powers = np.array([2, 4, 6, 1, 1])
+    return _decompose(P, k / size**powers, xy, xyz, columns)
 
 
 def _solve_linear(xy: FloatArray, X: FloatArray, columns: list[int]) -> tuple[FloatArray, FloatArray]:

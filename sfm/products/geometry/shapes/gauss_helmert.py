@@ -90,7 +90,9 @@ def refine_weighted(
         A = A[..., free].reshape(len(w), -1)
         if not np.abs(B - factored).max(initial=0.0) < SAME_NORMALS:
             Qw = constraint_covariance(covariance, B) / size**2
-            unit = _unit(Qw, A)
+            # roots of the diagonal U, the precision of each parameter from a typical constraint
+            variance = float(np.einsum("nii->", Qw) / len(A) if Qw.ndim == 3 else np.trace(Qw) / len(A))
+            unit = np.asarray(np.sqrt(variance / np.maximum((A**2).mean(axis=0), 1e-300)))
             solve, factored = _factor(Qw, A * unit), B
         PA = solve(A)
         N = A.T @ PA
@@ -162,12 +164,6 @@ def times_covariance(covariance: FloatArray, normals: FloatArray, k: FloatArray)
     if covariance.ndim == 3:
         return np.asarray(np.einsum("nij,nj->ni", covariance, back))
     return np.asarray((covariance @ back.ravel()).reshape(n, 3))
-
-
-def _unit(Qw: FloatArray, A: FloatArray) -> FloatArray:
-    """Return the roots of the diagonal U, the precision of each parameter from a typical constraint."""
-    variance = float(np.einsum("nii->", Qw) / len(A) if Qw.ndim == 3 else np.trace(Qw) / len(A))
-    return np.asarray(np.sqrt(variance / np.maximum((A**2).mean(axis=0), 1e-300)))
 
 
 class _Blocks:

@@ -223,7 +223,10 @@ class Shape:
         """
         y = (xyz - self.origin) @ self.rotation
         d, g, of_form = self.kind.distance(y, self.form)
-        return d, g @ self.rotation.T, np.concatenate([-g, -_cross(y, g), of_form], axis=2)
+        a, b, c = (y[:, None, k] for k in range(3))
+        p, q, r = (g[..., k] for k in range(3))
+        y_cross_g = np.stack([b * r - c * q, c * p - a * r, a * q - b * p], axis=2)
+        return d, g @ self.rotation.T, np.concatenate([-g, -y_cross_g, of_form], axis=2)
 
     def moved(self, step: FloatArray, centroid: FloatArray) -> Shape:
         """Return the shape after a step, with an arbitrary origin moved next to the points.
@@ -294,10 +297,3 @@ def axes_along(direction: FloatArray) -> FloatArray:
     a = -1 / (sign + z)
     b = x * y * a
     return np.array([[1 + sign * x * x * a, b, x], [sign * b, sign + y * y * a, y], [-sign * x, -y, z]])
-
-
-def _cross(y: FloatArray, g: FloatArray) -> FloatArray:
-    """Return y x g of points (n, 3) and vectors (n, c, 3)."""
-    a, b, c = (y[:, None, k] for k in range(3))
-    p, q, r = (g[..., k] for k in range(3))
-    return np.stack([b * r - c * q, c * p - a * r, a * q - b * p], axis=2)
