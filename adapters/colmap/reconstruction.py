@@ -194,18 +194,14 @@ def estimate_of(scene: Any, start: Estimate) -> Estimate:
     R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
-    return Estimate(tuple(cameras), position, R, points, _mounts_of(scene, start.mounts))
-
-
-def _mounts_of(scene: Any, start: Mounts | None) -> Mounts | None:
-    """Return the adjusted mounts of a scene."""
-    if start is None:
-        return None
-    position, rotation = start.position.copy(), start.rotation.copy()
-    for rig in scene.rigs.values():
-        for sensor, from_rig in rig.non_ref_sensors.items():
-            position[sensor.id - 1], rotation[sensor.id - 1] = mount_of(from_rig)
-    return replace(start, position=position, rotation=rotation)
+    mounts = start.mounts
+    if mounts is not None:
+        of_mount, turned = mounts.position.copy(), mounts.rotation.copy()
+        for rig in scene.rigs.values():
+            for sensor, from_rig in rig.non_ref_sensors.items():
+                of_mount[sensor.id - 1], turned[sensor.id - 1] = mount_of(from_rig)
+        mounts = replace(mounts, position=of_mount, rotation=turned)
+    return Estimate(tuple(cameras), position, R, points, mounts)
 
 
 def camera_from_rig(pycolmap: ModuleType, mounts: Mounts, camera: int) -> Any:

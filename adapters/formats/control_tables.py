@@ -77,6 +77,11 @@ def read_given(folder: Path, network: Network) -> GivenValues:
         _GivenValue(kind, name, coordinate, value, sigma)
         for kind, name, coordinate, (value, sigma) in zip(*table.texts, table.values.tolist(), strict=True)
     ]
+    interior = []
+    for kind, name, _, value, sigma in given:
+        if kind == "interior orientation":
+            parameter, _, camera = name.partition(" of camera ")
+            interior.append((camera, parameter, value, sigma))
     index = {name: j for j, name in enumerate(network.points)}
     bars = [
         (*ends, bar.value, bar.sigma)
@@ -87,7 +92,7 @@ def read_given(folder: Path, network: Network) -> GivenValues:
     return GivenValues(
         ScaleBars(rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]),
         _control(given, network),
-        _interior(given),
+        tuple(interior),
         _exterior(given, network),
         summary.sigma0 or 1.0,
         summary.sigma0_px,
@@ -127,16 +132,6 @@ def _control(given: list[_GivenValue], network: Network) -> ObjectPoints:
             C, (row, column) = control[index[name]][1], map(AXES.index, coordinate)
             C[row, column] = C[column, row] = value
     return object_points(control)
-
-
-def _interior(given: list[_GivenValue]) -> tuple[tuple[str, str, float, float], ...]:
-    """Return camera, parameter, value and sigma of the weighted interior parameters."""
-    weighted = []
-    for kind, name, _, value, sigma in given:
-        if kind == "interior orientation":
-            parameter, _, camera = name.partition(" of camera ")
-            weighted.append((camera, parameter, value, sigma))
-    return tuple(weighted)
 
 
 def _exterior(given: list[_GivenValue], network: Network) -> ExteriorObservations:

@@ -53,7 +53,11 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
         elif path.suffix.lower() == ".stl":
             count = int.from_bytes(first[80:84], "little")
             binary = size == STL_HEADER + STL_RECORD * count and size > STL_HEADER
-            corners = _binary_corners(path) if binary else _text_corners(path)
+            if binary:
+                record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+                corners = np.fromfile(path, dtype=record, offset=STL_HEADER)["corners"].astype(float)
+            else:
+                corners = _text_corners(path)
             vertices = corners.reshape(-1, 3)  # shared by no two triangles
             triangles = np.arange(len(vertices), dtype=np.int64).reshape(-1, 3)
         else:
@@ -69,12 +73,6 @@ def read_mesh(path: Path) -> tuple[FloatArray, IntArray]:
             f"{path}: vertex {triangles.max()} of a triangle, the mesh has {len(vertices)} (counted from 0)"
         )
     return vertices, triangles
-
-
-def _binary_corners(path: Path) -> FloatArray:
-    """Return the corners of the triangles of a binary STL file, (t, 3, 3)."""
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    return np.asarray(np.fromfile(path, dtype=record, offset=STL_HEADER)["corners"].astype(float))
 
 
 def _text_corners(path: Path) -> FloatArray:

@@ -303,7 +303,11 @@ def write_export(path: Path, content: Content) -> None:
     if any(camera.free.any() for camera in estimate.cameras):
         title = f"{title} {CALIBRATION.title()}"
     width, height = sizes.pop()
-    inner = [_text(*_inner(camera)) for camera in estimate.cameras]
+    inner = []
+    for camera in estimate.cameras:  # c xp yp xs ys K1 K2 K3 P1 P2
+        xs, ys = np.array(camera.size_px) * camera.pixel_mm
+        c, x0, y0, *distortion = camera.parameters[:8]
+        inner.append(_text(c, xs / 2 + x0, ys / 2 - y0, xs, ys, *distortion))
     none = _text(*[0.0] * INNER)
     lines = [title.replace("\n", " "), f" 0.0005 20 {width} {height}", _text(*[1.0] * 9), inner[0], none]
     angles = np.rad2deg(angles_from_rotation(estimate.rotation))[:, ::-1]
@@ -352,13 +356,6 @@ def _sigma_of(covariance: FloatArray | None, count: int) -> FloatArray:
     if covariance is None:
         return np.zeros((count, 3))
     return np.nan_to_num(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
-
-
-def _inner(camera: Camera) -> list[float]:
-    """Return c xp yp xs ys K1 K2 K3 P1 P2 of a camera."""
-    xs, ys = np.array(camera.size_px) * camera.pixel_mm
-    c, x0, y0, *distortion = camera.parameters[:8]
-    return [c, xs / 2 + x0, ys / 2 - y0, xs, ys, *distortion]
 
 
 def _text(*values: float) -> str:

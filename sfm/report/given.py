@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -144,7 +143,12 @@ def _check(check: ControlCheck, adjustment: Adjustment, unit: str) -> tuple[Part
 
 def _kind(residuals: GivenResiduals, a: Adjustment, length_unit: str) -> Iterator[Part]:
     """Yield the residuals of the values of a kind, largest w first."""
-    rows = [_to_second_digit(row) for row in residuals.table_rows]
+    columns = GIVEN.names_of()
+    given, sigma = columns.index("given"), columns.index("sigma")
+    rows = []
+    for row in residuals.table_rows:  # the given value is written to the second digit of its sigma
+        stated = np.nan if row[sigma] is None else float(row[sigma])
+        rows.append((*row[:given], with_sigma(float(row[given]), stated)[0], *row[given + 1 :]))
     if not rows:
         return
     yield Heading(HEADINGS.get(residuals.kind, f"Observations: {residuals.kind}"))
@@ -166,14 +170,6 @@ def _kind(residuals: GivenResiduals, a: Adjustment, length_unit: str) -> Iterato
     yield table if len(rows) <= MAX_OPEN else FoldedParts(counted(len(rows), "value"), table, in_text=True)
     if residuals.kind == "scale bar" and len(rows) == 1 and a.datum != "control":
         yield Note("A single bar gives the scale but cannot be checked; two or more check one another.")
-
-
-def _to_second_digit(row: Sequence[Any]) -> tuple[Any, ...]:
-    """Return a row of given.csv with the given value written to the second digit of its sigma."""
-    names = GIVEN.names_of()
-    given, sigma = names.index("given"), names.index("sigma")
-    stated = np.nan if row[sigma] is None else float(row[sigma])
-    return (*row[:given], with_sigma(float(row[given]), stated)[0], *row[given + 1 :])
 
 
 def _named(residuals: GivenResiduals) -> str:

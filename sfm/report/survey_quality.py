@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlation
 from sfm.files.result_tables import VARIANCE_COMPONENTS
-from sfm.judgement.bundle_statistics import WEAK_DEG, Coverage, Geometry
+from sfm.judgement.bundle_statistics import WEAK_DEG, Geometry
 from sfm.judgement.calibrated_cameras import InteriorParameter
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
@@ -121,7 +121,13 @@ def geometry_parts(f: Findings) -> Iterator[Part]:
     mean = f", mean {known.mean():.1f} deg; below {WEAK_DEG:g} deg: {words}" if len(known) else ""
     low, high = int(geometry.rays.min()), int(geometry.rays.max())
     yield Heading("Geometry of the network")
-    covered = [(f"coverage {coverage.camera}", _covered(coverage)) for coverage in geometry.coverage]
+    covered = []
+    for coverage in geometry.coverage:
+        hull, radius = 100 * coverage.hull, 100 * coverage.radius
+        area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
+        area += f", all together {100 * coverage.hull_of_all:.0f} %"
+        reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
+        covered.append((f"coverage {coverage.camera}", f"{area}; reach from the centre {reach}"))
     yield facts(
         [
             (
@@ -167,13 +173,6 @@ def _between(values: FloatArray, names: tuple[str, ...], unit: str, decimals: in
         return "not known"
     ends = int(np.nanargmin(values)), int(np.nanargmax(values))
     return " to ".join(f"{values[k]:.{decimals}f} {unit} ({names[k]})" for k in ends)
-
-
-def _covered(coverage: Coverage) -> str:
-    hull, radius = 100 * coverage.hull, 100 * coverage.radius
-    area = f"{hull.min():.0f} to {hull.max():.0f} % of a photograph, mean {hull.mean():.0f} %"
-    reach = f"{radius.min():.0f} to {radius.max():.0f} % of half the diagonal"
-    return f"{area}, all together {100 * coverage.hull_of_all:.0f} %; reach from the centre {reach}"
 
 
 def given_values_parts(f: Findings) -> tuple[Part, ...]:

@@ -236,17 +236,14 @@ def finished_row(job: SurveyJob) -> SurveyRow | None:
         row = _row(job, results[-1], float(results[-1].get("seconds", 0.0)))
     except (TypeError, ValueError):
         return None
-    return row if _is_sound(row) else None
-
-
-def _is_sound(row: SurveyRow) -> bool:
-    """Return whether the values of a row from a file are possible values of this program."""
+    # The values of a row from a file must be possible values of this program.
     numbers = (row.sigma0_px, row.rms_px, row.photographs, row.photographs_total, row.points, row.seconds)
-    return (
+    sound = (
         row.verdict in VERDICTS
         and all(isinstance(text, str) for text in (row.survey, row.comparison, row.reason))
         and all(n is None or (isinstance(n, int | float) and math.isfinite(n)) for n in numbers)
     )
+    return row if sound else None
 
 
 def _run(

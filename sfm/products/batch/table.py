@@ -124,7 +124,10 @@ class BatchTable:
         if self._failed:
             text += f", {self._failed} failed"
         if run_share >= MIN_DONE_SHARE and self._left:
-            text += f", about {_duration((now - self._begun) * (1 / run_share - 1))} left"
+            minutes, seconds = divmod(round((now - self._begun) * (1 / run_share - 1)), 60)
+            hours, minutes = divmod(minutes, 60)
+            rest = f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+            text += f", about {f'{hours} h {minutes} min' if hours else rest} left"
         table = RichTable(box=None, padding=(0, 2, 0, 0), caption=text, caption_justify="left")
         for name in ("survey", "stage", "photographs", "seconds"):
             table.add_column(name, justify="right" if name in ("photographs", "seconds") else "left")
@@ -178,12 +181,6 @@ def stopping_at_terminate() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def write_batch_pages(rows: Sequence[SurveyRow], out: Path) -> None:
@@ -252,7 +249,12 @@ def batch_page(rows: Sequence[SurveyRow], name: str) -> Page:
     """
     good = sum(row.succeeded for row in rows)
     headline = f"{good} of {len(rows)} surveys {'has' if good == 1 else 'have'} a dependable result."
-    above = _common_folder(rows)
+    try:
+        above = os.path.commonpath([Path(row.file).parent for row in rows])
+    except ValueError:  # no files, or several drives
+        above = ""
+    if above == Path(above).anchor:
+        above = ""
     oriented, photographs, points = (
         sum(getattr(row, of) or 0 for row in rows) for of in ("photographs", "photographs_total", "points")
     )
@@ -333,12 +335,3 @@ def _table_of_failures(rows: Sequence[SurveyRow], above: str) -> Table:
 
 def _below(file: str, above: str) -> str:
     return os.path.relpath(file, above) if above else file
-
-
-def _common_folder(rows: Sequence[SurveyRow]) -> str:
-    """Return the common folder of all survey files, empty if it is only the root."""
-    try:
-        common = os.path.commonpath([Path(row.file).parent for row in rows])
-    except ValueError:  # no files, or several drives
-        return ""
-    return "" if common == Path(common).anchor else common

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import escape
@@ -21,7 +21,7 @@ import numpy as np
 from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import Metadata
 from sfm.products.drafting.camera_names import NamedCameras, cameras_in_names, divisions_by_names
-from sfm.products.drafting.camera_times import USUAL_S, TimedRig, rig_of_times
+from sfm.products.drafting.camera_times import USUAL_S, rig_of_times
 
 FOCAL_PER_SIDE = 1.2  # assumed focal length over the longer side of the photograph
 FULL_FRAME_MM = 36.0  # assumed longer side of the sensor
@@ -101,7 +101,9 @@ def group_photographs(
         timed = rig_of_times(cameras, metadata)
         if timed is not None:
             kept, left_out, labels = kept_then, left_out_then, labels_then
-            rig = _rig_by_times(timed, cameras)
+            shared = _of_one_moment(timed.moment, [cameras[camera] for camera in timed.cameras])
+            example = max(shared, key=len)
+            rig = ProposedRig(timed.cameras, BY_TIMES, len(shared), example, timed.tolerance_s)
             break
     return Grouping(
         tuple(
@@ -122,7 +124,8 @@ def _divide(
     """
     groups: dict[tuple[object, ...], list[str]] = defaultdict(list)
     for name, exif in sorted(metadata.items()):
-        groups[*_camera_data(exif), part.get(name, "")].append(name)
+        camera = exif.make, exif.model, exif.serial, exif.lens, _rounded(exif.focal_mm), exif.size_px
+        groups[*camera, part.get(name, "")].append(name)
     largest = max((len(names) for names in groups.values()), default=0)
     kept: list[list[str]] = []
     left_out: list[tuple[str, str]] = []
@@ -132,22 +135,6 @@ def _divide(
         else:
             left_out += [(name, _reason_left_out(metadata[name], metadata[kept[0][0]])) for name in names]
     return kept, left_out
-
-
-def _rig_by_times(timed: TimedRig, cameras: Mapping[str, Sequence[str]]) -> ProposedRig:
-    """Return the rig of cameras whose times pair up."""
-    together: dict[str, list[str]] = defaultdict(list)
-    for camera in timed.cameras:
-        for name in cameras[camera]:
-            together[timed.moment[name]].append(name)
-    shared = [tuple(names) for names in together.values() if len(names) > 1]
-    example = max(shared, key=len)
-    return ProposedRig(timed.cameras, BY_TIMES, len(shared), example, timed.tolerance_s)
-
-
-def _camera_data(exif: Metadata) -> tuple[object, ...]:
-    """Return what tells cameras and their settings apart."""
-    return exif.make, exif.model, exif.serial, exif.lens, _rounded(exif.focal_mm), exif.size_px
 
 
 def _is_one_camera(named: NamedCameras, metadata: Mapping[str, Metadata]) -> bool:
@@ -184,24 +171,32 @@ def _rig(named: NamedCameras, cameras: Mapping[str, Sequence[str]]) -> ProposedR
     parts = [named.camera[names[0]] for names in of.values()]
     if len(of) < 2 or len(set(parts)) < len(parts) or not named.pattern:
         return None
-    together: dict[str, list[str]] = defaultdict(list)
-    for label in sorted(of):
-        for name in of[label]:
-            together[named.moment[name]].append(name)
-    shared = [tuple(names) for names in together.values() if len(names) > 1]
+    shared = _of_one_moment(named.moment, [of[label] for label in sorted(of)])
     if 2 * sum(map(len, shared)) <= sum(map(len, of.values())):
         return None
-    return ProposedRig(
-        tuple(sorted(of)), named.pattern, len(shared), max(shared, key=lambda names: len(names))
-    )
+    return ProposedRig(tuple(sorted(of)), named.pattern, len(shared), max(shared, key=len))
+
+
+def _of_one_moment(moment: Mapping[str, str], cameras: Iterable[Sequence[str]]) -> list[tuple[str, ...]]:
+    """Return the photographs of each moment that several photographs of cameras share."""
+    together: dict[str, list[str]] = defaultdict(list)
+    for names in cameras:
+        for name in names:
+            together[moment[name]].append(name)
+    return [tuple(names) for names in together.values() if len(names) > 1]
 
 
 def _group(
     label: str, names: tuple[str, ...], metadata: dict[str, Metadata], sensor_width: SensorWidth
 ) -> CameraGroup:
     first = metadata[names[0]]
-    pixel, pixel_source = _pixel(first, sensor_width)
     side = max(first.size_px)
+    pixel: float | None = None
+    pixel_source = ""
+    if first.pixel_mm is not None:
+        pixel, pixel_source = sum(first.pixel_mm) / 2, "EXIF data"
+    elif first.make and first.model and (width := sensor_width(first.make, first.model)) is not None:
+        pixel, pixel_source = width / side, f"{first.make} {first.model} in COLMAP's list of cameras"
     assumed = pixel is None
     if first.focal_mm is not None:
         c, c_source = first.focal_mm, "EXIF focal length"
@@ -235,16 +230,6 @@ def _group(
         ),
         _remarks(label, {name: metadata[name] for name in names}),
     )
-
-
-def _pixel(exif: Metadata, sensor_width: SensorWidth) -> tuple[float | None, str]:
-    """Return the side of a pixel, mm, and its source."""
-    if exif.pixel_mm is not None:
-        return sum(exif.pixel_mm) / 2, "EXIF data"
-    width = sensor_width(exif.make, exif.model) if exif.make and exif.model else None
-    if width is not None:
-        return width / max(exif.size_px), f"{exif.make} {exif.model} in COLMAP's list of cameras"
-    return None, ""
 
 
 def _remarks(camera: str, photographs: dict[str, Metadata]) -> tuple[Remark, ...]:
@@ -292,9 +277,14 @@ def _rounded(focal: float | None) -> float | None:
 def _labels(firsts: Sequence[Metadata], parts: Sequence[str]) -> list[str]:
     """Return unique names of the cameras: the part of the file names that stands for each, or the model."""
     models = [_word(exif.model or "") for exif in firsts]
+    paths = [PurePosixPath(part).parts for part in parts]
+    common = min(map(len, paths), default=0)
+    differing = [j for j in range(common) if len({folders[j] for folders in paths}) > 1]
+    if differing:  # without the folders that all of them have
+        parts = ["/".join(folders[j] for j in differing) for folders in paths]
     plain = [
         part if part and not part.isdigit() else "-".join(filter(None, (model or (part and "camera"), part)))
-        for model, part in zip(models, map(_word, _without_common(parts)), strict=True)
+        for model, part in zip(models, map(_word, parts), strict=True)
     ]
     plain = [name or "unnamed" for name in plain]
     total, seen = Counter(plain), Counter[str]()
@@ -309,18 +299,6 @@ def _word(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "-", text).strip("-").lower()
 
 
-def _without_common(parts: Sequence[str]) -> list[str]:
-    """Return paths of folders without the folders that all of them have."""
-    split = [PurePosixPath(part).parts for part in parts]
-    differing = [
-        j for j in range(min(map(len, split), default=0)) if len({folders[j] for folders in split}) > 1
-    ]
-    return [
-        "/".join(folders[j] for j in differing) if differing else part
-        for folders, part in zip(split, parts, strict=True)
-    ]
-
-
 def _globs(names: tuple[str, ...], everything: tuple[str, ...]) -> tuple[str, ...]:
     """Return a glob that matches only these photographs, else their names."""
     prefix = _common_start(names).rstrip("0123456789") if len(names) > 1 else names[0]
@@ -328,7 +306,9 @@ def _globs(names: tuple[str, ...], everything: tuple[str, ...]) -> tuple[str, ..
     endings = {name.rpartition(".")[2] for name in names}
     for ending in (f".{endings.pop()}" if len(endings) == 1 else "", suffix):
         glob = f"{escape(prefix)}*{escape(ending)}"
-        if ending and {name for name in everything if _matches(name, glob)} == set(names):
+        # folder by folder, as when files are searched
+        alike = (name for name in everything if name.count("/") == glob.count("/"))
+        if ending and {name for name in alike if fnmatchcase(name, glob)} == set(names):
             return (glob,)
     return tuple(escape(name) for name in sorted(names))
 
@@ -337,8 +317,3 @@ def _common_start(names: Sequence[str]) -> str:
     first, last = min(names), max(names)
     length = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first))
     return first[:length]
-
-
-def _matches(name: str, glob: str) -> bool:
-    """Return whether a glob matches a name, folder by folder as when files are searched."""
-    return name.count("/") == glob.count("/") and fnmatchcase(name, glob)

@@ -153,7 +153,13 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
     """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
-    files = next((files for depth in DEPTHS if (files := _files(folder, depth))), [])
+    files: list[Path] = []
+    for depth in DEPTHS:
+        files = files or [
+            path
+            for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
+            if path.suffix.lower() in SUFFIXES or conversion_of(path)
+        ]
     files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
     if all(conversion_of(path) for path in files):
         _refuse_folder(folder, files)
@@ -171,15 +177,6 @@ def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str],
         except PhotographError as error:
             unreadable.append((name, str(error).removeprefix(f"{path.name}: ")))
     return metadata, tuple(unreadable)
-
-
-def _files(folder: Path, pattern: str) -> list[Path]:
-    """Return the photographs and raw files of a folder, and of its subfolders as the pattern asks."""
-    return [
-        path
-        for path in find_files(folder, pattern, hidden=pattern == DEPTHS[0])
-        if path.suffix.lower() in SUFFIXES or conversion_of(path)
-    ]
 
 
 def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
@@ -228,7 +225,18 @@ def _text(content: _Content, *, models: bool = True) -> str:
     if trial.plate is None:
         lines += ["", "[datum]", 'kind = "free"  # shape first; "control" with known points']
         lines += ["", *_example_lines(trial)]
-        lines += _position_lines(content.positions) if content.positions else []
+        if content.positions:
+            east, _, up = USUAL_SIGMAS_M
+            state = agreeing(content.positions, "states|state")
+            lines += [
+                "#",
+                f"# {counted(content.positions, 'photograph')} {state} a position (EXIF), no better than the "
+                "receiver.",
+                '# For scale and datum from positions, "control" and:',
+                "# [exterior]",
+                f"# exif_sigma_m = [{east:g}, {up:g}]  # m, in the plane and of the height, where none is "
+                "stated",
+            ]
     else:
         lines += ["", "[datum]", 'kind = "control"  # the first plate, flat and true, is the datum']
         for plate in trial.plates[1:]:
@@ -301,13 +309,26 @@ def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
 def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
     kinds = _kinds_of_codes().splitlines()
     if trial.plate is not None:
-        return [*kinds, *_plate_lines(trial.plate, pitch)]
+        assumed = "pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured"
+        return [*kinds, "[targets]", *_plate_keys(trial.plate, pitch)] + ([] if pitch else [assumed])
     common = ", ".join(f"{family} {count}" for family, count in trial.counts if count) or "none"
     tried = f"# Tried on {', '.join(trial.photographs)}; codes that two of them have in common: {common}"
     lines = [tried, *kinds]
     if trial.codes == "none":
         lines += ["# No coded targets: points of natural texture take their place.", "[tie_points]"]
-        return lines + (_lattice_lines(trial.lattice, pitch) if trial.lattice and not trial.ringed else [])
+        if trial.lattice and not trial.ringed:
+            rows, columns = trial.lattice
+            lines += [
+                f"# Circles are in up to {rows} rows and {columns} columns. If they are a plate, correct "
+                "these lines",
+                "# and put them in place of [tie_points]:",
+                "# [targets]",
+                f"# codes = {_quoted(next(iter(GRIDS)))}  # or {', '.join(list(GRIDS)[1:])}",
+                f"# rows = {rows}",
+                f"# columns = {columns}",
+                f"# pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots in a row",
+            ]
+        return lines
     lines += ["[targets]", f"codes = {_quoted(trial.codes)}", f"polarity = {_quoted(trial.polarity)}"]
     if trial.fewest < TARGETS.fewest:
         shows = counted(trial.fewest, "code")
@@ -318,20 +339,6 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
     return lines
 
 
-def _lattice_lines(lattice: tuple[int, int], pitch: float | None) -> list[str]:
-    """Return commented lines for circles in rows and columns that may be a plate."""
-    rows, columns = lattice
-    return [
-        f"# Circles are in up to {rows} rows and {columns} columns. If they are a plate, correct these lines",
-        "# and put them in place of [tie_points]:",
-        "# [targets]",
-        f"# codes = {_quoted(next(iter(GRIDS)))}  # or {', '.join(list(GRIDS)[1:])}",
-        f"# rows = {rows}",
-        f"# columns = {columns}",
-        f"# pitch = {pitch or PITCH:g}  # {UNIT}, distance of neighbouring dots in a row",
-    ]
-
-
 def _kinds_of_codes() -> str:
     """Return a comment that lists the kinds of codes and plates; an ellipsis stands for more of one kind."""
     kinds: dict[str, list[str]] = {}
@@ -340,13 +347,6 @@ def _kinds_of_codes() -> str:
     codes = ", ".join(names[0] if len(names) == 1 else f"{kind}…" for kind, names in kinds.items())
     text = f"# Codes: {codes}; plates: {', '.join(PLATES)}"
     return fill(text, COMMENT_WIDTH, subsequent_indent="# ", break_on_hyphens=False)
-
-
-def _plate_lines(plate: PlateFamily, pitch: float | None) -> list[str]:
-    lines = ["[targets]", *_plate_keys(plate, pitch)]
-    if not pitch:
-        lines.append("pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured")
-    return lines
 
 
 def _plate_keys(plate: PlateFamily, pitch: float | None) -> list[str]:
@@ -402,19 +402,6 @@ def _example_lines(trial: TargetTrial) -> list[str]:
         f"# Known {known}, a table id,X,Y,Z[,sX,sY,sZ] beside this file:",
         "# [control]",
         '# file = "control.csv"',
-    ]
-
-
-def _position_lines(positions: int) -> list[str]:
-    """Return commented lines that show how to use the EXIF positions of so many photographs."""
-    east, _, up = USUAL_SIGMAS_M
-    state = agreeing(positions, "states|state")
-    return [
-        "#",
-        f"# {counted(positions, 'photograph')} {state} a position (EXIF), no better than the receiver.",
-        '# For scale and datum from positions, "control" and:',
-        "# [exterior]",
-        f"# exif_sigma_m = [{east:g}, {up:g}]  # m, in the plane and of the height, where none is stated",
     ]
 
 

@@ -260,11 +260,12 @@ def _decided(seen: _Seen) -> TargetTrial:
     coded = seen.is_coded and not seen.plates
     measured = seen.measure(best) if coded and best in RING_NAMES else seen.measured or seen.plain
     unknown = not coded and not seen.plates
+    name_of = corner_name if isinstance(code_family(best), TagFamily) else str
     blur = np.concatenate([targets.blur for targets in measured])
     return TargetTrial(
         best if coded else seen.plates[0].name if seen.plates else "none",
         _polarity(measured) if coded else "auto",
-        tuple(_name(code, best) for code in counts[best]) if coded else (),
+        tuple(map(name_of, counts[best])) if coded else (),
         tuple(sorted(((family, len(codes)) for family, codes in counts.items()), key=lambda row: -row[1])),
         float(np.median([targets.is_circle.sum() for targets in measured])),
         float(np.median(blur)) if len(blur) else float("nan"),
@@ -396,22 +397,15 @@ def _shared_family(read: Sequence[Tags]) -> tuple[str, str]:
 
     Where two dictionaries read as many tags, the smaller one is right: chance reads fewer of its tags.
     """
-    repeated = {
-        family: _shared_numbers([tags.get(family, NO_TAGS)[0] for tags in read])
-        for family in LARGEST_DICTIONARIES
-    }
+    repeated = {}
+    for family in LARGEST_DICTIONARIES:
+        numbers = [np.unique(tags.get(family, NO_TAGS)[0]) for tags in read]
+        number, times = np.unique(np.concatenate(numbers), return_counts=True)
+        repeated[family] = number[times > 1]
     largest = max(repeated, key=lambda name: (len(repeated[name]), -tag_family(name).count))
     if not len(repeated[largest]):
         return "", ""
     return smallest_dictionary(largest, repeated[largest]), largest
-
-
-def _shared_numbers(photographs: Sequence[IntArray]) -> IntArray:
-    """Return the numbers that at least two photographs have."""
-    number, times = np.unique(
-        np.concatenate([np.unique(numbers) for numbers in photographs]), return_counts=True
-    )
-    return np.asarray(number[times > 1])
 
 
 def _dot_plate(plain: Sequence[Targets], others: Sequence[Path], files: _Files) -> PlateFamily | None:
@@ -473,7 +467,7 @@ def _look(grey: AnyArray) -> _Look:
     if (
         shows_a_lattice(few.xy)
         or _shows_rings(reduced, few)
-        or any(map(_shows_concentric_tags, (small, middle, reduced)))
+        or any(any(map(len, read_resolved(picture).values())) for picture in (small, middle, reduced))
     ):
         return _Look(True, circles, tags)
     part = part_of_checkerboard(grey)
@@ -486,11 +480,6 @@ def _shows_rings(picture: AnyArray, targets: Targets) -> bool:
     """Return whether a picture shows codes of a family of rings."""
     reader = _ring_reader(picture, targets)
     return any((_read_rings(family, reader).code >= 0).sum() >= MIN_CODES for family in (*RINGS, *NECKLACES))
-
-
-def _shows_concentric_tags(picture: AnyArray) -> bool:
-    """Return whether a picture shows a concentric tag."""
-    return any(len(codes) for codes in read_resolved(picture).values())
 
 
 def _read_spread(
@@ -531,7 +520,3 @@ def _polarity(photographs: Sequence[Targets]) -> str:
     """Return the polarity of the coded targets, "auto" if there are both."""
     polarities = {int(p) for targets in photographs for p in targets.polarity[targets.code >= 0]}
     return {-1: "dark", 1: "bright"}[polarities.pop()] if len(polarities) == 1 else "auto"
-
-
-def _name(code: int, family: str) -> str:
-    return corner_name(code) if isinstance(code_family(family), TagFamily) else str(code)

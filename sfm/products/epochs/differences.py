@@ -348,14 +348,14 @@ class Epoch:
         if not len(self.control) and result.datum == "control":
             object.__setattr__(self, "control", given.control)
         if not self.interior and len(given.interior):
-            object.__setattr__(self, "interior", tuple(_interior_of(result)))
-
-
-def _interior_of(result: Solution) -> Iterator[tuple[str, str, float, float]]:
-    """Yield camera, parameter, value and standard deviation of the observed interior parameters."""
-    seen, cameras = result.network.interior, result.estimate.cameras
-    for a, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
-        yield cameras[a].owner_of(s), cameras[a].names[s], float(value), float(sigma)
+            seen, cameras = given.interior, result.estimate.cameras
+            interior = tuple(
+                (cameras[a].owner_of(s), cameras[a].names[s], float(value), float(sigma))
+                for a, s, value, sigma in zip(
+                    seen.camera, seen.parameter, seen.value, seen.sigma, strict=True
+                )
+            )
+            object.__setattr__(self, "interior", interior)
 
 
 Observed = tuple[list[tuple[int, float]], float, float]  # gradient by column, standard deviation, value

@@ -262,9 +262,9 @@ def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
     keys: dict[str, None] = {}
     for k, single in enumerate(alone):
         for key, (_, value) in single.given.items():
-            for other in alone[:k]:
-                if key in other.given and _same(other.given[key][1], value):
-                    keys[f"{key} = {value:.12g}"] = None
+            earlier = [other.given[key][1] for other in alone[:k] if key in other.given]
+            if any(abs(a - value) <= MAX_SAME_DIFFERENCE * max(abs(a), 1.0) for a in earlier):
+                keys[f"{key} = {value:.12g}"] = None
     return tuple(keys)
 
 
@@ -332,7 +332,3 @@ def _describe_change(camera: SharedCamera, alone: Sequence[_Alone]) -> str:
         f"{camera.critical:.3g}; {which} of {where} differs by {worst:.1f} standard deviations. Analyse the "
         "epochs without --together, each with a separate interior orientation"
     )
-
-
-def _same(a: float, b: float) -> bool:
-    return abs(a - b) <= MAX_SAME_DIFFERENCE * max(abs(a), 1.0)

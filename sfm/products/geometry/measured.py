@@ -151,13 +151,14 @@ class MeasuredPoints:
         if self.covariance is None:
             return np.full((q, q), np.nan)
         points = np.unique(np.concatenate([function.points for function in functions]))
-        J = np.vstack([self._spread(function, points) for function in functions])
+        J = np.zeros((q, 3 * len(points)))
+        first = 0
+        for function in functions:
+            columns = coordinates_of(np.searchsorted(points, function.points))
+            rows = J[first : first + len(function.value)]
+            np.add.at(rows.T, columns, function.jacobian.T)
+            first += len(function.value)
         return np.asarray(J @ self.covariance_of(points) @ J.T)
-
-    def _spread(self, function: Function, points: IntArray) -> FloatArray:
-        J = np.zeros((len(function.value), 3 * len(points)))
-        np.add.at(J.T, coordinates_of(np.searchsorted(points, function.points)), function.jacobian.T)
-        return J
 
     def depends_on_datum(self, function: Function) -> BoolArray:
         """Return which values depend on the datum, because a motion of the whole changes them, (q,)."""

@@ -7,7 +7,7 @@ achieved precision is compared with the prediction.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -310,7 +310,12 @@ def write_simulation(
     network, truth = plan.simulated(seed)
     if codes is None:
         targets = ["[observations]", 'file = "image_points.csv"']
-        _write(folder / "image_points.csv", IMAGE_POINTS, _image_points(network))
+        seen = network.image_points
+        rows = (
+            (network.images[i], network.points[j], *xy, *np.sqrt(np.diagonal(C)).tolist())
+            for i, j, xy, C in zip(seen.image, seen.point, seen.xy.tolist(), seen.covariance, strict=True)
+        )
+        _write(folder / "image_points.csv", IMAGE_POINTS, rows)
     else:
         targets = ["[targets]", 'polarity = "dark"', f'codes = "{codes}"']
         _write_photographs(plan, folder, truth.points, codes, seed)
@@ -328,15 +333,15 @@ def write_simulation(
         lines += ["[[scale_bar]]", f"from = {ends[0]}", f"to = {ends[1]}"]
         lines += [f"length = {float(length)!r}", f"sigma = {float(sigma)!r}"]
     for kind, of in TABLES.items():
-        rows = [
+        of_kind = [
             row
             for observations in network.observations
             if type(observations) is of
             for row in observations.table_rows(network)
         ]
-        if rows:
+        if of_kind:
             file = f"{kind.replace(' ', '_')}.csv"
-            _write(folder / file, (*of.texts, *of.columns()), rows)
+            _write(folder / file, (*of.texts, *of.columns()), of_kind)
             lines += ["[[survey_observations]]", f'kind = "{kind}"', f'file = "{file}"']
     lines += ["[datum]", 'kind = "free"', "[compare]", 'backend = "none"']
     path = folder / "survey.toml"
@@ -346,13 +351,6 @@ def write_simulation(
 
 def _write(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     path.write_text(csv_text(header, rows), encoding="utf-8", newline="")
-
-
-def _image_points(network: Network) -> Iterator[tuple[object, ...]]:
-    """Yield the rows of measured image points."""
-    seen = network.image_points
-    for i, j, xy, C in zip(seen.image, seen.point, seen.xy.tolist(), seen.covariance, strict=True):
-        yield network.images[i], network.points[j], *xy, *np.sqrt(np.diagonal(C)).tolist()
 
 
 def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes: str, seed: int) -> None:

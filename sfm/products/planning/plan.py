@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -232,22 +233,15 @@ def _remarks(plan: Plan) -> Iterator[Remark]:
     uncoded = [s.station for s in plan.shots if s.coded < MIN_CODES]
     if uncoded:
         yield remark("plan_has_few", photographs=uncoded, needed=MIN_CODES)
-    assumed = _assumptions(plan)
-    if assumed:
-        yield remark("plan_assumes", assumed=assumed)
-
-
-def _assumptions(plan: Plan) -> list[str]:
-    """Return what the plan assumes where it states nothing."""
-    p = plan.prediction
-    assumed = {
+    unstated = {
         "known scale": p.adjustment.expected_defect == MOTIONS,
         "no surface": p.planned.mesh is None,
         "no normals": bool(np.isnan(p.planned.normals).any()),
         "precision of targets": plan.seeing.sigma_px is None,
         "no depth of field": plan.seeing.depth is None,
     }
-    return [name for name, is_assumed in assumed.items() if is_assumed]
+    if any(unstated.values()):
+        yield remark("plan_assumes", assumed=list(compress(unstated, unstated.values())))
 
 
 @dataclass(frozen=True)

@@ -154,23 +154,19 @@ def sight_of(
     visibility = np.empty((m, n), dtype=np.uint8)
     xy, covariance = np.empty((m, n, 2)), np.empty((m, n, 2, 2))
     diameter = np.empty((m, n))
-    hidden: dict[bytes, BoolArray] = {}
+    hidden: dict[bytes, BoolArray] = {}  # or turned away
     for i in range(m):
         key = position[i].tobytes()  # photographs of one station that differ in their roll
         if key not in hidden:
-            hidden[key] = _turned_away_or_hidden(planned, position[i])
+            away = planned.normals * (position[i] - planned.xyz)
+            turned = away.sum(axis=1) <= 0  # NaN for an unknown normal: not turned away
+            if planned.tree is not None:
+                turned |= hidden_points(planned.tree, position[i], planned.xyz)
+            hidden[key] = turned
         visibility[i], xy[i], covariance[i], diameter[i] = _photograph(
             planned, camera, position[i], rotation[i], seeing, hidden[key]
         )
     return Sight(visibility, xy, covariance, diameter)
-
-
-def _turned_away_or_hidden(planned: PlannedObject, position: FloatArray) -> BoolArray:
-    away = planned.normals * (position - planned.xyz)
-    turned = away.sum(axis=1) <= 0  # NaN for an unknown normal: not turned away
-    if planned.tree is not None:
-        turned |= hidden_points(planned.tree, position, planned.xyz)
-    return np.asarray(turned)
 
 
 def _photograph(

@@ -332,7 +332,10 @@ def photograph_paths(network: Network, estimate: Estimate, folder: Path) -> list
     """
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}; the photographs of the model were needed")
-    paths = [_path_in(folder, name) for name in network.images]
+    paths = [folder / name for name in network.images]
+    for name, path in zip(network.images, paths, strict=True):
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise SurveyFileError(f"{folder}: photograph '{name}' of the model is outside this folder")
     lost = [i for i in np.flatnonzero(estimate.oriented) if not paths[i].is_file()]
     if lost:
         more = f", and {len(lost) - 1} more are not" if len(lost) > 1 else ""
@@ -358,11 +361,3 @@ def read_of_size(path: Path, name: str, size_px: tuple[int, int], *, channel: st
             f"{name}: {photograph.shape[1]} x {photograph.shape[0]} px, its camera has {width} x {height} px"
         )
     return photograph
-
-
-def _path_in(folder: Path, name: str) -> Path:
-    """Return the path of a photograph, which must be inside the folder."""
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise SurveyFileError(f"{folder}: photograph '{name}' of the model is outside this folder")
-    return path

@@ -187,7 +187,10 @@ def read_scene(path: Path) -> Staging:
     marks: list[Marks] = []
     targets: list[tuple[int, float, float, float, int]] = []
     for k, face in enumerate(file.face):
-        marks += [_rectangle(k, rectangle) for rectangle in face.rectangle]
+        for rectangle in face.rectangle:
+            centre, half = np.array([rectangle.centre]), np.array([rectangle.size]) / 2
+            turn, value = np.array([np.radians(rectangle.turn_deg)]), np.array([rectangle.reflectance])
+            marks.append(rectangles(k, centre, half, turn, value))
         marks += [_printed_lines(k, printed, rng) for printed in face.print]
         for grid in face.grid:
             _place_grid(path, k, face.name, grid, family, marks, targets)
@@ -237,12 +240,6 @@ def _faces(given: list[_Face]) -> Faces:
         np.array([face.texture for face in given]),
         np.array([face.grain for face in given]),
     )
-
-
-def _rectangle(face: int, rectangle: _Rectangle) -> Marks:
-    half = np.array([rectangle.size]) / 2
-    turn, value = np.array([np.radians(rectangle.turn_deg)]), np.array([rectangle.reflectance])
-    return rectangles(face, np.array([rectangle.centre]), half, turn, value)
 
 
 def _printed_lines(face: int, printed: _Print, rng: np.random.Generator) -> Marks:

@@ -153,8 +153,9 @@ def draw_photograph(
 
     adjustment = solved if isinstance(solved, Adjustment) else None
     network = solved.network if isinstance(solved, Adjustment) else solved
-    rows, names = _image_points(photograph.image, network)
-    seen = network.image_points.xy[rows]
+    i = network.images.index(photograph.image) if photograph.image in network.images else -1
+    rows = np.flatnonzero(network.image_points.image == i)
+    seen, points = network.image_points.xy[rows], network.image_points.point[rows]
     rejected = np.zeros(len(rows), dtype=bool) if adjustment is None else adjustment.rejected[rows]
     colour = [DROPPED if dropped else USED for dropped in rejected]
     owner = nearest_image_points(photograph.xy, seen)
@@ -169,12 +170,13 @@ def draw_photograph(
         # The vector points from the measured to the adjusted position: v = computed - measured.
         ends = seen + factor / scale * adjustment.residuals[rows]
         finite = np.isfinite(ends).all(axis=1)  # a rejected point behind the camera has no residual
-        _arrows(picture, seen[finite], ends[finite], scale, thickness=1 if crowded else 2)
+        lines = np.stack([_drawn(seen[finite], scale), _drawn(ends[finite], scale)], axis=1)
+        cv2.polylines(picture, list(lines), False, ARROW, 1 if crowded else 2, cv2.LINE_AA, SHIFT)
     # a crowd is of natural texture, whose numbers mean nothing; what has a name is still found by it
-    labelled = network.named[network.image_points.point[rows]] if crowded else np.ones(len(rows), dtype=bool)
+    labelled = network.named[points] if crowded else np.ones(len(rows), dtype=bool)
     if labelled.sum() <= MAX_NAMED_POINTS:
         for k in np.flatnonzero(labelled).tolist():
-            _label(picture, names[k], seen[k], scale, colour[k])
+            _label(picture, network.points[points[k]], seen[k], scale, colour[k])
     return picture
 
 
@@ -202,14 +204,6 @@ def overlay_names(images: tuple[str, ...]) -> tuple[str, ...]:
         taken.add(name.lower())
         names.append(name)
     return tuple(names)
-
-
-def _image_points(image: str, network: Network) -> tuple[IntArray, tuple[str, ...]]:
-    """Return rows of the image points of one photograph, and the names of their points."""
-    if image not in network.images:
-        return np.zeros(0, dtype=np.int64), ()
-    rows = np.flatnonzero(network.image_points.image == network.images.index(image))
-    return rows, tuple(network.points[j] for j in network.image_points.point[rows])
 
 
 def nearest_image_points(xy: FloatArray, measured: FloatArray) -> IntArray:
@@ -266,11 +260,6 @@ def _crosses(picture: AnyArray, xy: FloatArray, flag: IntArray, scale: float) ->
         strokes = np.array([[[-arm, -arm], [arm, arm]], [[-arm, arm], [arm, -arm]]], dtype=np.int32)
         lines = (at[flag == value][:, None, None] + strokes).reshape(-1, 2, 2)
         cv2.polylines(picture, list(lines), False, colour, 1, cv2.LINE_AA, SHIFT)
-
-
-def _arrows(picture: AnyArray, starts: FloatArray, ends: FloatArray, scale: float, *, thickness: int) -> None:
-    lines = np.stack([_drawn(starts, scale), _drawn(ends, scale)], axis=1)
-    cv2.polylines(picture, list(lines), False, ARROW, thickness, cv2.LINE_AA, SHIFT)
 
 
 def _label(picture: AnyArray, name: str, xy: FloatArray, scale: float, colour: tuple[int, ...]) -> None:
@@ -355,7 +344,12 @@ def draw_patches(
     """
     zoom = max(ZOOM, math.ceil(PANEL / template_px))
     drawn = min(len(matches), MAX_PICTURES)
-    lines = [_caption(names[k], matches, k) for k in range(drawn)]
+    lines = []
+    for k in range(drawn):
+        r = float(matches.correlation[k])
+        line = f"{names[k]}  r {r:.4f}" if math.isfinite(r) else names[k]
+        line += f"  not matched: {matches.reason[k]}" if matches.reason[k] else ""
+        lines.append(line[:MAX_LETTERS].encode("ascii", "replace").decode())  # that OpenCV can draw
     last = f"the first {drawn} of {len(matches)} points" if drawn < len(matches) else ""
     width = max(3 * zoom * template_px + 2 * GAP, LETTER * max(len(line) for line in [*lines, last]))
     rows = []
@@ -390,14 +384,6 @@ def _panels(
         big = cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_NEAREST)
         row += [big, np.full((len(big), GAP), 255, np.uint8)]
     return [np.hstack(row[:-1])]
-
-
-def _caption(name: str, matches: ConjugatePoints, k: int) -> str:
-    """Return name, r and reason in characters that OpenCV can draw."""
-    r = float(matches.correlation[k])
-    what = f"{name}  r {r:.4f}" if math.isfinite(r) else name
-    line = f"{what}  not matched: {matches.reason[k]}" if matches.reason[k] else what
-    return line[:MAX_LETTERS].encode("ascii", "replace").decode()
 
 
 def _text(line: str, width: int) -> AnyArray:

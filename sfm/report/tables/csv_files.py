@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.judgement.bundle_statistics import Statistics
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import base_name
-from sfm.model.conventions import FloatArray
 from sfm.model.distortion.brown import (
     BALANCED,
     BALANCED_MODEL,
@@ -28,7 +27,6 @@ from sfm.model.distortion.brown import (
     to_balanced,
 )
 from sfm.model.errors import GeometryError
-from sfm.model.network import Network
 from sfm.model.observation_residuals import given_rows
 from sfm.model.solution import MEASURED
 from sfm.report.findings import Findings
@@ -153,17 +151,18 @@ def reliability_rows(adjustment: Adjustment, statistics: Statistics) -> Iterable
     )
     checked = a.redundancy_numbers > MIN_CHECKED_REDUNDANCY
     error = np.where(checked, a.residuals / np.where(checked, a.redundancy_numbers, 1.0), np.nan)
-    for names, values, rejected in zip(
-        _names(network), _listed((*tests, a.weights, error)), a.rejected.tolist(), strict=True
-    ):
-        yield (*names, *values[:-2], int(rejected), *values[-2:])
-
-
-def _names(network: Network) -> Iterator[tuple[str, str]]:
-    """Yield photograph and point of every image point."""
     seen = network.image_points
-    for image, point in zip(seen.image.tolist(), seen.point.tolist(), strict=True):
-        yield network.images[image], network.points[point]
+    columns = (*tests, a.weights, error)
+    for first in range(0, len(seen), BLOCK):
+        part = slice(first, first + BLOCK)
+        for i, j, values, rejected in zip(
+            seen.image[part].tolist(),
+            seen.point[part].tolist(),
+            np.column_stack([column[part] for column in columns]).tolist(),
+            a.rejected[part].tolist(),
+            strict=True,
+        ):
+            yield (network.images[i], network.points[j], *values[:-2], int(rejected), *values[-2:])
 
 
 def component_rows(statistics: Statistics) -> Iterable[Sequence[Any]]:
@@ -198,9 +197,3 @@ def _exterior_correlation_rows(findings: Findings) -> Iterable[Sequence[object]]
     for c, (parameter, camera) in enumerate(correlations.parameters):
         for image, rho in zip(correlations.images, correlations.rho[:, :, c], strict=True):
             yield (camera.removeprefix("camera "), parameter, image, *rho)
-
-
-def _listed(columns: Sequence[FloatArray]) -> Iterator[list[float]]:
-    """Yield the values of every image point in columns (k,) or (k, 2), block by block."""
-    for first in range(0, len(columns[0]), BLOCK):
-        yield from np.column_stack([column[first : first + BLOCK] for column in columns]).tolist()

@@ -7,7 +7,7 @@ page contain what does not fit in it: every photograph, and its crops as the cel
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -149,9 +149,14 @@ def _cut(
     frames: dict[int, tuple[float, float, float, int]] = {}
     cells = []
     scale = grey.shape[1] / width_px  # below 1 if a smaller picture replaces the photograph
-    for k, (left, top, side) in zip(
-        rows.tolist(), _frames(scene, rows, grey.shape, scale).tolist(), strict=True
-    ):
+    # first column, first row and side of the crops of rays, px, inside the picture
+    semi = scene.rays.ellipse[rows, 0]
+    across = np.where(np.isfinite(semi), 2 * semi * CROP_DIAMETERS, SIDE_PX)
+    sides = np.minimum(np.rint(scale * np.clip(across, MIN_SIDE_PX, MAX_SIDE_PX)), min(grey.shape[:2]))
+    corner = np.rint(scale * (scene.rays.xy[rows] + 0.5) - sides[:, None] / 2)
+    corner = np.clip(corner, 0, np.array(grey.shape[1::-1]) - sides[:, None])
+    windows = np.column_stack([corner, sides]).astype(np.int64).tolist()
+    for k, (left, top, side) in zip(rows.tolist(), windows, strict=True):
         patch = grey[top : top + side, left : left + side]
         if side > CROP_PX:
             patch = cv2.resize(patch, (CROP_PX, CROP_PX), interpolation=cv2.INTER_AREA)
@@ -170,16 +175,6 @@ def _cut(
         frames,
         _sheet(cells) if cells else b"",
     )
-
-
-def _frames(scene: ViewerScene, rows: IntArray, shape: tuple[int, ...], scale: float) -> IntArray:
-    """Return first column, first row and side of the crops of rays, px, inside the picture, (k, 3)."""
-    semi = scene.rays.ellipse[rows, 0]
-    wanted = np.where(np.isfinite(semi), 2 * semi * CROP_DIAMETERS, SIDE_PX)
-    side = np.minimum(np.rint(scale * np.clip(wanted, MIN_SIDE_PX, MAX_SIDE_PX)), min(shape[:2]))
-    corner = np.rint(scale * (scene.rays.xy[rows] + 0.5) - side[:, None] / 2)
-    corner = np.clip(corner, 0, np.array(shape[1::-1]) - side[:, None])
-    return np.column_stack([corner, side]).astype(np.int64)
 
 
 def _sheet(patches: list[AnyArray]) -> bytes:
@@ -210,7 +205,12 @@ def _embed(
     crop_files = {i: f"crops_{names[i]}" for i, cut in read.items() if cut.cells}
     content = {name: read[i].file for i, name in files.items()}
     content |= {name: read[i].cells for i, name in crop_files.items()}
-    shown = list(_shown_crops(read.values(), kept))
+    shown = [  # image point, frame, place in the page and cell in its file
+        (k, frame, kept.get(k, (0, 0)), cell)
+        for cut in read.values()
+        for cell, (k, frame) in enumerate(cut.frames.items())
+        if k in kept or cut.cells
+    ]
     rays = sum(len(cut.frames) for cut in read.values())
     return Pictures(
         store.text(),
@@ -232,16 +232,6 @@ def _paths(folder: str, names: Mapping[int, str], count: int) -> tuple[str, ...]
     """Return the path of the file of each photograph from the page, "" without a file."""
     below = f"{folder}/" if folder else ""
     return tuple(f"{below}{names[i]}" if i in names else "" for i in range(count))
-
-
-def _shown_crops(
-    cuts: Iterable[_Cut], kept: Mapping[int, tuple[int, int]]
-) -> Iterator[tuple[int, tuple[float, float, float, int], tuple[int, int], int]]:
-    """Yield image point, frame, place in the page and cell in its file of each crop that the viewer shows."""
-    for cut in cuts:
-        for cell, (k, frame) in enumerate(cut.frames.items()):
-            if k in kept or cut.cells:
-                yield k, frame, kept.get(k, (0, 0)), cell
 
 
 def _notes_of(read: int, m: int, views: int, crops: int, rays: int, beside: bool) -> list[str]:

@@ -15,7 +15,7 @@ from scipy.special import gammaln
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.errors import GeometryError
-from sfm.orientation.resection.least_squares import UNKNOWNS, Resection, pose_normals, resect_least_squares
+from sfm.orientation.resection.least_squares import UNKNOWNS, pose_normals, resect_least_squares
 from sfm.orientation.resection.ransac import SAMPLE, RobustResection, resect_robust
 
 # Tolerances to try, tangents: from a tenth of the principal distance to below the precision of any camera.
@@ -67,17 +67,20 @@ def _refine(
     """Return the orientation by least squares over the correct points, and ln of its likelihood."""
     residuals = start.residuals
     used, likelihood = _select_points(residuals, field)
+    weights = np.ascontiguousarray(np.broadcast_to(np.eye(2), (len(uv), 2, 2)))
     X0, R, fitted = start.position, start.rotation, None
     for _ in range(ROUNDS):
         try:
             trial = resect_least_squares(uv[used], xyz[used], X0, R)
         except GeometryError:
             break
-        trial_residuals, trial_N = _residuals_and_normals(uv, xyz, used, trial)
-        selected, trial_likelihood = _select_points(trial_residuals, field)
+        # v: residuals of all points, tangents, NaN behind the camera; N of the used points
+        trial_N, g, v = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty((len(uv), 2))
+        pose_normals(uv, xyz, weights, used, trial.position, trial.rotation, trial_N, g, v)
+        selected, trial_likelihood = _select_points(v, field)
         if fitted is not None and trial_likelihood <= likelihood:
             break
-        fitted, residuals, likelihood, N = trial, trial_residuals, trial_likelihood, trial_N
+        fitted, residuals, likelihood, N = trial, v, trial_likelihood, trial_N
         X0, R = trial.position, trial.rotation
         inliers, used = used, selected
         if (inliers == selected).all():
@@ -120,16 +123,3 @@ def _select_points(residuals: FloatArray, field: float) -> tuple[BoolArray, floa
     used = np.zeros(n, dtype=bool)
     used[order[: k[at]]] = True
     return used, float(likelihood[at])
-
-
-def _residuals_and_normals(
-    uv: FloatArray, xyz: FloatArray, used: BoolArray, resection: Resection
-) -> tuple[FloatArray, FloatArray]:
-    """Return residuals of all points, tangents, NaN behind the camera, (n, 2), and N of the used points."""
-    n = len(uv)
-    N, residuals = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((n, 2))
-    weights = np.ascontiguousarray(np.broadcast_to(np.eye(2), (n, 2, 2)))
-    pose_normals(
-        uv, xyz, weights, used, resection.position, resection.rotation, N, np.empty(UNKNOWNS), residuals
-    )
-    return residuals, N
