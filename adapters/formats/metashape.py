@@ -199,7 +199,12 @@ def _camera(sensor: Node) -> Camera:
         values = _opencv_values(p, size)
         names = OPENCV_PARAMETERS
     else:
-        model, values, names = "brown_forward_affine", _brown_values(p, pixel), BROWN_PARAMETERS
+        model, names = "brown_forward_affine", BROWN_PARAMETERS
+        c = p["f"] * pixel[1]
+        values = {"x0": p["cx"] * pixel[0], "y0": -p["cy"] * pixel[1]}
+        values |= {"b1": (p["f"] + p["b1"]) * pixel[0] / c - 1, "b2": -p["b2"] * pixel[0] / c}
+        values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
+        values |= {"P1": p["p1"] / c, "P2": -p["p2"] / c}
     freed = [name for tag in CALIBRATION if tag in free for name in names.get(tag, ())]
     has = MODELS[model].names
     return camera_from_values(
@@ -241,15 +246,6 @@ def _opencv_values(p: dict[str, float], size_px: tuple[int, int]) -> dict[str, f
         "p1": p["p2"],
         "p2": p["p1"],
     }
-
-
-def _brown_values(p: dict[str, float], pixel_mm: tuple[float, ...]) -> dict[str, float]:
-    """Return the parameters of `brown_forward_affine` from a calibration, except c."""
-    c = p["f"] * pixel_mm[1]
-    values = {"x0": p["cx"] * pixel_mm[0], "y0": -p["cy"] * pixel_mm[1]}
-    values |= {"b1": (p["f"] + p["b1"]) * pixel_mm[0] / c - 1, "b2": -p["b2"] * pixel_mm[0] / c}
-    values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
-    return values | {"P1": p["p1"] / c, "P2": -p["p2"] / c}
 
 
 def _sensor_lines(number: int, camera: Camera) -> list[str]:

@@ -56,7 +56,13 @@ def read_result(folder: Path) -> Solution:
         SurveyFileError: with file and line number.
     """
     refuse_links_out(folder, COLMAP_SIDE_FILE)
-    summary = _summary(folder / "summary.json")
+    path = folder / "summary.json"
+    if not path.exists():
+        raise SurveyFileError(f"{folder}: not the folder of a result, {path.name} is missing")
+    summary = read_json(path, _Summary, "the summary of a result")
+    for name, count in Counter(camera.name for camera in summary.cameras).items():
+        if count > 1:
+            raise SurveyFileError(f"{path}: camera '{name}' is a duplicate")
     cameras, sigmas = _cameras(folder, summary)
     names = [camera.name for camera in cameras]
     table = tables.IMAGES.read(folder)
@@ -364,18 +370,6 @@ class _Summary(Json):
     cameras: Annotated[tuple[_CameraEntry, ...], Field(min_length=1)]
     sources: tuple[_SourceEntry, ...] = ()
     verdict: _VerdictEntry | None = None
-
-
-def _summary(path: Path) -> _Summary:
-    """Read the summary, which must not contain a camera twice."""
-    if not path.exists():
-        raise SurveyFileError(f"{path.parent}: not the folder of a result, {path.name} is missing")
-    summary = read_json(path, _Summary, "the summary of a result")
-    names = [camera.name for camera in summary.cameras]
-    for name, count in Counter(names).items():
-        if count > 1:
-            raise SurveyFileError(f"{path}: camera '{name}' is a duplicate")
-    return summary
 
 
 def _cameras(folder: Path, summary: _Summary) -> tuple[tuple[Camera, ...], tuple[FloatArray, ...]]:

@@ -84,6 +84,7 @@ def page(plan: Plan) -> Page:
         "was given, the nearest and the farthest point are equally sharp."
     )
     rows = [(name[0].upper() + name[1:], value) for name, value in figures(plan)]
+    calibrations = [part for c in plan.calibrations for part in _calibration(c, p.cameras)]
     return Page(
         "plan",
         "Plan of a network",
@@ -93,7 +94,7 @@ def page(plan: Plan) -> Page:
             Section("Figures", facts(rows), prediction),
             Section("Photographs", Table(columns, shot_rows(plan.shots)), axis),
             Section("Weak points", *_weak(plan)),
-            Section("Camera", *_camera(plan)),
+            Section("Camera", *(calibrations or [Paragraph("The interior orientation is held fixed.")])),
             Section("Rig", *_rigs(plan)),
             Section("Gain", *_gain(plan)),
             Section("Points", FoldedParts(counted(len(points.rows), "point"), points)),
@@ -200,13 +201,6 @@ def _weak(plan: Plan) -> tuple[Part, ...]:
     ]
     more = (Note(f"The worst {MAX_NAMED} of {len(plan.weak)}."),) if len(plan.weak) > MAX_NAMED else ()
     return Table(columns, rows), *more
-
-
-def _camera(plan: Plan) -> tuple[Part, ...]:
-    """Return the parts on whether the network calibrates its cameras."""
-    if not plan.calibrations:
-        return (Paragraph("The interior orientation is held fixed."),)
-    return tuple(part for c in plan.calibrations for part in _calibration(c, plan.prediction.cameras))
 
 
 def _calibration(c: Calibratability, cameras: Sequence[Camera]) -> tuple[Part, ...]:
@@ -354,6 +348,18 @@ def _summary(plan: Plan) -> dict[str, Any]:
     """Return the content of plan.json."""
     p = plan.prediction
     by_camera = {c.camera: c for c in plan.calibrations}
+    cameras = []
+    for camera in p.cameras:
+        c = by_camera.get(camera.name)
+        cameras.append(
+            values_of(camera, "name model size_px pixel_mm")
+            | {
+                "parameters": dict(zip(camera.names, camera.parameters, strict=True)),
+                "free": list(compress(camera.names, camera.free)),
+                "can_be_calibrated": None if c is None else c.good,
+                "sigma": {} if c is None else dict(zip(c.parameters, c.sigma, strict=True)),
+            }
+        )
     return {
         **values_of(plan, "name unit"),
         **verdict_of_plan(plan).as_dict(),
@@ -375,7 +381,7 @@ def _summary(plan: Plan) -> dict[str, Any]:
         },
         "coded_targets": len(plan.coded),
         **_observed(plan),
-        "cameras": [_camera_summary(camera, by_camera.get(camera.name)) for camera in p.cameras],
+        "cameras": cameras,
         "rigs": summary_of_rigs(rigs_of(p.adjustment, planned=True)),
         "contributions": [
             values_of(contribution, "name count shifts rotations scale points sigma_without sigma_with gain")
@@ -421,16 +427,6 @@ def _observed(plan: Plan) -> dict[str, Any]:
         }
         observed["mounts"].append(mount)
     return observed
-
-
-def _camera_summary(camera: Camera, c: Calibratability | None) -> dict[str, Any]:
-    return {
-        **values_of(camera, "name model size_px pixel_mm"),
-        "parameters": dict(zip(camera.names, camera.parameters, strict=True)),
-        "free": list(compress(camera.names, camera.free)),
-        "can_be_calibrated": None if c is None else c.good,
-        "sigma": {} if c is None else dict(zip(c.parameters, c.sigma, strict=True)),
-    }
 
 
 def _camera_rows(c: Calibratability, camera: Camera) -> list[tuple[str, ...]]:

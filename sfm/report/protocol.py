@@ -169,21 +169,17 @@ def _lens(camera: Camera) -> Lens:
         ]
     )
     straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
-    rays = tangents_from_pixel(camera, edge)
-    moved = np.linalg.norm(pixel_from_tangents(straight, rays) - edge, axis=1)
+    moved = np.linalg.norm(pixel_from_tangents(straight, tangents_from_pixel(camera, edge)) - edge, axis=1)
     middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])
     upright = np.array([[(width - 1) / 2, 0.0], [(width - 1) / 2, height - 1.0]])
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
-    angles = [_angle(tangents_from_pixel(camera, pair)) for pair in (middle, upright, corners)]
+    angles = []  # between the rays of opposite points, rad
+    for pair in (middle, upright, corners):
+        rays = np.concatenate([tangents_from_pixel(camera, pair), -np.ones((2, 1))], axis=1)
+        first, second = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(float(np.arccos(np.clip(first @ second, -1.0, 1.0))))
     largest = float(moved[np.isfinite(moved)].max(initial=0.0)) if np.isfinite(moved).any() else np.nan
     return Lens(camera.name, largest, np.degrees(angles))
-
-
-def _angle(tangents: FloatArray) -> float:
-    """Return the angle between two rays, rad."""
-    rays = np.concatenate([tangents, -np.ones((2, 1))], axis=1)
-    first, second = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return float(np.arccos(np.clip(first @ second, -1.0, 1.0)))
 
 
 def _cumulative(a: Adjustment) -> tuple[CumulativeTest, ...]:

@@ -27,7 +27,12 @@ def public_names(package: str, folder: str) -> Face:
     Raises:
         AttributeError: from `__getattr__`, if a name is not public.
     """
-    module_of = _modules_of_stub(package, os.path.join(folder, "__init__.pyi"))
+    module_of = {}  # module of each name that the stub imports
+    with open(os.path.join(folder, "__init__.pyi"), encoding="utf-8") as lines:
+        for line in lines:
+            if line.startswith("from "):
+                _, module_name, _, public, *_ = line.split()
+                module_of[public] = f"{package}.{public}" if module_name == "." else module_name
     names = sorted(module_of)
 
     def get(name: str) -> object:
@@ -44,14 +49,3 @@ def public_names(package: str, folder: str) -> Face:
         return value
 
     return get, lambda: list(names), names
-
-
-def _modules_of_stub(package: str, stub: str) -> dict[str, str]:
-    """Return the module of each name that a stub imports."""
-    module_of = {}
-    with open(stub, encoding="utf-8") as lines:
-        for line in lines:
-            if line.startswith("from "):
-                _, module, _, name, *_ = line.split()
-                module_of[name] = f"{package}.{name}" if module == "." else module
-    return module_of

@@ -83,7 +83,13 @@ def cameras_in_names(names: Sequence[str]) -> NamedCameras | None:
     if not proposals:
         return None
     best = max(proposals, key=lambda proposal: proposal[:3])
-    groupings = {_grouping(proposal.camera) for *rank, proposal in proposals if tuple(rank) == best[:3]}
+    groupings = set()  # sets of photographs of the cameras of each of the best proposals
+    for *rank, proposal in proposals:
+        if tuple(rank) == best[:3]:
+            of: dict[str, set[str]] = defaultdict(set)
+            for name, part in proposal.camera.items():
+                of[part].add(name)
+            groupings.add(frozenset(map(frozenset, of.values())))
     return best[3] if len(groupings) == 1 else None
 
 
@@ -246,11 +252,3 @@ def _pattern(rows: Sequence[tuple[Part, ...]], chosen: Sequence[int], k: int) ->
 
     before, group = map(expression, range(first)), map(expression, range(first, last + 1))
     return f"^{''.join(before)}({''.join(group).removesuffix('/')})"
-
-
-def _grouping(camera: Mapping[str, str]) -> frozenset[frozenset[str]]:
-    """Return the sets of photographs of each camera."""
-    of: dict[str, set[str]] = defaultdict(set)
-    for name, part in camera.items():
-        of[part].add(name)
-    return frozenset(map(frozenset, of.values()))

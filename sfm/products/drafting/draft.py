@@ -307,7 +307,12 @@ def _model_lines(camera: CameraGroup, free: Sequence[str]) -> list[str]:
 
 
 def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
-    kinds = _kinds_of_codes().splitlines()
+    names_of: dict[str, list[str]] = {}
+    for name in FAMILIES:
+        names_of.setdefault(re.split(r"[\d_]", name)[0], []).append(name)
+    codes = ", ".join(names[0] if len(names) == 1 else f"{kind}…" for kind, names in names_of.items())
+    text = f"# Codes: {codes}; plates: {', '.join(PLATES)}"
+    kinds = fill(text, COMMENT_WIDTH, subsequent_indent="# ", break_on_hyphens=False).splitlines()
     if trial.plate is not None:
         assumed = "pitch_assumed = true  # the pitch sets the scale; remove this line once it is measured"
         return [*kinds, "[targets]", *_plate_keys(trial.plate, pitch)] + ([] if pitch else [assumed])
@@ -337,16 +342,6 @@ def _target_lines(trial: TargetTrial, pitch: float | None) -> list[str]:
             "[tie_points]",
         ]
     return lines
-
-
-def _kinds_of_codes() -> str:
-    """Return a comment that lists the kinds of codes and plates; an ellipsis stands for more of one kind."""
-    kinds: dict[str, list[str]] = {}
-    for name in FAMILIES:
-        kinds.setdefault(re.split(r"[\d_]", name)[0], []).append(name)
-    codes = ", ".join(names[0] if len(names) == 1 else f"{kind}…" for kind, names in kinds.items())
-    text = f"# Codes: {codes}; plates: {', '.join(PLATES)}"
-    return fill(text, COMMENT_WIDTH, subsequent_indent="# ", break_on_hyphens=False)
 
 
 def _plate_keys(plate: PlateFamily, pitch: float | None) -> list[str]:

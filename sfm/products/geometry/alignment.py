@@ -304,7 +304,8 @@ def _refine(
         step = -pull @ d
         if not np.abs(step[3:]).max() < 1:
             break
-        T = _take_step(T, step)
+        spin, growth = rotation_from_vector(step[3:6]), 1 + (step[6] if scale else 0.0)
+        T = Similarity(T.scale * growth, spin @ T.rotation, growth * spin @ T.translation + step[:3])
         if np.abs(step[:3]).max() < CONVERGED * size and np.abs(step[3:]).max() < CONVERGED:
             break
     else:
@@ -321,13 +322,6 @@ def _refine(
     linear[:u] = -_times_blocks(pull, D.T)
     of_nominal[:u, :u] = pull @ spread @ pull.T
     return T, linear, of_nominal, omega
-
-
-def _take_step(T: Similarity, step: FloatArray) -> Similarity:
-    """Return a transformation after small shifts, rotations and a change of scale in the new system."""
-    spin = rotation_from_vector(step[3:6])
-    factor = 1 + (step[6] if len(step) > 6 else 0.0)
-    return Similarity(T.scale * factor, spin @ T.rotation, factor * spin @ T.translation + step[:3])
 
 
 def _agreeing_points(

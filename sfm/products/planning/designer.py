@@ -150,13 +150,17 @@ class _Designer:
                 break
         if short <= 1:
             chosen, prediction, short = self._remove_unneeded(chosen, prediction, short)
-        return Design(
-            prediction,
-            short,
-            bool(short <= 1),
-            "" if short <= 1 else self._limit(prediction, len(chosen)),
-            len(self.room.stations),
-        )
+        limit = ""
+        if not short <= 1:
+            j = int(np.argmax(np.where(self.seeable, prediction.sigma, -1.0)))
+            worst = f"{self.planned.names[j]} ({reason_of(prediction, j)})"
+            limit = (
+                f"where one may stand: {PATIENCE} more photographs gain less than {1 - NO_BETTER:.0%} each; "
+                f"the worst point is {worst}"
+            )
+            if len(chosen) >= self.most:
+                limit = f"the {self.most} photographs that are allowed; the worst is {worst}"
+        return Design(prediction, short, bool(short <= 1), limit, len(self.room.stations))
 
     def _cofactors(self, chosen: Sequence[int]) -> FloatArray:
         """Return the covariance of each point with the chosen photographs, (n, 3, 3)."""
@@ -251,18 +255,6 @@ class _Designer:
                 break
         return chosen, prediction, short
 
-    def _limit(self, prediction: Prediction, photographs: int) -> str:
-        if photographs >= self.most:
-            return f"the {self.most} photographs that are allowed; the worst is {self._worst(prediction)}"
-        return (
-            f"where one may stand: {PATIENCE} more photographs gain less than {1 - NO_BETTER:.0%} each; "
-            f"the worst point is {self._worst(prediction)}"
-        )
-
-    def _worst(self, prediction: Prediction) -> str:
-        j = int(np.argmax(np.where(self.seeable, prediction.sigma, -1.0)))
-        return f"{self.planned.names[j]} ({reason_of(prediction, j)})"
-
 
 @dataclass(frozen=True)
 class StationLimits:
@@ -337,8 +329,16 @@ def candidates(
         position.append(place)
         rotation.append(ways[best])
         counted += 1
+    if not inside:
+        raise GeometryError(
+            f"plan: no station is {least:g} to {most:g} from the object in the space that is allowed; needed "
+            "another distance or space"
+        )
     if counted < 2:
-        raise GeometryError(_no_room(least, most, inside))
+        raise GeometryError(
+            f"plan: of {inside} places that are allowed fewer than 2 show {MIN_POINTS} points; the object "
+            "faces away, or is too far, too oblique or not sharp from there"
+        )
     places, ways = np.array(position), np.array(rotation)
     names = tuple(f"{k + 1}" for k in range(2 * counted))
     stations = Stations(names, np.tile(places, (2, 1)), np.concatenate([ways, roll_rotations(ways)]))
@@ -375,18 +375,6 @@ def _room(planned: PlannedObject, allowed: StationLimits, most: float) -> tuple[
             "needed a space that reaches the object"
         )
     return low, high
-
-
-def _no_room(least: float, most: float, inside: int) -> str:
-    if not inside:
-        return (
-            f"plan: no station is {least:g} to {most:g} from the object in the space that is allowed; needed "
-            "another distance or space"
-        )
-    return (
-        f"plan: of {inside} places that are allowed fewer than 2 show {MIN_POINTS} points; the object faces "
-        "away, or is too far, too oblique or not sharp from there"
-    )
 
 
 def _halton(count: int) -> FloatArray:

@@ -127,10 +127,13 @@ def object_of_mesh(
             f"mesh: {counted(edges, 'edge')} of one triangle only: it has holes, or is an open "
             "surface, through which points would be seen from behind; close it, or use --open-mesh"
         )
-    reversed_ = _reversed_edges(mesh)
-    if reversed_:
+    ends = _edges(mesh)
+    _, of, uses = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    along = np.bincount(of.reshape(-1), weights=ends[:, 0] < ends[:, 1], minlength=len(uses))
+    alike = int(((uses == 2) & (along != 1)).sum())  # both triangles run through them in one direction
+    if alike:
         raise GeometryError(
-            f"mesh: at {counted(reversed_, 'edge')} neighbouring triangles run in opposite directions, so "
+            f"mesh: at {counted(alike, 'edge')} neighbouring triangles run in opposite directions, so "
             "that inside and outside are not known; turn its triangles to run alike"
         )
     corners = mesh.vertices[mesh.triangles]
@@ -204,14 +207,6 @@ def open_edges(mesh: Mesh) -> int:
     """Return the number of edges that belong to only one triangle; coincident vertices count as one."""
     _, count = np.unique(np.sort(_edges(mesh), axis=1), axis=0, return_counts=True)
     return int((count == 1).sum())
-
-
-def _reversed_edges(mesh: Mesh) -> int:
-    """Return the number of edges that both of their triangles run through in the same direction."""
-    edges = _edges(mesh)
-    _, of, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    along = np.bincount(of.reshape(-1), weights=edges[:, 0] < edges[:, 1], minlength=len(count))
-    return int(((count == 2) & (along != 1)).sum())
 
 
 def _edges(mesh: Mesh) -> IntArray:

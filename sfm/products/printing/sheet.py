@@ -324,19 +324,11 @@ def _svg(sheet: Sheet, k: int) -> str:
 HELVETICA_WIDTH = 0.5
 
 
-def _pdf_text(words: str) -> str:
-    """Return words as the inside of a PDF string in WinAnsiEncoding, with ? for characters it does not have.
-
-    Source: ISO 32000-1:2008, sec. 7.3.4.2 (literal strings) and annex D.2 (Windows code page 1252).
-    """
-    known = words.encode("cp1252", "replace").decode("cp1252")
-    return "".join(f"\\{letter}" if letter in "\\()" else letter for letter in known)
-
-
 def _pdf(sheet: Sheet) -> bytes:
     """Return the sheet as PDF 1.4 with one content stream per page.
 
-    Source: ISO 32000-1:2008, secs. 7.5 (file structure), 8.5 (paths), 9.4 (text).
+    Source: ISO 32000-1:2008, secs. 7.3.4.2 (literal strings), 7.5 (file structure), 8.5 (paths), 9.4 (text),
+    annex D.2 (WinAnsiEncoding: Windows code page 1252).
     """
     width, height = sheet.size_mm
     scale = POINTS_PER_INCH / MM_PER_INCH
@@ -352,7 +344,9 @@ def _pdf(sheet: Sheet) -> bytes:
         lines.append("0 g")
         for x, y, size, words in _texts(sheet, k):
             left = x - HELVETICA_WIDTH * size * len(words) / 2
-            lines.append(f"BT /F {size:g} Tf {left:.3f} {y:.3f} Td ({_pdf_text(words)}) Tj ET")
+            known = words.encode("cp1252", "replace").decode("cp1252")  # ? for other characters
+            escaped = "".join(f"\\{letter}" if letter in "\\()" else letter for letter in known)
+            lines.append(f"BT /F {size:g} Tf {left:.3f} {y:.3f} Td ({escaped}) Tj ET")
         streams.append("\n".join(lines).encode("cp1252"))
     n = len(streams)
     kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(n))

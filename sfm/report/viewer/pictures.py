@@ -165,6 +165,10 @@ def _cut(
             crops[k] = jpeg_of(patch, CROP_QUALITY)
         if with_files and with_cells:
             cells.append(patch)
+    sheet = np.zeros((CROP_PX * -(-len(cells) // COLUMNS), CROP_PX * COLUMNS), np.uint8)
+    for n, patch in enumerate(cells):  # crops as cells of one picture, by rows
+        y, x = CROP_PX * (n // COLUMNS), CROP_PX * (n % COLUMNS)
+        sheet[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
     large = fitted_picture(grey, FILE_PX)
     view = fitted_picture(large, VIEW_PX)
     return _Cut(
@@ -173,17 +177,8 @@ def _cut(
         jpeg_of(large, FILE_QUALITY) if with_files else b"",
         crops,
         frames,
-        _sheet(cells) if cells else b"",
+        jpeg_of(sheet, CROP_QUALITY) if cells else b"",
     )
-
-
-def _sheet(patches: list[AnyArray]) -> bytes:
-    """Return crops as cells of one picture, by rows."""
-    sheet = np.zeros((CROP_PX * -(-len(patches) // COLUMNS), CROP_PX * COLUMNS), np.uint8)
-    for k, patch in enumerate(patches):
-        y, x = CROP_PX * (k // COLUMNS), CROP_PX * (k % COLUMNS)
-        sheet[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
-    return jpeg_of(sheet, CROP_QUALITY)
 
 
 def _embed(

@@ -361,7 +361,12 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
     for triple in islice(combinations(range(len(xyz)), 3), MAX_TRIPLES):
         order = [*triple, *(i for i in range(len(xyz)) if i not in triple)]
         try:
-            position = _rampal_position(uv[order], xyz[order])
+            # from the distances of the first three points and of all others
+            rays, X = rays_from_tangents(uv[order]), xyz[order]
+            S = _distances(uv[order[:MIN_POINTS]], rays[:MIN_POINTS], X[:MIN_POINTS])
+            for i in range(MIN_POINTS, len(X)):
+                S = np.append(S, _further_distance(S, rays, X, i))
+            position = _position(S, rays, X)
         except GeometryError as error:
             failure = error
             continue
@@ -375,15 +380,6 @@ def resect_rampal(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSo
     if not solutions:
         raise failure
     return sort_solutions(solutions)
-
-
-def _rampal_position(uv: FloatArray, xyz: FloatArray) -> FloatArray:
-    """Return the projection centre from the distances of the first three points and of all others."""
-    rays = rays_from_tangents(uv)
-    S = _distances(uv[:MIN_POINTS], rays[:MIN_POINTS], xyz[:MIN_POINTS])
-    for i in range(MIN_POINTS, len(xyz)):
-        S = np.append(S, _further_distance(S, rays, xyz, i))
-    return _position(S, rays, xyz)
 
 
 def _distances(uv: FloatArray, rays: FloatArray, X: FloatArray) -> FloatArray:

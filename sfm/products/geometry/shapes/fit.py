@@ -144,22 +144,19 @@ def fit_shape(
     if kind not in KINDS:
         raise GeometryError(f"shape '{name or kind}': kind '{kind}', expected one of {', '.join(KINDS)}")
     what = f"{kind} {name}".strip()
-    rows = _rows(points, chosen, what)
+    if chosen is None:
+        rows = np.arange(len(points.names))
+    elif isinstance(chosen, np.ndarray):
+        check_indices("fit_shape: chosen", chosen, len(points.names))
+        rows = chosen.astype(np.int64)
+    elif all(isinstance(name, str) for name in chosen) and not set(chosen) <= set(points.names):
+        rows = points.matching(chosen, f"{what}: points")
+    else:
+        rows = np.array([points.index(name) for name in chosen], dtype=np.int64)
     try:
         return _fit(points, KINDS[kind], rows, name or kind, weights, dict(hold or {}), robust, offset)
     except GeometryError as error:
         raise GeometryError(f"{what}: {error}") from error
-
-
-def _rows(points: MeasuredPoints, chosen: Sequence[str] | IntArray | None, what: str) -> IntArray:
-    if chosen is None:
-        return np.arange(len(points.names))
-    if isinstance(chosen, np.ndarray):
-        check_indices("fit_shape: chosen", chosen, len(points.names))
-        return chosen.astype(np.int64)
-    if all(isinstance(name, str) for name in chosen) and not set(chosen) <= set(points.names):
-        return points.matching(chosen, f"{what}: points")
-    return np.array([points.index(name) for name in chosen], dtype=np.int64)
 
 
 def _fit(

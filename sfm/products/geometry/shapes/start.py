@@ -59,7 +59,14 @@ def start_shapes(
     else:
         tried = np.vstack([[normal, along, np.cross(normal, along)], half_sphere(directions)])
     if kind.name == "cone" and origin is not None:
-        return _cones_at(xyz, origin, tried)
+        cones = []  # with this apex; the half angle for each direction is the mean angle to the points
+        y = xyz - origin
+        for direction in np.vstack([tried, -tried]):
+            height = y @ direction
+            angle = np.arctan2(np.linalg.norm(y - height[:, None] * direction, axis=1), height).mean()
+            if angle < MAX_ANGLE:
+                cones.append(Shape(kind, origin, axes_along(direction), np.array([0.0, angle])))
+        return _best_first(cones, xyz)
     shapes = [shape for direction in tried for shape in WITH_AXIS[kind.name](xyz, axes_along(direction))]
     return _best_first(shapes, xyz)
 
@@ -175,18 +182,6 @@ def _cones(xyz: FloatArray, R: FloatArray) -> list[Shape]:
     if radius < 0:
         slope, radius = -slope, -radius
     return [Shape(KINDS["cone"], R[:, :2] @ u[:2], R, np.array([radius, np.arctan(slope)]))]
-
-
-def _cones_at(xyz: FloatArray, apex: FloatArray, directions: FloatArray) -> list[Shape]:
-    """Return cones with a given apex; the half angle for each direction is the mean angle to the points."""
-    y = xyz - apex
-    shapes = []
-    for axis in np.vstack([directions, -directions]):
-        along = y @ axis
-        angle = np.arctan2(np.linalg.norm(y - along[:, None] * axis, axis=1), along).mean()
-        if angle < MAX_ANGLE:
-            shapes.append(Shape(KINDS["cone"], apex, axes_along(axis), np.array([0.0, angle])))
-    return _best_first(shapes, xyz)
 
 
 def _tori(xyz: FloatArray, R: FloatArray) -> list[Shape]:
