@@ -141,7 +141,7 @@ def test_an_argument_of_another_type_is_refused_by_its_name(name: str) -> None:
         lambda: sfm.products.geometry.fit_shape(MEASURED, "plane", [99]),
         lambda: sfm.products.geometry.decide(np.zeros(3), np.zeros(2), 0.0, 1.0, 2.0),
         lambda: sfm.products.geometry.deviations_from_points(
-            MEASURED, Nominal(("a",), XYZ[:1]), name="a", upper=1.0, chosen=[-1]
+            MEASURED, Nominal(("a",), XYZ[:1]), sfm.products.geometry.Tolerance("a", upper=1.0), chosen=[-1]
         ),
         lambda: sfm.products.geometry.distance(point_function(MEASURED, "a"), point_function(MEASURED, "x")),
         lambda: sfm.matching.match_points(STACK, GREY, PLACE),

@@ -92,7 +92,10 @@ def orient_dependent(
         raise GeometryError("dependent pair: the base has no X component, use the independent pair")
     positions = np.stack([np.zeros(3), b * bx / b[0]])
     rotations = np.stack([np.eye(3), R])
-    return _pair_orientation("dependent", DEPENDENT, parameters, b, R, v, Q, positions, rotations)
+    values, covariance, sigma0 = _with_precision(parameters, b, R, v, Q)
+    return PairOrientation(
+        "dependent", DEPENDENT, values, covariance, positions, rotations, v, sigma0, len(v) - UNKNOWNS
+    )
 
 
 @checked_arguments(first="n 2", second="n 2", start="5")
@@ -129,8 +132,10 @@ def orient_independent(
     b, R, v, Q = refine_coplanarity(first, second, b, R)
     R1 = _base_frame(b)
     positions = np.array([[0.0, 0, 0], [1, 0, 0]])
-    return _pair_orientation(
-        "independent", INDEPENDENT, parameters, b, R, v, Q, positions, np.stack([R1, R1 @ R])
+    rotations = np.stack([R1, R1 @ R])
+    values, covariance, sigma0 = _with_precision(parameters, b, R, v, Q)
+    return PairOrientation(
+        "independent", INDEPENDENT, values, covariance, positions, rotations, v, sigma0, len(v) - UNKNOWNS
     )
 
 
@@ -152,18 +157,14 @@ def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, Floa
     return best.base, best.rotation
 
 
-def _pair_orientation(
-    kind: str,
-    names: tuple[str, ...],
+def _with_precision(
     parameters: Callable[[FloatArray, FloatArray], FloatArray],
     base: FloatArray,
     rotation: FloatArray,
     residuals: FloatArray,
     cofactors: FloatArray,
-    positions: FloatArray,
-    rotations: FloatArray,
-) -> PairOrientation:
-    """Return the orientation; its covariance follows from that of small rotations of base and rotation."""
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return parameters, covariance and sigma0; the covariance follows from small rotations of the pair."""
     J = np.empty((UNKNOWNS, UNKNOWNS))
     for k, step in enumerate(np.eye(UNKNOWNS) * DIFFERENCE):
         plus = parameters(*turned_pair(base, rotation, step))
@@ -174,18 +175,7 @@ def _pair_orientation(
         J[:, k] = change / (2 * DIFFERENCE)
     redundancy = len(residuals) - UNKNOWNS
     sigma0 = float(np.sqrt(np.sum(residuals**2) / redundancy)) if redundancy > 0 else np.nan
-    covariance = sigma0**2 * J @ cofactors @ J.T
-    return PairOrientation(
-        kind,
-        names,
-        parameters(base, rotation),
-        covariance,
-        positions,
-        rotations,
-        residuals,
-        sigma0,
-        redundancy,
-    )
+    return parameters(base, rotation), sigma0**2 * J @ cofactors @ J.T, sigma0
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def accept(
         from adapters.formats.result_tables import read_result, read_scale_sources
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.products.inspection.acceptance import accept_result, read_lengths
+        from sfm.products.inspection.acceptance import LengthLimit, accept_result, read_lengths
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -136,9 +136,7 @@ def accept(
     acceptance = accept_result(
         result,
         read_lengths(lengths),
-        a=a,
-        k=k,
-        b=float("inf") if b is None else b,
+        LengthLimit(a, k, float("inf") if b is None else b),
         bars=bars,
         control=control,
         coverage=coverage,

@@ -268,8 +268,8 @@ def network_command(
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.conventions import METRES
         from sfm.products.planning.designer import StationLimits, design_network
-        from sfm.products.planning.plan import describe_plan, plan_of, verdict_of_plan
-        from sfm.products.planning.prediction import WantedPrecision
+        from sfm.products.planning.plan import describe_plan, verdict_of_plan
+        from sfm.products.planning.prediction import WantedPrecision, predict_network
         from sfm.products.planning.visibility import Seeing, TargetImage
         from sfm.report.pages import write_page
         from sfm.report.planning import figures
@@ -312,17 +312,8 @@ def network_command(
         name = Path(planned).stem if ":" not in planned else planned
         if stations is not None:
             placed = taken.photographs(stations_of(stations, object_, reference))
-            network_plan = plan_of(
-                name,
-                unit,
-                object_,
-                taken.cameras,
-                placed,
-                seeing,
-                wanted=wanted,
-                bars=bars,
-                given=taken.given,
-            )
+            prediction = predict_network(object_, taken.cameras, placed, seeing, bars=bars, given=taken.given)
+            network_plan = describe_plan(name, unit, prediction, seeing, wanted)
         else:
             taken.refuse_to_design()
             least_and_most = box = None
@@ -331,20 +322,9 @@ def network_command(
                 least_and_most = (least, most)
             if space is not None:
                 box = np.array(parse_numbers("--space", space, 6)).reshape(3, 2).T
-            allowed = StationLimits(least_and_most, box, floor)
-            design = design_network(
-                object_,
-                reference,
-                allowed,
-                seeing,
-                wanted,
-                max_photographs=photographs,
-                bars=bars,
-                given=taken.given,
-            )
-            network_plan = describe_plan(
-                name, unit, design.prediction, seeing, wanted, design.shortfall, design
-            )
+            allowed = StationLimits(least_and_most, box, floor, photographs)
+            design = design_network(object_, reference, allowed, seeing, wanted, bars=bars, given=taken.given)
+            network_plan = describe_plan(name, unit, design.prediction, seeing, wanted, design)
     page = write_page(network_plan, out)
     verdict = verdict_of_plan(network_plan)
     print_verdict(verdict)

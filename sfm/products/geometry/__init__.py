@@ -5,8 +5,8 @@
 - `point_function`, and from it `distance`, `angle_at`, `height`, `distance_from_axis`, `angle_of_directions`,
   `coordinates_in`: functions of coordinates with their covariance.
 - `align_321`, `align_features`, `align_points`: the coordinate system of a part.
-- `deviations_from_points`, `deviations_from_mesh`, `deviations_from_shape`, `decide`: conformity with
-  tolerances.
+- `Tolerance`, `deviations_from_points`, `deviations_from_mesh`, `deviations_from_shape`, `decide`: conformity
+  with tolerances.
 - `with_hidden_point`: a point at the end of a rod with two targets.
 
 Every quantity keeps its derivatives by the coordinates of the points. So its covariance, and the joint

@@ -20,6 +20,7 @@ from sfm.products.geometry.shapes.fit import ShapeFit as ShapeFit
 from sfm.products.geometry.shapes.fit import fit_shape as fit_shape
 from sfm.products.geometry.tolerance import Deviations as Deviations
 from sfm.products.geometry.tolerance import Mesh as Mesh
+from sfm.products.geometry.tolerance import Tolerance as Tolerance
 from sfm.products.geometry.tolerance import decide as decide
 from sfm.products.geometry.tolerance import deviations_from_mesh as deviations_from_mesh
 from sfm.products.geometry.tolerance import deviations_from_points as deviations_from_points

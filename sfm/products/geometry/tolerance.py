@@ -30,6 +30,16 @@ COVERAGE = 2.0  # k of the expanded uncertainty, for about 95 %
 
 
 @dataclass(frozen=True)
+class Tolerance:
+    """Limits of deviations, and the certainty with which they must be kept."""
+
+    name: str
+    lower: float = -np.inf  # smallest deviation, object unit
+    upper: float = np.inf  # largest deviation, object unit
+    coverage: float = COVERAGE  # k of the expanded uncertainty U = k sigma
+
+
+@dataclass(frozen=True)
 class Deviations:
     """Deviations of points with their limits."""
 
@@ -54,10 +64,8 @@ class Deviations:
 def deviations_from_points(
     points: MeasuredPoints,
     nominal: Nominal,
+    tolerance: Tolerance,
     *,
-    name: str,
-    upper: float,
-    coverage: float = COVERAGE,
     chosen: IntArray | None = None,
 ) -> Deviations:
     """Return the distances of measured points from nominal points of the same names.
@@ -65,9 +73,7 @@ def deviations_from_points(
     Args:
         points: points aligned to the system of the nominal points.
         nominal: nominal points; their covariance is taken into account.
-        name: name of the tolerance.
-        upper: largest distance, object unit.
-        coverage: k of the expanded uncertainty.
+        tolerance: its largest distance; distances have no lower limit.
         chosen: indices of the points to judge; all with a nominal point if not given.
 
     Raises:
@@ -80,7 +86,7 @@ def deviations_from_points(
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
     common = [name for name in nominal.names if name in points.names and name in wanted]
     if not common:
-        raise GeometryError(f"tolerance {name}: no nominal point was measured")
+        raise GeometryError(f"tolerance {tolerance.name}: no nominal point was measured")
     rows = np.array([points.index(name) for name in common], dtype=np.int64)
     of_nominal = np.array([nominal.names.index(name) for name in common], dtype=np.int64)
     d = points.xyz[rows] - nominal.xyz[of_nominal]
@@ -91,8 +97,20 @@ def deviations_from_points(
     u = np.divide(d, length[:, None], out=np.zeros_like(d), where=length[:, None] > 0)
     sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", u, Q, u), 0.0))
     missing = tuple(name for name in nominal.names if name not in points.names)
-    decision = decide(length, sigma, -np.inf, upper, coverage)
-    return Deviations(name, "nominal points", rows, length, sigma, d, 0.0, upper, coverage, decision, missing)
+    decision = decide(length, sigma, -np.inf, tolerance.upper, tolerance.coverage)
+    return Deviations(
+        tolerance.name,
+        "nominal points",
+        rows,
+        length,
+        sigma,
+        d,
+        0.0,
+        tolerance.upper,
+        tolerance.coverage,
+        decision,
+        missing,
+    )
 
 
 @checked_arguments()
@@ -100,12 +118,9 @@ def deviations_from_mesh(
     points: MeasuredPoints,
     mesh: Mesh,
     chosen: IntArray,
+    tolerance: Tolerance,
     *,
-    name: str,
     against: str,
-    lower: float,
-    upper: float,
-    coverage: float = COVERAGE,
     offset: float = 0.0,
 ) -> Deviations:
     """Return the signed distances of points from a mesh, positive outside.
@@ -114,11 +129,8 @@ def deviations_from_mesh(
         points: points aligned to the system of the mesh.
         mesh: nominal surface.
         chosen: indices of the points to judge.
-        name: name of the tolerance.
+        tolerance: limits of the signed distances.
         against: name of the mesh.
-        lower: smallest distance, object unit.
-        upper: largest distance, object unit.
-        coverage: k of the expanded uncertainty.
         offset: distance of the targets from the surface along its normal, object unit.
 
     Raises:
@@ -131,39 +143,55 @@ def deviations_from_mesh(
     value = nearest.distance - offset
     variance = np.einsum("ni,nij,nj->n", nearest.normal, points.blocks[chosen], nearest.normal)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    decision = decide(value, sigma, lower, upper, coverage)
-    vector = value[:, None] * nearest.normal
-    return Deviations(name, against, chosen, value, sigma, vector, lower, upper, coverage, decision)
+    return _judged(tolerance, against, chosen, value, sigma, value[:, None] * nearest.normal)
 
 
 @checked_arguments()
 def deviations_from_shape(
     points: MeasuredPoints,
     fit: ShapeFit,
-    *,
-    name: str,
-    lower: float,
-    upper: float,
-    coverage: float = COVERAGE,
+    tolerance: Tolerance,
 ) -> Deviations:
     """Return the distances of points from a shape fitted to them, with the uncertainty of both.
 
     Args:
         points: points that the shape was fitted to.
         fit: the fitted shape.
-        name: name of the tolerance.
-        lower: smallest distance, object unit.
-        upper: largest distance, object unit.
-        coverage: k of the expanded uncertainty.
+        tolerance: limits of the signed distances.
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
     _, normals, _ = fit.shape.design(points.xyz[fit.points])
     vector = np.einsum("nc,nci->ni", fit.distances, normals)
-    value = fit.deviation
-    decision = decide(value, fit.sigma, lower, upper, coverage)
     against = f"{fit.shape.kind.name} {fit.name}"
-    return Deviations(name, against, fit.points, value, fit.sigma, vector, lower, upper, coverage, decision)
+    return _judged(tolerance, against, fit.points, fit.deviation, fit.sigma, vector)
+
+
+def _judged(
+    tolerance: Tolerance,
+    against: str,
+    points: IntArray,
+    value: FloatArray,
+    sigma: FloatArray,
+    vector: FloatArray,
+    missing: tuple[str, ...] = (),
+) -> Deviations:
+    """Return deviations with the decision on each."""
+    lower, upper, coverage = tolerance.lower, tolerance.upper, tolerance.coverage
+    decision = decide(value, sigma, lower, upper, coverage)
+    return Deviations(
+        tolerance.name,
+        against,
+        points,
+        value,
+        sigma,
+        vector,
+        lower,
+        upper,
+        coverage,
+        decision,
+        missing,
+    )
 
 
 @checked_arguments(value="n", sigma="n")

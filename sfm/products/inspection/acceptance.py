@@ -49,6 +49,27 @@ class CalibratedLengths:
 
 
 @dataclass(frozen=True)
+class LengthLimit:
+    """Limit A + K L of the error of a length L, at most B.
+
+    Raises:
+        GeometryError: A or K is negative, or both are 0, or B is not above 0.
+    """
+
+    a: float  # object unit
+    k: float  # pure number
+    b: float = np.inf  # object unit
+
+    def __post_init__(self) -> None:
+        """Refuse an impossible limit."""
+        if not (self.a >= 0 and self.k >= 0 and self.a + self.k > 0 and self.b > 0):
+            raise GeometryError(
+                f"limit: A = {self.a:g}, K = {self.k:g}, B = {self.b:g}, expected A and K not negative, one "
+                "above 0"
+            )
+
+
+@dataclass(frozen=True)
 class Acceptance:
     """Errors of length measurement, and the decision on each."""
 
@@ -119,10 +140,8 @@ def read_lengths(path: Path) -> CalibratedLengths:
 def accept_result(
     result: Solution,
     lengths: CalibratedLengths,
+    limit: LengthLimit,
     *,
-    a: float,
-    k: float,
-    b: float = np.inf,
     bars: Sequence[str] | None,
     control: Sequence[str] = (),
     coverage: float = COVERAGE,
@@ -133,9 +152,7 @@ def accept_result(
     Args:
         result: result of a survey with a scale from other bars.
         lengths: calibrated lengths between points of the result.
-        a: A of the limit A + K L, object unit.
-        k: K of the limit A + K L, a pure number.
-        b: B, the largest limit, object unit.
+        limit: limit of the error of a length.
         bars: "start - end" of the scale bars that gave the scale; None if unknown.
         control: names of control points that gave the scale.
         coverage: k of the expanded uncertainty of the calibration.
@@ -143,13 +160,9 @@ def accept_result(
             given.
 
     Raises:
-        GeometryError: no scale, a scale from the tested lengths, or impossible limits.
+        GeometryError: no scale, or a scale from the tested lengths.
         UnknownNameError: an end of a length is not in the result.
     """
-    if not (a >= 0 and k >= 0 and a + k > 0 and b > 0):
-        raise GeometryError(
-            f"limit: A = {a:g}, K = {k:g}, B = {b:g}, expected A and K not negative, one above 0"
-        )
     points = measured_points(result)
     if not points.has_scale:
         raise GeometryError(
@@ -166,9 +179,9 @@ def accept_result(
     measured = np.array([function.value[0] for function in functions])
     variance = np.array([points.covariance_between([function])[0, 0] for function in functions])
     error = measured - lengths.length
-    limit = np.minimum(a + k * lengths.length, b)
+    largest = np.minimum(limit.a + limit.k * lengths.length, limit.b)
     # |error| is scaled so that the limit of each length is 1
-    decision = decide(np.abs(error) / limit, lengths.sigma / limit, -np.inf, 1.0, coverage)
+    decision = decide(np.abs(error) / largest, lengths.sigma / largest, -np.inf, 1.0, coverage)
     if diagonal is None:  # of the smaller box: along the axes of the system, or along the object's axes
         _, _, principal = np.linalg.svd(points.xyz - points.xyz.mean(axis=0), full_matrices=False)
         boxes = [np.ptp(points.xyz @ axes.T, axis=0) for axes in (np.eye(3), principal)]
@@ -185,10 +198,10 @@ def accept_result(
         lengths,
         error,
         np.sqrt(np.maximum(variance, 0.0)),
-        limit,
-        a,
-        k,
-        b,
+        largest,
+        limit.a,
+        limit.k,
+        limit.b,
         coverage,
         decision,
         diagonal,

@@ -39,6 +39,7 @@ from sfm.products.geometry.tolerance import (
     UNKNOWN,
     Deviations,
     Mesh,
+    Tolerance,
     deviations_from_mesh,
     deviations_from_points,
     deviations_from_shape,
@@ -387,21 +388,13 @@ class _Work:
         chosen = (
             None if settings.points is None else self.chosen(settings.points, f"tolerance {settings.name}")
         )
+        tolerance = Tolerance(settings.name, lower, settings.upper, coverage)
         if settings.shape is not None:
             fit = self.shape_named(settings.shape, f"tolerance {settings.name}")
-            return deviations_from_shape(
-                self.points, fit, name=settings.name, lower=lower, upper=settings.upper, coverage=coverage
-            )
+            return deviations_from_shape(self.points, fit, tolerance)
         if settings.nominal is not None:
             nominal = self.tables[settings.nominal]
-            return deviations_from_points(
-                self.points,
-                nominal,
-                name=settings.name,
-                upper=settings.upper,
-                coverage=coverage,
-                chosen=chosen,
-            )
+            return deviations_from_points(self.points, nominal, tolerance, chosen=chosen)
         assert settings.mesh is not None and chosen is not None
         if self.read_mesh is None:
             raise GeometryError(f"tolerance {settings.name}: nothing here reads the mesh {settings.mesh}")
@@ -409,11 +402,8 @@ class _Work:
             self.points,
             Mesh(*self.read_mesh(self.paths[settings.mesh])),
             chosen,
-            name=settings.name,
+            tolerance,
             against=settings.mesh,
-            lower=lower,
-            upper=settings.upper,
-            coverage=coverage,
             offset=settings.offset,
         )
 

@@ -34,7 +34,7 @@ from sfm.model.solution import Solution
 from sfm.products.planning.prediction import simulate_network
 from sfm.products.planning.stations import Stations
 from sfm.products.planning.weakness import open_motions
-from sfm.products.rendering.planned_targets import INK, PAPER, write_planned_photographs
+from sfm.products.rendering.planned_targets import INK, PAPER, PlannedTargets, write_planned_photographs
 from sfm.products.rendering.scene import UNCODED, Optics
 from sfm.survey.observation_tables import ObservationTable, observation_table, with_tables
 from sfm.targets.codes.plates import code_family
@@ -372,19 +372,15 @@ def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes
         blur_px=float(np.sqrt(max(plan.blur_px**2 - 1 / 12, 0.04))), exposure=exposure, noise=plan.noise / 255
     )
     stations = plan.stations
+    targets = PlannedTargets(xyz, plan.normals, codes_of(plan, family), plan.diameter / 2, family)
     for a, rows in enumerate(rows_of(stations.camera, len(plan.cameras))):
         write_planned_photographs(
-            pictures,
-            tuple(f"{stations.names[i]}.png" for i in rows),
+            [pictures / f"{stations.names[i]}.png" for i in rows],
             plan.cameras[a],
             stations.position[rows],
             stations.rotation[rows],
-            xyz=xyz,
-            normals=plan.normals,
-            code=codes_of(plan, family),
-            radius=plan.diameter / 2,
+            targets=targets,
             seen=plan.seen[rows],
-            family=family,
             optics=optics,
             seed=seed + a,
         )

@@ -81,7 +81,6 @@ def design_network(
     seeing: Seeing,
     wanted: WantedPrecision,
     *,
-    max_photographs: int = MAX_PHOTOGRAPHS,
     count: int = COUNT,
     bars: Sequence[ScaleBarPlan] = (),
     given: Callable[[Network], Network] | None = None,
@@ -91,10 +90,9 @@ def design_network(
     Args:
         planned: the object.
         camera: interior orientation and its free parameters.
-        allowed: limits of the stations.
+        allowed: limits of the stations, and of their number.
         seeing: limits and precision of image points.
         wanted: requirements on the network.
-        max_photographs: largest number of photographs.
         count: number of candidate stations, each upright and rolled.
         bars: scale bars.
         given: as in `predict_network`.
@@ -104,12 +102,12 @@ def design_network(
 
     Source: Fedorov (1972), Theory of Optimal Experiments; Fraser (1984).
     """
-    if max_photographs < MIN_PHOTOGRAPHS:
+    if allowed.photographs < MIN_PHOTOGRAPHS:
         raise GeometryError(
-            f"plan: at most {counted(max_photographs, 'photograph')}, needed {MIN_PHOTOGRAPHS} or more"
+            f"plan: at most {counted(allowed.photographs, 'photograph')}, needed {MIN_PHOTOGRAPHS} or more"
         )
     room = candidates(planned, camera, allowed, seeing, count=count)
-    return _Designer(planned, camera, seeing, wanted, room, max_photographs, bars, given).run()
+    return _Designer(planned, camera, seeing, wanted, room, allowed.photographs, bars, given).run()
 
 
 @dataclass
@@ -265,6 +263,7 @@ class StationLimits:
     distance: tuple[float, float] | None = None
     space: FloatArray | None = None  # least and largest X, Y, Z of a station, object unit, (2, 3)
     floor: float | None = None  # least Z of a station, object unit
+    photographs: int = MAX_PHOTOGRAPHS  # largest number of them
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ Source: Fedorov (1972), Theory of Optimal Experiments (augmentation of a design)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import compress
 
@@ -34,9 +34,7 @@ from sfm.products.planning.prediction import (
     MIN_POINTS,
     MIN_RAYS,
     Prediction,
-    ScaleBarPlan,
     WantedPrecision,
-    predict_network,
     short_of,
 )
 from sfm.products.planning.stations import Shot, Stations, choose_coded, shots
@@ -96,47 +94,13 @@ class Plan:
         return self.shortfall <= 1 and bool(determined)
 
 
-def plan_of(
-    name: str,
-    unit: str,
-    planned: PlannedObject,
-    camera: Camera | Sequence[Camera],
-    stations: Stations,
-    seeing: Seeing,
-    *,
-    wanted: WantedPrecision,
-    bars: Sequence[ScaleBarPlan] = (),
-    given: Callable[[Network], Network] | None = None,
-) -> Plan:
-    """Return the plan of given stations.
-
-    Args:
-        name: name of the plan.
-        unit: unit of lengths.
-        planned: the object.
-        camera: as in `predict_network`.
-        stations: as in `predict_network`.
-        seeing: limits and precision of image points.
-        wanted: requirements on the network.
-        bars: scale bars.
-        given: as in `predict_network`.
-
-    Raises:
-        GeometryError: as in `predict_network`.
-    """
-    prediction = predict_network(planned, camera, stations, seeing, bars=bars, given=given)
-    every = np.ones(len(planned.names), dtype=bool)
-    return describe_plan(name, unit, prediction, seeing, wanted, short_of(prediction, wanted, every), None)
-
-
 def describe_plan(
     name: str,
     unit: str,
     prediction: Prediction,
     seeing: Seeing,
     wanted: WantedPrecision,
-    shortfall: float,
-    design: Design | None,
+    design: Design | None = None,
 ) -> Plan:
     """Return the plan of a prediction, with its weaknesses and list of photographs.
 
@@ -146,10 +110,10 @@ def describe_plan(
         prediction: prediction of the network.
         seeing: limits and precision of image points.
         wanted: requirements on the network.
-        shortfall: largest ratio of predicted to wanted values.
         design: the design of the stations; None for given stations.
     """
     seen = prediction.sight.seen
+    every = np.ones(len(prediction.planned.names), dtype=bool)
     network = prediction.adjustment.network
     # Points with observations besides image points need a code as their name.
     observed = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
@@ -179,7 +143,7 @@ def describe_plan(
         seeing,
         wanted,
         design,
-        shortfall,
+        short_of(prediction, wanted, every) if design is None else design.shortfall,
         weak_points(prediction),
         unusable_photographs(prediction),
         separate_groups(prediction),

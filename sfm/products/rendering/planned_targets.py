@@ -7,6 +7,8 @@ that hide other targets are not drawn.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -33,26 +35,38 @@ PAPER, INK = 0.8, 0.08  # reflectance of cards and of targets
 MARGIN = 1.25  # size of a card over its target or ring
 
 
-def planned_scene(
-    xyz: FloatArray, normals: FloatArray, code: IntArray, radius: float, family: CodeFamily
-) -> Scene:
-    """Return a scene of targets, each on a card that faces along a normal.
+@dataclass(frozen=True)
+class PlannedTargets:
+    """Targets of a plan, all of one size."""
 
-    Args:
-        xyz: centres of the targets, object unit, (n, 3).
-        normals: directions in which they face, length 1, (n, 3).
-        code: code numbers, UNCODED = a dot without a ring, (n,).
-        radius: radius of the dots, object unit.
-        family: the family of codes.
+    xyz: FloatArray  # centres, object unit, (n, 3)
+    normals: FloatArray  # directions in which they face, length 1, (n, 3)
+    code: IntArray  # code numbers, UNCODED = a dot without a ring, (n,)
+    radius: float  # of the dots, object unit
+    family: CodeFamily  # of the codes
+
+    @property
+    def reach(self) -> FloatArray:
+        """Radius of each with its ring, object unit, (n,)."""
+        return self.radius * np.where(self.code == UNCODED, 1.0, self.family.outer)
+
+    def select(self, rows: BoolArray) -> PlannedTargets:
+        """Return some of the targets, (n,)."""
+        return replace(self, xyz=self.xyz[rows], normals=self.normals[rows], code=self.code[rows])
+
+
+def planned_scene(planned: PlannedTargets) -> Scene:
+    """Return a scene of targets, each on a card that faces along a normal.
 
     Raises:
         GeometryError: the family has no such code.
     """
+    xyz, normals, code, radius = planned.xyz, planned.normals, planned.code, planned.radius
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     a = np.cross(helper, normals)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
     n = len(xyz)
-    half = MARGIN * radius * np.where(code == UNCODED, 1.0, family.outer)
+    half = MARGIN * planned.reach
     faces = Faces(
         xyz,
         np.stack([a, np.cross(normals, a)], axis=1),
@@ -65,7 +79,7 @@ def planned_scene(
     marks: list[Marks] = [
         discs(k, middle, radius, INK)
         if code[k] == UNCODED
-        else coded_ring(k, middle[0], radius, int(code[k]), family, INK)
+        else coded_ring(k, middle[0], radius, int(code[k]), planned.family, INK)
         for k in range(n)
     ]
     targets = CircularTargets(np.arange(n), np.zeros((n, 2)), np.full(n, radius), code)
@@ -73,35 +87,25 @@ def planned_scene(
 
 
 def write_planned_photographs(
-    folder: Path,
-    names: tuple[str, ...],
+    paths: Sequence[Path],
     camera: Camera,
     position: FloatArray,
     rotation: FloatArray,
     *,
-    xyz: FloatArray,
-    normals: FloatArray,
-    code: IntArray,
-    radius: float,
+    targets: PlannedTargets,
     seen: BoolArray,
-    family: CodeFamily,
     optics: Optics,
     seed: int,
 ) -> None:
-    """Render the photographs of a plan and write them into an existing folder.
+    """Render the photographs of a plan and write them into existing folders.
 
     Args:
-        folder: folder of the photographs.
-        names: file names, m of them.
+        paths: files of the photographs, m of them.
         camera: interior orientation.
         position: projection centres, object unit, (m, 3).
         rotation: R of each, (m, 3, 3).
-        xyz: see `planned_scene`, as for normals, code, radius and family.
-        normals: see `planned_scene`.
-        code: see `planned_scene`.
-        radius: see `planned_scene`.
+        targets: the targets of the plan, n of them.
         seen: which photograph shows which target, (m, n).
-        family: see `planned_scene`.
         optics: blur, exposure and noise.
         seed: seed of the noise.
 
@@ -109,16 +113,16 @@ def write_planned_photographs(
         GeometryError: a code that the family does not have, or targets that overlap.
         OutputError: a photograph cannot be written.
     """
-    _refuse_overlap(xyz, radius * np.where(code == UNCODED, 1.0, family.outer), seen)
+    _refuse_overlap(targets.xyz, targets.reach, seen)
     rays = corner_rays(camera)
-    sources = np.random.default_rng(seed).spawn(len(names))
-    for i, name in enumerate(names):
-        scene = planned_scene(xyz[seen[i]], normals[seen[i]], code[seen[i]], radius, family)
+    sources = np.random.default_rng(seed).spawn(len(paths))
+    for i, path in enumerate(paths):
+        scene = planned_scene(targets.select(seen[i]))
         photograph, _ = render_photograph(
             scene, camera, position[i], rotation[i], optics=optics, rng=sources[i], rays=rays
         )
-        if not cv2.imwrite(str(folder / name), photograph, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OutputError(f"{folder / name}: the photograph could not be written")
+        if not cv2.imwrite(str(path), photograph, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise OutputError(f"{path}: the photograph could not be written")
 
 
 def _refuse_overlap(xyz: FloatArray, reach: FloatArray, seen: BoolArray) -> None:

@@ -19,6 +19,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -81,8 +82,9 @@ def render_photograph(
     n = optics.oversampling
     fine = np.full((height * n, width * n), scene.background, dtype=np.float32)
     scratch = np.empty((2, fine.size), dtype=np.float32)  # allocated once for all faces: new memory is slow
+    view = _View(camera, position, rotation, rays)
     for face in painting_order(scene, position):
-        _paint_face(fine, scene, int(face), camera, position, rotation, rays, n, scratch)
+        _paint_face(fine, scene, int(face), view, n, scratch)
     sigma = optics.blur_px * n
     if sigma > 0:
         reach = 2 * math.ceil(5 * sigma) + 1
@@ -160,26 +162,32 @@ def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyA
     return np.asarray(intensities.astype(np.uint8 if optics.bits == 8 else np.uint16))
 
 
-def _paint_face(
-    fine: AnyArray,
-    scene: Scene,
-    face: int,
-    camera: Camera,
-    position: FloatArray,
-    rotation: FloatArray,
-    rays: FloatArray,
-    n: int,
-    scratch: AnyArray,
-) -> None:
+class _View(NamedTuple):
+    """A camera at a station."""
+
+    camera: Camera
+    position: FloatArray  # projection centre, object unit, (3,)
+    rotation: FloatArray  # R, (3, 3)
+    rays: FloatArray  # tangents at the corners of the pixels, (height + 1, width + 1, 2)
+
+
+def _paint_face(fine: AnyArray, scene: Scene, face: int, view: _View, n: int, scratch: AnyArray) -> None:
     """Paint one face with its marks and its light over the existing image, n cells along a pixel."""
     faces, marks = scene.faces, scene.marks
-    H = _plane_from_ray(scene, face, position, rotation)
+    H = _plane_from_ray(scene, face, view.position, view.rotation)
 
     def windows(centre: FloatArray, half: FloatArray) -> IntArray:
+        """Return first and last row and column of the cells around squares, in whole pixels, (k, 4)."""
         around = (centre[:, None] + half[:, None] * SQUARE).reshape(-1, 2)
         points = faces.place(np.full(len(around), face), around)
-        xy = project(camera, position, rotation, points).reshape(len(centre), len(SQUARE), 2)
-        return _windows(xy, fine.shape, n)
+        xy = project(view.camera, view.position, view.rotation, points).reshape(len(centre), len(SQUARE), 2)
+        in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
+        seen = np.where(in_front[:, None, None], xy, 0.0)
+        low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, fine.shape[::-1])
+        high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, fine.shape[::-1])
+        cells = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
+        everywhere = (0, fine.shape[0], 0, fine.shape[1])  # of a square partly behind the camera
+        return np.where(in_front[:, None], cells, everywhere)
 
     box = windows(np.zeros((1, 2)), faces.half[face][None])[0]
     if box[0] >= box[1] or box[2] >= box[3]:
@@ -189,7 +197,7 @@ def _paint_face(
     rectangle = np.array([*faces.half[face], 0.0, 0.0])
     lamp = _lamp(scene, face)
     surface = faces.value[face], faces.texture[face], faces.grain[face]
-    fill_face(value, cover, box, rays, H, rectangle, *surface, face, lamp, n)
+    fill_face(value, cover, box, view.rays, H, rectangle, *surface, face, lamp, n)
     on_face = np.flatnonzero(marks.face == face)
     kinds = (marks.kind[on_face] == DISC, marks.kind[on_face] == ARC)
     reach = np.select(kinds, marks.shape[on_face, :2].T, np.hypot(*marks.shape[on_face, :2].T))
@@ -197,8 +205,8 @@ def _paint_face(
     parts[:, ::2] = np.maximum(parts[:, ::2], box[::2])
     parts[:, 1::2] = np.minimum(parts[:, 1::2], box[1::2])
     for k, part in zip(on_face, parts, strict=True):
-        kind = int(marks.kind[k])
-        paint_mark(value, box, part, rays, H, kind, marks.centre[k], marks.shape[k], marks.value[k], lamp, n)
+        mark = int(marks.kind[k]), marks.centre[k], marks.shape[k], marks.value[k]
+        paint_mark(value, box, part, view.rays, H, *mark, lamp, n)
     cover_with(fine, box, value, cover)
 
 
@@ -212,17 +220,6 @@ SQUARE = np.concatenate(
         np.column_stack([np.full(8, -1.0), -_SIDE]),
     ]
 )
-
-
-def _windows(xy: FloatArray, shape: tuple[int, ...], n: int) -> IntArray:
-    """Return first and last row and column of the cells around points (k, p, 2), (k, 4); in whole pixels."""
-    everywhere = (0, shape[0], 0, shape[1])
-    in_front = np.asarray(np.isfinite(xy).all(axis=(1, 2)))
-    seen = np.where(in_front[:, None, None], xy, 0.0)
-    low = np.clip(np.floor(seen.min(axis=1) - 1).astype(np.int64) * n, 0, shape[::-1])
-    high = np.clip(np.ceil(seen.max(axis=1) + 2).astype(np.int64) * n, 0, shape[::-1])
-    around = np.column_stack([low[:, 1], high[:, 1], low[:, 0], high[:, 0]])
-    return np.where(in_front[:, None], around, everywhere)  # partly behind the camera: can be anywhere
 
 
 def _lamp(scene: Scene, face: int) -> Lamp:

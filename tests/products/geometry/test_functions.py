@@ -30,6 +30,7 @@ from sfm.products.geometry.measured import (
 from sfm.products.geometry.shapes.fit import fit_shape
 from sfm.products.geometry.tolerance import (
     Mesh,
+    Tolerance,
     decide,
     deviations_from_mesh,
     deviations_from_points,
@@ -353,11 +354,11 @@ def test_a_length_has_the_sigma_of_its_direction() -> None:
     Q = np.diag([1e-4, 4e-4, 9e-4, 1e-4, 1e-4, 1e-4])
     points = MeasuredPoints(("a", "b"), np.array([[0.0, 0.5, 0], [1, 1, 1]]), Q, "mm", "aligned")
     nominal = Nominal(("a", "c"), np.zeros((2, 3)), np.tile(5e-4 * np.eye(3), (2, 1, 1)))
-    found = deviations_from_points(points, nominal, name="x", upper=0.6)
+    found = deviations_from_points(points, nominal, Tolerance("x", upper=0.6))
     assert found.value.tolist() == [0.5] and found.missing == ("c",)
     assert found.sigma[0] == pytest.approx(0.03) and found.decision == ("in",)
     with pytest.raises(GeometryError, match="tolerance x: no nominal point was measured"):
-        deviations_from_points(points, Nominal(("c",), np.zeros((1, 3))), name="x", upper=1.0)
+        deviations_from_points(points, Nominal(("c",), np.zeros((1, 3))), Tolerance("x", upper=1.0))
 
 
 def test_deviations_from_a_mesh_and_a_shape_have_the_uncertainty_of_both() -> None:
@@ -366,11 +367,11 @@ def test_deviations_from_a_mesh_and_a_shape_have_the_uncertainty_of_both() -> No
     xyz = points_on(truth, 30, rng)
     points = MeasuredPoints(tuple(map(str, range(30))), xyz, random_covariance(30, 0.1, rng), "mm", "aligned")
     fit = fit_shape(points, "cylinder")
-    found = deviations_from_shape(points, fit, name="roundness", lower=-1.0, upper=1.0)
+    found = deviations_from_shape(points, fit, Tolerance("roundness", -1.0, 1.0))
     assert found.count("in") == 30
     # a residual has less than the point itself, since the shape follows it
     assert np.median(found.sigma) < np.median(np.sqrt(np.einsum("nii->n", points.blocks) / 3))
-    found = deviations_from_mesh(points, CUBE, np.arange(5), name="m", against="cube.stl", lower=-1, upper=1)
+    found = deviations_from_mesh(points, CUBE, np.arange(5), Tolerance("m", -1.0, 1.0), against="cube.stl")
     assert (found.sigma > 0).all() and len(found.decision) == 5
 
 

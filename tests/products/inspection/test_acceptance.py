@@ -18,7 +18,13 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, without_given
 from sfm.model.remarks.remark import remark
 from sfm.model.solution import Solution
-from sfm.products.inspection.acceptance import Acceptance, CalibratedLengths, accept_result, read_lengths
+from sfm.products.inspection.acceptance import (
+    Acceptance,
+    CalibratedLengths,
+    LengthLimit,
+    accept_result,
+    read_lengths,
+)
 from sfm.report.pages import write_page
 from tests.products.inspection.benches import one_bench
 from tests.synthetic import seed_of
@@ -57,7 +63,10 @@ def volume(*, error: float = 0.0, lines: int = 7, sigma: float = SIGMA) -> tuple
 
 
 def accepted(result: Solution, lengths: CalibratedLengths, **options: Any) -> Acceptance:
-    return accept_result(result, lengths, **{"a": 0.02, "k": 2e-5, "bars": ["s1 - s2"]} | options)
+    limit = {key: options.pop(key) for key in ("a", "k", "b") if key in options}
+    return accept_result(
+        result, lengths, LengthLimit(**{"a": 0.02, "k": 2e-5} | limit), **{"bars": ["s1 - s2"]} | options
+    )
 
 
 def test_a_complete_test_is_proven(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def compared(name: str, points: int, draws: int, count: int = 300) -> tuple[int,
     """Return photographs needed: designed, by the best of the rings, by the luckiest of random choices."""
     kind, sizes, allowed, sigma = OBJECTS[name]
     planned, wanted = shape_object(kind, sizes, points), WantedPrecision(sigma=sigma)
-    found = design_network(planned, CAMERA, allowed, SEEING, wanted, max_photographs=MOST, count=count)
+    found = design_network(planned, CAMERA, replace(allowed, photographs=MOST), SEEING, wanted, count=count)
     assert found.reached, found.limit
     every = np.ones(points, dtype=bool)
     assert short_of(found.prediction, wanted, every) <= 1  # by the full covariance
@@ -206,10 +206,9 @@ def test_what_limits_a_design_is_said() -> None:
     few = design_network(
         planned,
         CAMERA,
-        StationLimits(floor=0.0),
+        StationLimits(floor=0.0, photographs=6),
         SEEING,
         WantedPrecision(sigma=1e-7),
-        max_photographs=6,
         count=40,
     )
     assert not few.reached and few.shortfall > 1 and "the 6 photographs that are allowed" in few.limit

@@ -17,12 +17,12 @@ from sfm.model.network import Network
 from sfm.model.remarks.remark import of_kind
 from sfm.model.solution import Solution
 from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-from sfm.products.planning.plan import further_photographs, plan_of, verdict_of_plan
+from sfm.products.planning.plan import describe_plan, further_photographs, verdict_of_plan
 from sfm.products.planning.planned_object import shape_object
 from sfm.products.planning.prediction import WantedPrecision, predict_network
 from sfm.products.planning.stations import Stations, arrangement
 from sfm.products.planning.visibility import Seeing, TargetImage
-from sfm.products.rendering.planned_targets import planned_scene
+from sfm.products.rendering.planned_targets import PlannedTargets, planned_scene
 from sfm.report.further import headline, weakest
 from sfm.report.page import Banner
 from sfm.report.pages import page_of, write_page
@@ -89,7 +89,8 @@ def test_a_plan_is_achieved_by_its_rendered_photographs(tmp_path: Path) -> None:
     target = TargetImage(contrast=120, noise=3, blur_px=0.8)
     stations: Stations = arrangement("ring:8", plate, camera)
     seeing = Seeing(diameter=12.0, target=target)
-    plan = plan_of("plate", "mm", plate, camera, stations, seeing, wanted=WantedPrecision())
+    prediction = predict_network(plate, camera, stations, seeing)
+    plan = describe_plan("plate", "mm", prediction, seeing, WantedPrecision())
     write_page(plan, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
     assert (read.seen == plan.prediction.sight.seen).all() and read.cameras[0].free.sum() == 1
@@ -112,9 +113,8 @@ def test_targets_that_overlap_are_refused(tmp_path: Path) -> None:
     camera = camera_from_values("small", "brown", (900, 700), (0.005, 0.005), c_mm=6.0, free=("c",))
     plate = shape_object("plate", (100.0, 100.0), 20)
     seeing = Seeing(diameter=12.0)
-    plan = plan_of(
-        "plate", "mm", plate, camera, arrangement("ring:6", plate, camera), seeing, wanted=WantedPrecision()
-    )
+    prediction = predict_network(plate, camera, arrangement("ring:6", plate, camera), seeing)
+    plan = describe_plan("plate", "mm", prediction, seeing, WantedPrecision())
     write_page(plan, tmp_path / "plan")
     with pytest.raises(GeometryError, match="overlap; needed fewer points or smaller targets"):
         write_simulation(read_plan(tmp_path / "plan"), tmp_path)
@@ -124,7 +124,8 @@ def test_a_planned_target_lies_where_its_point_is() -> None:
     family = code_family("ring14")
     assert isinstance(family, CodeFamily)
     normals = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
-    scene = planned_scene(np.array([[1.0, 2, 3], [4, 5, 6]]), normals, np.array([-1, 5]), 2.0, family)
+    xyz = np.array([[1.0, 2, 3], [4, 5, 6]])
+    scene = planned_scene(PlannedTargets(xyz, normals, np.array([-1, 5]), 2.0, family))
     assert np.allclose(scene.faces.normals(), normals)
     assert np.allclose(scene.faces.place(scene.targets.face, scene.targets.centre), scene.faces.centre)
 
@@ -138,7 +139,8 @@ def test_groups_that_nothing_joins_are_named() -> None:
     named = {}
     for rings in ("two-rings:16", "ring:16"):
         stations = arrangement(rings, box, camera)
-        plan = plan_of("box", "mm", box, camera, stations, seeing, wanted=WantedPrecision())
+        prediction = predict_network(box, camera, stations, seeing)
+        plan = describe_plan("box", "mm", prediction, seeing, WantedPrecision())
         found = of_kind(verdict_of_plan(plan).remarks, "plan_not_connected", "plan_undetermined")
         named[rings] = [(one.kind, one.names("photographs"), one.names("others")) for one in found]
         assert sorted(name for group in plan.groups for name in group) == sorted(stations.names)

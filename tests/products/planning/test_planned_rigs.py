@@ -22,7 +22,7 @@ from sfm.model.observations.kind import PHOTOGRAPH, Group, TableKind
 from sfm.model.observations.rigid_frames import RigidFrames
 from sfm.model.observations.tables import TABLES
 from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-from sfm.products.planning.plan import plan_of
+from sfm.products.planning.plan import describe_plan
 from sfm.products.planning.planned_object import shape_object
 from sfm.products.planning.prediction import ScaleBarPlan, WantedPrecision, predict_network
 from sfm.products.planning.stations import arrangement
@@ -317,9 +317,9 @@ def test_true_errors_are_those_predicted_in_the_mean(tmp_path: Path) -> None:
     plate = shape_object("plate", (500.0, 380.0), 12)
     stations = arrangement("ring:4", plate, camera)
     bar = ScaleBarPlan(plate.names[0], plate.names[11], 1.0)
-    found = plan_of(
-        "plate", "mm", plate, camera, stations, Seeing(sigma_px=0.1), wanted=WantedPrecision(), bars=[bar]
-    )
+    seeing = Seeing(sigma_px=0.1)
+    prediction = predict_network(plate, camera, stations, seeing, bars=[bar])
+    found = describe_plan("plate", "mm", prediction, seeing, WantedPrecision())
     write_page(found, tmp_path / "plan")
     read, squares = read_plan(tmp_path / "plan"), []
     for seed in range(10):
@@ -343,7 +343,8 @@ def test_photographs_of_a_planned_rig_are_rendered_and_surveyed(tmp_path: Path) 
     seeing = Seeing(diameter=12.0, target=TargetImage(contrast=120, noise=3, blur_px=0.8))
     stations = arrangement("ring:5", plate, small).with_rig(mounts, cameras)
     bar = ScaleBarPlan(plate.names[3], plate.names[16], 0.02)
-    found = plan_of("plate", "mm", plate, cameras, stations, seeing, wanted=WantedPrecision(), bars=[bar])
+    prediction = predict_network(plate, cameras, stations, seeing, bars=[bar])
+    found = describe_plan("plate", "mm", prediction, seeing, WantedPrecision())
     write_page(found, tmp_path / "plan")
     read = read_plan(tmp_path / "plan")
     assert read.coded[[3, 16]].all()
