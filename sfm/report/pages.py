@@ -44,13 +44,13 @@ from sfm.report.page import (
 from sfm.report.phrases import is_number
 
 PAGES: Mapping[str, str] = {
-    "Acceptance": "sfm.report.measurement:acceptance_page",
-    "EpochSeries": "sfm.report.epochs:page",
+    "Acceptance": "sfm.products.inspection.page:acceptance_page",
+    "EpochSeries": "sfm.products.epochs.page:page",
     "Findings": "sfm.report.survey_report:page",
-    "Further": "sfm.report.further:page",
-    "Measurement": "sfm.report.measurement:page",
-    "Plan": "sfm.report.planning:page",
-    "Refinement": "sfm.report.refinement:page",
+    "Further": "sfm.products.planning.further_page:page",
+    "Measurement": "sfm.products.inspection.page:page",
+    "Plan": "sfm.products.planning.page:page",
+    "Refinement": "sfm.products.refining.page:page",
     "ResultComparison": "sfm.report.differences:page",
     "UnfinishedSurvey": "sfm.report.unfinished:page",
     "ViewerScene": "sfm.report.view_page:page",

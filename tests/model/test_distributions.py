@@ -87,7 +87,6 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
         "products/drafting/": "there is no survey file yet",
         "survey/diagnosis/photograph_cameras.py": "a number of trials",
         "products/planning/": "a plan",
-        "report/planning.py": "a plan",
         "comparison/": "two results",
         "cli/commands/solvers.py": "several results",
         "products/epochs/": "several results",

@@ -54,7 +54,7 @@ def measure(
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.products.inspection.features_file import read_features_file
         from sfm.products.inspection.measure import measure_result
-        from sfm.report.measurement import describe_measured, parameter_rows, quantity_table
+        from sfm.products.inspection.page import describe_measured, parameter_rows, quantity_table
         from sfm.report.pages import write_page
         from sfm.report.phrases import with_sigma
 
@@ -155,7 +155,7 @@ def _write_drawings(measurement: Measurement, folder: Path) -> None:
 
     from adapters.formats.dxf import DxfCircle, DxfLine, write_dxf
     from sfm.files.csv_tables import write_ply
-    from sfm.report.measurement import point_sigma, write_point_covariance
+    from sfm.products.inspection.page import point_sigma, write_point_covariance
 
     points = measurement.points
     sigma = point_sigma(measurement)

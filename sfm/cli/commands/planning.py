@@ -101,7 +101,7 @@ def target_size_command(
     print(f"ring of the code      {size.ring:.4g} {unit} outer diameter ({codes.name})")
     print(f"a pixel at the object {size.pixel:.4g} {unit}")
     if diagram is not None:
-        from sfm.report.figures.comparisons import DIAGRAM_PIXELS, design_diagram
+        from sfm.products.planning.page import DIAGRAM_PIXELS, design_diagram
 
         drawn = design_diagram(
             lines=sorted({*DIAGRAM_PIXELS, pixels}),
@@ -268,11 +268,11 @@ def network_command(
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.conventions import METRES
         from sfm.products.planning.designer import StationLimits, design_network
+        from sfm.products.planning.page import figures
         from sfm.products.planning.plan import describe_plan, verdict_of_plan
         from sfm.products.planning.prediction import WantedPrecision, predict_network
         from sfm.products.planning.visibility import Seeing, TargetImage
         from sfm.report.pages import write_page
-        from sfm.report.planning import figures
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress
 

@@ -215,8 +215,8 @@ def epochs(
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.distributions import FALSE_ALARM
+        from sfm.products.epochs.page import describe_block, describe_stable
         from sfm.products.epochs.series import analyse_epochs, verdict_of_epochs
-        from sfm.report.epochs import describe_block, describe_stable
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
@@ -347,9 +347,9 @@ def refine(
         )
         from sfm.files.whole_files import refuse_unwritable, whole_folder
         from sfm.products.refining.oriented_windows import measure_model_targets
+        from sfm.products.refining.page import Numbers, describe_key_points
         from sfm.products.refining.refinement import RefineSettings, refine_model, refinement_text
         from sfm.report.pages import page_of, texts_of
-        from sfm.report.refinement import Numbers, describe_key_points
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.inputs.settings import AdjustSettings
         from sfm.survey.inputs.survey import read_survey

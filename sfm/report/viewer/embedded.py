@@ -1,4 +1,4 @@
-"""The viewer embedded in a page, and the scenes of solutions, plans, measurements and epochs.
+"""The viewer embedded in a page, and the scenes of solutions.
 
 A scene is embedded in a page as text: names as JSON and numbers as arrays, compressed by gzip, as base64.
 
@@ -19,22 +19,20 @@ import json
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from sfm.comparison.stable_points import point_blocks
 from sfm.files.plain_text import or_none
 from sfm.judgement.checks import rms_of_groups
 from sfm.judgement.survey_result import sort_likeliest_first
 from sfm.model.camera import project
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, ScaleBars
+from sfm.model.network import ImagePoints, ScaleBars
 from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
 from sfm.orientation.image_rays import ray_angles
-from sfm.products.geometry.tolerance import Deviations
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
 from sfm.report.phrases import finer_unit
@@ -46,18 +44,9 @@ from sfm.report.viewer.pictures import (
     Pictures,
     Rays,
     ViewerScene,
-    cut_pictures,
     distance_sigmas,
 )
 
-if TYPE_CHECKING:
-    from sfm.products.epochs.displacements import Displacements
-    from sfm.products.epochs.series import EpochSeries
-    from sfm.products.geometry.shapes.fit import ShapeFit
-    from sfm.products.inspection.measure import Measurement
-    from sfm.products.planning.plan import Plan
-
-MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"
 UNUSED = "measured, not part of the result"
 ALIGNED = 8  # bytes to which arrays are aligned
 TYPES = {"f8": "<f8", "f4": "<f4", "u4": "<u4", "u1": "|u1"}
@@ -362,94 +351,3 @@ def joined_targets(seen: SeenTargets, image: IntArray, xy: FloatArray) -> tuple[
     reasons = {word: number for number, word in enumerate(sort_likeliest_first(set(words)))}
     number = np.array([reasons[word] for word in words], dtype=np.int64)
     return ellipse, Marks(seen.image[kept], seen.xy[kept], number, tuple(reasons))
-
-
-def displacements_viewer(series: EpochSeries) -> Viewer | None:
-    """Return the viewer of the first epoch with displacements to the last; None without photographs."""
-    if not series.first.result.estimate.oriented.any():
-        return None
-    scene = _scene_of_displacements(series.since_first[-1].displacements, series.first.result)
-    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
-
-
-def _scene_of_displacements(displacements: Displacements, first: Solution) -> ViewerScene:
-    """Return the scene of an epoch with the displacement of every point and the outcome of its test.
-
-    Standard deviations and ellipsoids are those of the displacements.
-    """
-    names = first.network.points
-    row = {name: j for j, name in enumerate(names)}
-    tested = np.array([row[name] for name in displacements.differences.points], dtype=np.int64)
-    covariance = np.full((len(names), 3, 3), np.nan)
-    covariance[tested] = point_blocks(displacements.covariance, 3)
-    scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
-    displacement = np.full((len(names), 3), np.nan)
-    displacement[tested] = displacements.displacement
-    state = [UNTESTED] * len(names)
-    for k, j in enumerate(tested.tolist()):
-        state[j] = MOVED if displacements.moved[k] else STABLE if displacements.stable[k] else ""
-    kept = [row[name] for name in scene.points]
-    return replace(
-        scene,
-        name=" to ".join(displacements.differences.names),
-        displacement=displacement[kept],
-        state=tuple(state[j] for j in kept),
-        notes=(
-            *scene.notes,
-            f"Displacements from {' to '.join(displacements.differences.names)}; standard deviations and "
-            " ellipsoids are those of the displacements.",
-        ),
-    )
-
-
-def measurement_viewer(measurement: Measurement, result: Solution) -> Viewer | None:
-    """Return the viewer in the coordinate system of a measurement; None without photographs."""
-    if not result.estimate.oriented.any():
-        return None
-    estimate, n = result.estimate, int(result.estimate.determined.sum())
-    positions = result.position_covariance
-    if measurement.alignment is not None:
-        estimate = measurement.alignment.aligned_from_object.apply_estimate(estimate)
-        positions = None
-    kept = np.flatnonzero(result.estimate.determined)
-    covariance = np.full((len(result.network.points), 3, 3), np.nan)
-    covariance[kept] = measurement.points.blocks[:n]
-    moved = replace(
-        result,
-        estimate=estimate,
-        point_covariance=covariance,
-        position_covariance=positions,
-        covariance=None,
-        unit=measurement.unit,
-    )
-    scene = scene_of_stored(moved)
-    worst = np.full(len(measurement.points.names), np.nan)
-    judged: list[Deviations | ShapeFit] = [*measurement.tolerances] or [*measurement.shapes]
-    for fit in judged:
-        value = fit.value if isinstance(fit, Deviations) else fit.deviation
-        larger = ~(np.abs(value) <= np.abs(worst[fit.points]))
-        worst[fit.points[larger]] = value[larger]
-    deviation = worst[:n]
-    if np.isfinite(deviation).any():
-        scene = replace(scene, deviation=deviation)
-    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
-
-
-def plan_viewer(plan: Plan) -> Viewer:
-    """Return the viewer of a plan: stations, rays and all points, including undetermined ones."""
-    p = plan.prediction
-    a = p.adjustment
-    m, n = np.nonzero(p.sight.seen)
-    network = Network(
-        p.stations.names,
-        p.stations.camera,
-        p.planned.names,
-        ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
-    )
-    estimate = Estimate(p.cameras, p.stations.position, p.stations.rotation, p.planned.xyz)
-    covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
-    of_position = np.full((len(p.stations), 3, 3), np.nan)
-    used = p.photograph >= 0
-    of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
-    solution = Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit)
-    return viewer_of(scene_of_stored(solution), Pictures())

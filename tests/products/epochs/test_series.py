@@ -15,8 +15,8 @@ from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import Remark, kinds_of
 from sfm.products.epochs.differences import Epoch, epoch_differences
 from sfm.products.epochs.displacements import find_displacements
+from sfm.products.epochs.page import describe_stable
 from sfm.products.epochs.series import EpochSeries, analyse_epochs, remarks_of_pair, verdict_of_epochs
-from sfm.report.epochs import describe_stable
 from sfm.report.pages import write_page
 from tests.products.epochs.scenes import POINTS, epoch
 from tests.synthetic import make_network, seed_of

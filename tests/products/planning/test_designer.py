@@ -16,6 +16,7 @@ from sfm.model.camera import camera_from_values, project
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
 from sfm.products.planning.designer import POWER, StationLimits, candidates, design_network, gains, image_rows
+from sfm.products.planning.page import DIAGRAM_PIXELS, design_diagram
 from sfm.products.planning.planned_object import PlannedObject, object_of_points, shape_object
 from sfm.products.planning.prediction import (
     MIN_RAYS,
@@ -34,7 +35,6 @@ from sfm.products.planning.stations import (
     roll_rotations,
 )
 from sfm.products.planning.visibility import Seeing, compute_target_size, sight_of
-from sfm.report.figures.comparisons import DIAGRAM_PIXELS, design_diagram
 from sfm.runtime.progress import Silent, StageClock
 from tests.synthetic import seed_of
 

@@ -17,13 +17,13 @@ from sfm.model.network import Network
 from sfm.model.remarks.remark import of_kind
 from sfm.model.solution import Solution
 from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
+from sfm.products.planning.further_page import headline, weakest
 from sfm.products.planning.plan import describe_plan, further_photographs, verdict_of_plan
 from sfm.products.planning.planned_object import shape_object
 from sfm.products.planning.prediction import WantedPrecision, predict_network
 from sfm.products.planning.stations import Stations, arrangement
 from sfm.products.planning.visibility import Seeing, TargetImage
 from sfm.products.rendering.planned_targets import PlannedTargets, planned_scene
-from sfm.report.further import headline, weakest
 from sfm.report.page import Banner
 from sfm.report.pages import page_of, write_page
 from sfm.targets.codes.plates import code_family

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain, compress
 from typing import Any
 
 import numpy as np
 
+from sfm.comparison.stable_points import point_blocks
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.distributions import POWER
+from sfm.model.solution import Solution
 from sfm.products.epochs.displacements import Displacements
 from sfm.products.epochs.series import BlockMotion, EpochPair, EpochSeries, verdict_of_epochs
-from sfm.report.figures.comparisons import difference_figure, plot_series
+from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
-from sfm.report.figures.plots import plot
+from sfm.report.figures.plots import plot, single_panel_figure
 from sfm.report.page import (
     YES,
     Column,
@@ -32,9 +35,13 @@ from sfm.report.page import (
     values_of,
 )
 from sfm.report.phrases import finer_unit, general, significant
-from sfm.report.viewer.embedded import displacements_viewer
+from sfm.report.viewer.embedded import Viewer, scene_of_stored, viewer_of
+from sfm.report.viewer.pictures import ViewerScene, cut_pictures
 
 MAX_NAMED = 12  # points in a sentence
+MAX_DRAWN = 12  # points drawn of a series: those that moved farthest
+MOVED, STABLE, UNTESTED = "moved", "stable", "not tested"  # in the viewer
+BANDS = "Displacements since the first epoch along their latest direction; bands of two standard deviations."
 PICTURE = (
     "Displacements. Arrows show the part in the object's main plane, red for points that moved; the colour "
     "of the dots shows the part out of the plane."
@@ -327,3 +334,91 @@ def _picture(displacements: Displacements, number: int) -> Plot | None:
 
 def _names(names: Iterable[str]) -> str:
     return listed(names, most=MAX_NAMED)
+
+
+def plot_series(series: EpochSeries) -> Plot | None:
+    """Plot the series of the points that moved farthest; None with two epochs, or if no point moved."""
+    if len(series.names) < 3:
+        return None
+    pairs = [pair.displacements for pair in series.since_first]
+    moved: dict[str, float] = {}
+    for displacements in pairs:
+        for k in np.flatnonzero(displacements.moved):
+            name = displacements.differences.points[k]
+            moved[name] = max(moved.get(name, 0.0), float(np.linalg.norm(displacements.displacement[k])))
+    chosen = sorted(moved, key=lambda name: -moved[name])[:MAX_DRAWN]
+    if not chosen:
+        return None
+    factor, unit = finer_unit(pairs[0].differences.unit, max(moved.values()))
+    picture = single_panel_figure(3.8)
+    axes = picture.subplots()
+    at = np.arange(len(series.names))
+    for name in chosen:
+        length, sigma = (factor * np.array(values) for values in _along(name, pairs))
+        (line,) = axes.plot(at, length, marker="o", ms=3, label=name)
+        axes.fill_between(
+            at, length - 2 * sigma, length + 2 * sigma, color=line.get_color(), alpha=0.15, lw=0
+        )
+    axes.axhline(0.0, color="grey", lw=0.8)
+    axes.set_xticks(at, series.names)
+    axes.set_ylabel(f"displacement [{unit}]")
+    axes.legend(fontsize=8, ncols=4, loc="upper left")
+    return plot("series", BANDS, picture)
+
+
+def _along(name: str, pairs: list[Displacements]) -> tuple[list[float], list[float]]:
+    """Return displacements of a point since the first epoch along its latest direction, and their sigmas."""
+    rows = [
+        displacements.differences.points.index(name) if name in displacements.differences.points else -1
+        for displacements in pairs
+    ]
+    last, k = next((epoch, k) for epoch, k in zip(reversed(pairs), reversed(rows), strict=True) if k >= 0)
+    direction = last.displacement[k] / max(float(np.linalg.norm(last.displacement[k])), 1e-300)
+    length, sigma = [0.0], [0.0]
+    for epoch, k in zip(pairs, rows, strict=True):
+        if k < 0:
+            length.append(np.nan)
+            sigma.append(np.nan)
+            continue
+        Q = epoch.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        length.append(float(epoch.displacement[k] @ direction))
+        sigma.append(float(np.sqrt(max(direction @ Q @ direction, 0.0))))
+    return length, sigma
+
+
+def displacements_viewer(series: EpochSeries) -> Viewer | None:
+    """Return the viewer of the first epoch with displacements to the last; None without photographs."""
+    if not series.first.result.estimate.oriented.any():
+        return None
+    scene = _scene_of_displacements(series.since_first[-1].displacements, series.first.result)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))
+
+
+def _scene_of_displacements(displacements: Displacements, first: Solution) -> ViewerScene:
+    """Return the scene of an epoch with the displacement of every point and the outcome of its test.
+
+    Standard deviations and ellipsoids are those of the displacements.
+    """
+    names = first.network.points
+    row = {name: j for j, name in enumerate(names)}
+    tested = np.array([row[name] for name in displacements.differences.points], dtype=np.int64)
+    covariance = np.full((len(names), 3, 3), np.nan)
+    covariance[tested] = point_blocks(displacements.covariance, 3)
+    scene = scene_of_stored(replace(first, point_covariance=covariance, covariance=None))
+    displacement = np.full((len(names), 3), np.nan)
+    displacement[tested] = displacements.displacement
+    state = [UNTESTED] * len(names)
+    for k, j in enumerate(tested.tolist()):
+        state[j] = MOVED if displacements.moved[k] else STABLE if displacements.stable[k] else ""
+    kept = [row[name] for name in scene.points]
+    return replace(
+        scene,
+        name=" to ".join(displacements.differences.names),
+        displacement=displacement[kept],
+        state=tuple(state[j] for j in kept),
+        notes=(
+            *scene.notes,
+            f"Displacements from {' to '.join(displacements.differences.names)}; standard deviations and "
+            " ellipsoids are those of the displacements.",
+        ),
+    )

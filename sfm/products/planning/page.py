@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from itertools import compress
 from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
 
 from sfm.adjustment.quality.statistics import reliability
 from sfm.files.result_tables import IN_FILES
@@ -15,13 +18,17 @@ from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray, angles_from_rotation
 from sfm.model.display import counted
 from sfm.model.distributions import LEVEL, POWER
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
 from sfm.model.observations.control_and_bars import ScaleBars
 from sfm.model.observations.pose import MountObservations
 from sfm.model.observations.tables import TABLES
+from sfm.model.solution import Solution
 from sfm.products.planning import MIN_PIXELS
 from sfm.products.planning.plan import Plan, verdict_of_plan
 from sfm.products.planning.prediction import found_displacement
 from sfm.products.planning.stations import Shot, Stations
+from sfm.products.planning.visibility import compute_target_size
 from sfm.products.planning.weakness import Calibratability, Contribution
 from sfm.report.page import (
     YES,
@@ -53,9 +60,12 @@ from sfm.report.phrases import (
     with_exponent,
 )
 from sfm.report.tables.summary import summary_of_rigs
-from sfm.report.viewer.embedded import plan_viewer
+from sfm.report.viewer.embedded import Viewer, scene_of_stored, viewer_of
+from sfm.report.viewer.pictures import Pictures
 
 MAX_NAMED = 12  # weak points listed
+SIZE_IN = (7.0, 4.5)  # of the design diagram
+DIAGRAM_PIXELS = (MIN_PIXELS, 10.0, 15.0, 20.0)  # px across the target, one line of the diagram each
 EXTERIOR = ("X", "Y", "Z", "omega_deg", "phi_deg", "kappa_deg")
 IMAGE_POINTS = ("image", "point", "x_px", "y_px", "sx_px", "sy_px")
 
@@ -452,3 +462,70 @@ def _spread(values: FloatArray, unit: str) -> str:
     """Write median and largest reliability, which is unlimited if nothing checks an image point."""
     median, largest = (or_unlimited(float(value)) for value in (np.median(values), values.max()))
     return f"{median} {unit} (median), {largest} at most"
+
+
+def design_diagram(
+    *,
+    w_mm: float,
+    d: float,
+    c_mm: float,
+    n: int,
+    unit: str,
+    tilt_deg: float = 0.0,
+    lines: Sequence[float] = DIAGRAM_PIXELS,
+) -> bytes:
+    """Return the design diagram as SVG: dot diameter over distance, with a line for each minimum size.
+
+    Args:
+        w_mm: width of the sensor, mm.
+        d: farthest distance of the camera from the object, where the diagram ends.
+        c_mm: principal distance (focal length), mm.
+        n: pixels along the width of the photograph.
+        unit: unit of the distance and the diameter.
+        tilt_deg: largest angle between the ray and the normal of a target, deg.
+        lines: minimum size of the target in the photograph for each line, px.
+
+    Raises:
+        GeometryError: a number is not positive, or targets are not recognised at this tilt.
+
+    Source: document 000, fig. 2.11, drawn there for 7 px and a camera of 18 mm.
+    """
+    figure = Figure(figsize=SIZE_IN, layout="constrained")
+    FigureCanvasSVG(figure)
+    axes = figure.add_subplot()
+    for pixels in lines:
+        end = compute_target_size(p=pixels, w_mm=w_mm, d=d, c_mm=c_mm, n=n, tilt_deg=tilt_deg).diameter
+        axes.plot([0, d], [0, end], gid=f"{pixels:g} px")  # in proportion
+        axes.annotate(f"{pixels:g} px", (d, end), xytext=(4, 0), textcoords="offset points", va="center")
+    axes.set(
+        xlim=(0, d),
+        ylim=(0, None),
+        xlabel=f"distance [{unit}]",
+        ylabel=f"diameter of the dot [{unit}]",
+        title=f"c = {c_mm:g} mm, sensor {w_mm:g} mm wide, {n} px, tilt up to {tilt_deg:g} deg",
+    )
+    axes.minorticks_on()
+    axes.grid(which="both", alpha=0.3)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def plan_viewer(plan: Plan) -> Viewer:
+    """Return the viewer of a plan: stations, rays and all points, including undetermined ones."""
+    p = plan.prediction
+    a = p.adjustment
+    m, n = np.nonzero(p.sight.seen)
+    network = Network(
+        p.stations.names,
+        p.stations.camera,
+        p.planned.names,
+        ImagePoints(m, n, p.sight.xy[m, n], p.sight.covariance[m, n]),
+    )
+    estimate = Estimate(p.cameras, p.stations.position, p.stations.rotation, p.planned.xyz)
+    covariance = np.where(np.isfinite(p.covariance), p.covariance, np.nan)
+    of_position = np.full((len(p.stations), 3, 3), np.nan)
+    used = p.photograph >= 0
+    of_position[used] = a.covariance.exterior[p.photograph[used], :3, :3]
+    solution = Solution(plan.name, network, estimate, covariance, of_position, unit=plan.unit)
+    return viewer_of(scene_of_stored(solution), Pictures())

@@ -3,23 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import chain, compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from sfm.files.covariance_file import write_covariance
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.display import counted, plural
 from sfm.model.solution import MAX_POINTS, Solution
 from sfm.products.geometry.alignment import Alignment
 from sfm.products.geometry.shapes.fit import ShapeFit
-from sfm.products.geometry.tolerance import DECISIONS, Deviations
+from sfm.products.geometry.tolerance import DECISIONS, IN, OUT, Deviations
 from sfm.products.inspection.acceptance import Acceptance
 from sfm.products.inspection.measure import Measurement
-from sfm.report.figures.comparisons import deviation_figure, length_error_figure
-from sfm.report.figures.plots import plot
+from sfm.report.figures.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    plot,
+    single_panel_figure,
+    two_panel_figure,
+)
 from sfm.report.page import (
     Column,
     FoldedParts,
@@ -35,13 +46,16 @@ from sfm.report.page import (
     tested_section,
     values_of,
 )
-from sfm.report.phrases import fixed, general, signed, significant, with_sigma
-from sfm.report.viewer.embedded import measurement_viewer
+from sfm.report.phrases import finer_unit, fixed, general, signed, significant, with_sigma
+from sfm.report.viewer.embedded import Viewer, scene_of_stored, viewer_of
+from sfm.report.viewer.pictures import cut_pictures
 
 PICTURE = (
     "Length measurement error over length. Bars are the expanded uncertainty of the calibration, lines the "
     "limit A + K L, at most B."
 )
+BINS = 30  # of a histogram
+COLOURS = {IN: GREEN, OUT: RED}
 METHODS = {"3-2-1": "3-2-1", "features": "by features", "points": "best fit to nominal points"}
 USED = ("no", "yes")
 
@@ -490,3 +504,88 @@ def acceptance_page(acceptance: Acceptance) -> Page:
         ),
         summary=summary,
     )
+
+
+def deviation_figure(deviations: Deviations, unit: str) -> Figure:
+    """Draw a histogram of the deviations, and each deviation with its uncertainty in ascending order."""
+    limits = [x for x in (deviations.lower, deviations.upper) if np.isfinite(x)]
+    largest = float(np.abs([*deviations.value, *limits]).max())
+    factor, fine = finer_unit(unit, largest)
+    value, U = deviations.value * factor, deviations.coverage * np.nan_to_num(deviations.sigma) * factor
+    picture = two_panel_figure(3.6)
+    left, right = picture.subplots(1, 2)
+    left.hist(value, bins=min(BINS, max(5, len(value) // 3)), color=BLUE, alpha=0.8)
+    left.set(xlabel=f"deviation [{fine}]", ylabel="points")
+    order = np.argsort(value, kind="stable")
+    x = np.arange(1, len(order) + 1)
+    _draw_decided(right, x, value[order], U[order], np.array(deviations.decision)[order], 3)
+    for limit in limits:
+        left.axvline(limit * factor, color=GREY, lw=1, ls="--")
+        right.axhline(limit * factor, color=GREY, lw=1, ls="--")
+    right.set(xlabel="points in order of their deviation", ylabel=f"deviation and U [{fine}]")
+    right.legend(fontsize=8, loc="upper left")
+    return picture
+
+
+def length_error_figure(acceptance: Acceptance) -> Figure:
+    """Draw the length measurement errors over the length, with their limits."""
+    length, error = acceptance.lengths.length, acceptance.error
+    U = acceptance.coverage * np.nan_to_num(acceptance.lengths.sigma)
+    factor, fine = finer_unit(acceptance.unit, float(max(np.abs(error).max(), acceptance.limit.max())))
+    picture = single_panel_figure(4.2)
+    axes = picture.subplots()
+    x = np.linspace(0, 1.05 * float(length.max()), 200)
+    limit = np.minimum(acceptance.a + acceptance.k * x, acceptance.b) * factor
+    axes.plot(x, limit, color=GREY, lw=1.2)
+    axes.plot(x, -limit, color=GREY, lw=1.2)
+    axes.axhline(0, color=GREY, lw=0.6)
+    _draw_decided(axes, length, error * factor, U * factor, np.array(acceptance.decision), 4)
+    axes.set(
+        xlabel=f"calibrated length [{acceptance.unit}]",
+        ylabel=f"measured minus calibrated [{fine}]",
+    )
+    axes.legend(fontsize=8, loc="upper left")
+    return picture
+
+
+def _draw_decided(
+    axes: Axes, x: AnyArray, y: FloatArray, U: FloatArray, decision: AnyArray, size: float
+) -> None:
+    """Draw values with their uncertainty, one colour per decision."""
+    for name in dict.fromkeys(decision.tolist()):
+        rows = decision == name
+        colour, label = COLOURS.get(name, ORANGE), f"{name} ({rows.sum()})"
+        axes.errorbar(x[rows], y[rows], yerr=U[rows], fmt="o", ms=size, lw=0.8, color=colour, label=label)
+
+
+def measurement_viewer(measurement: Measurement, result: Solution) -> Viewer | None:
+    """Return the viewer in the coordinate system of a measurement; None without photographs."""
+    if not result.estimate.oriented.any():
+        return None
+    estimate, n = result.estimate, int(result.estimate.determined.sum())
+    positions = result.position_covariance
+    if measurement.alignment is not None:
+        estimate = measurement.alignment.aligned_from_object.apply_estimate(estimate)
+        positions = None
+    kept = np.flatnonzero(result.estimate.determined)
+    covariance = np.full((len(result.network.points), 3, 3), np.nan)
+    covariance[kept] = measurement.points.blocks[:n]
+    moved = replace(
+        result,
+        estimate=estimate,
+        point_covariance=covariance,
+        position_covariance=positions,
+        covariance=None,
+        unit=measurement.unit,
+    )
+    scene = scene_of_stored(moved)
+    worst = np.full(len(measurement.points.names), np.nan)
+    judged: list[Deviations | ShapeFit] = [*measurement.tolerances] or [*measurement.shapes]
+    for fit in judged:
+        value = fit.value if isinstance(fit, Deviations) else fit.deviation
+        larger = ~(np.abs(value) <= np.abs(worst[fit.points]))
+        worst[fit.points[larger]] = value[larger]
+    deviation = worst[:n]
+    if np.isfinite(deviation).any():
+        scene = replace(scene, deviation=deviation)
+    return viewer_of(scene, cut_pictures(scene, {}, budget_mb=0.0))

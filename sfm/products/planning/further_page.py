@@ -9,10 +9,10 @@ import numpy as np
 from sfm.model.display import counted
 from sfm.model.remarks.verdict import Line
 from sfm.model.solution import Solution
+from sfm.products.planning.page import exterior_table, shot_columns, shot_rows
 from sfm.products.planning.plan import Further
 from sfm.report.page import Banner, Column, Note, Page, Section, Table
 from sfm.report.phrases import length_of
-from sfm.report.planning import exterior_table, shot_columns, shot_rows
 from sfm.report.viewer.embedded import scene_of_stored, viewer_of
 from sfm.report.viewer.pictures import Pictures
 
