@@ -71,7 +71,14 @@ def read_sba_text(
     elif calibration is None:
         raise SurveyFileError(f"{cameras}: cameras without calibration, a calibration matrix is needed")
     else:
-        inner, camera = _calibration(calibration)[None], np.zeros(len(rows), dtype=np.int64)
+        lines = list(_rows(calibration, 4))
+        if [len(values) for _, values in lines] != [3, 3, 3] or not lines[0][1][0] > 0:
+            raise SurveyFileError(
+                f"{calibration}, line {lines[-1][0]}: three lines of 3 numbers are needed, a matrix K"
+            )
+        K = np.array([values for _, values in lines])
+        inner = np.array([[K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], K[0, 1]]])
+        camera = np.zeros(len(rows), dtype=np.int64)
     made = tuple(
         _camera(f"camera {a + 1}", values, (size[0], size[1]), cameras) for a, values in enumerate(inner)
     )
@@ -184,14 +191,6 @@ def _camera(name: str, values: FloatArray, size_px: tuple[int, int], path: Path)
         c_mm=fu,
         values=(("fx", fu), ("fy", fu * aspect), ("cx", u0), ("cy", v0)),
     )
-
-
-def _calibration(path: Path) -> FloatArray:
-    rows = list(_rows(path, 4))
-    if [len(values) for _, values in rows] != [3, 3, 3] or not rows[0][1][0] > 0:
-        raise SurveyFileError(f"{path}, line {rows[-1][0]}: three lines of 3 numbers are needed, a matrix K")
-    K = np.array([values for _, values in rows])
-    return np.array([K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], K[0, 1]])
 
 
 def _points(path: Path, frames: int) -> tuple[ImagePoints, FloatArray]:

@@ -45,8 +45,14 @@ def write_survey_file(folder: Path, content: Content, *, title: str) -> None:
     if result.unit in METRES:
         unit = f"unit = {_text(result.unit)}"
     lines = ["[survey]", f"name = {_text(title)}", unit, ""]
+    seen = network.interior
     for camera, images, varying in _families(network, estimate):
-        lines += [*_camera(camera, images, _weighted(network, estimate, camera), varying), ""]
+        weighted = {}  # value and standard deviation of the weighted parameters
+        for k, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
+            observed = estimate.cameras[k]
+            if camera.name in (observed.name, observed.owner_of(s)) and camera.model == observed.model:
+                weighted[observed.names[s]] = (float(value), float(sigma))
+        lines += [*_camera(camera, images, weighted, varying), ""]
     lines += _rigs(folder, network, estimate)
     lines += ["[observations]", 'file = "image_points.csv"', ""]
     lines += [
@@ -126,16 +132,6 @@ def _families(network: Network, estimate: Estimate) -> Iterator[tuple[Camera, li
         names = [name for k in members for name in images[k]]
         if names:
             yield camera, names, varying
-
-
-def _weighted(network: Network, estimate: Estimate, camera: Camera) -> dict[str, tuple[float, float]]:
-    """Return value and standard deviation of the weighted parameters of a camera."""
-    seen, weighted = network.interior, {}
-    for k, s, value, sigma in zip(seen.camera, seen.parameter, seen.value, seen.sigma, strict=True):
-        observed = estimate.cameras[k]
-        if camera.name in (observed.name, observed.owner_of(s)) and camera.model == observed.model:
-            weighted[observed.names[s]] = (float(value), float(sigma))
-    return weighted
 
 
 def _exterior(network: Network) -> str:

@@ -445,15 +445,6 @@ def _form_parameters(kind: Kind, form: FloatArray) -> Iterator[_Parameter]:
             yield "diameter", "length", 2 * form[k : k + 1], 2 * derivatives
 
 
-def _apex(shape: Shape, at: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the apex of a cone, where its radius is 0 (along = -r / tan), and its derivatives, (3, 8)."""
-    R, (r, angle) = shape.rotation, shape.form
-    along = -r / np.tan(angle)
-    by_apex = at + along * direction
-    by_apex[:, 6:] = np.outer(R[:, 2], np.array([-1 / np.tan(angle), r / np.sin(angle) ** 2]))
-    return shape.origin + along * R[:, 2], by_apex
-
-
 def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     """Return the parameters of a shape.
 
@@ -473,7 +464,10 @@ def parameters_of(shape: Shape) -> tuple[Parameters, FloatArray, FloatArray]:
     direction[:, 3], direction[:, 4] = -R[:, 1], R[:, 0]
     place, by_place = shape.origin, at
     if kind.name == "cone" and abs(form[1]) > 1e-9:
-        place, by_place = _apex(shape, at, direction)
+        r, angle = form
+        along = -r / np.tan(angle)  # of the apex, where the radius is 0
+        place, by_place = shape.origin + along * R[:, 2], at + along * direction
+        by_place[:, 6:] = np.outer(R[:, 2], np.array([-1 / np.tan(angle), r / np.sin(angle) ** 2]))
     rows.append((kind.place, "coordinate", place, by_place))
     if kind.name != "sphere":
         rows.append(("direction", "direction", R[:, 2], direction))
