@@ -124,9 +124,9 @@ class BatchTable:
         if self._failed:
             text += f", {self._failed} failed"
         if run_share >= MIN_DONE_SHARE and self._left:
-            minutes, seconds = divmod(round((now - self._begun) * (1 / run_share - 1)), 60)
+            minutes, over = divmod(round((now - self._begun) * (1 / run_share - 1)), 60)
             hours, minutes = divmod(minutes, 60)
-            rest = f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+            rest = f"{minutes} min {over} s" if minutes else f"{over} s"
             text += f", about {f'{hours} h {minutes} min' if hours else rest} left"
         table = RichTable(box=None, padding=(0, 2, 0, 0), caption=text, caption_justify="left")
         for name in ("survey", "stage", "photographs", "seconds"):
