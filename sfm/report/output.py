@@ -32,7 +32,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from sfm.adjustment.result import Adjustment
 from sfm.files.covariance_file import write_covariance
 from sfm.files.csv_tables import read_table
 from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, refuse_foreign_folder
@@ -41,7 +40,6 @@ from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
 from sfm.judgement.checks import adjusted_sigmas, root_mean_square
 from sfm.judgement.survey_result import StageTime, SurveyResult
-from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.remarks.remark import remark
@@ -208,6 +206,10 @@ def plot_data(findings: Findings) -> PlotData:
         [root_mean_square(of_point) for of_point in adjusted_sigmas(adjustment.covariance.points)]
     )
     factor, unit = finer_unit(findings.result.length_unit, float(findings.precision.largest[3]))
+    # Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r
+    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
+    r = adjustment.redundancy_numbers[used]
+    sigma_v = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
     centre = np.array([camera.frame[:2] for camera in estimate.cameras])
     sizes = {camera.name: camera.size_px for camera in estimate.cameras}
     return PlotData(
@@ -224,7 +226,7 @@ def plot_data(findings: Findings) -> PlotData:
         xy=seen.xy,
         from_centre=seen.xy - centre[network.camera[seen.image]],
         residuals=adjustment.residuals[used],
-        standardised=_standardised_residuals(adjustment),
+        standardised=(adjustment.residuals[used] / sigma_v).ravel(),
         image_rms_px=geometry.image_rms_px,
         image_points=geometry.image_points,
         rms_px=adjustment.rms_px,
@@ -248,18 +250,6 @@ def plot_data(findings: Findings) -> PlotData:
             if mount.epipolar is not None and len(mount.epipolar.px)
         ),
     )
-
-
-def _standardised_residuals(adjustment: Adjustment) -> FloatArray:
-    """Return accepted residuals over their standard deviations a posteriori, shape (2k,).
-
-    Source: Baarda (1968): sigma of v = sigma0 * sigma * sqrt(r) with the redundancy number r.
-    """
-    used = ~adjustment.rejected
-    variance = np.einsum("kii->ki", adjustment.image_covariance[used])
-    r = adjustment.redundancy_numbers[used]
-    sigma = adjustment.sigma0 * np.sqrt(np.where(r > 1e-6, variance * r, np.nan))
-    return np.asarray((adjustment.residuals[used] / sigma).ravel())
 
 
 @dataclass(frozen=True)

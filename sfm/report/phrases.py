@@ -71,22 +71,18 @@ def describe_test(test: GlobalTest, adjustment: Adjustment | None = None) -> str
     r = f"{test.redundancy:.1f}".removesuffix(".0")
     said = "passed" if test.passed else "NOT passed, worse than stated"
     if not test.passed and test.statistic < test.lower:
-        said = f"better than stated, {_fitting_sigmas(test, adjustment)} would fit"
+        factor, a = float(np.sqrt(test.statistic / test.redundancy)), adjustment
+        fitting = f"{significant(factor)} times the stated standard deviations"
+        if a is not None and a.observations == 2 * int((~a.rejected).sum()):
+            measured = a.stated_px**2 - a.sigma_px**2  # part stated for targets; sigma_px is added to it
+            left = (factor * a.stated_px) ** 2 - measured
+            if 0 <= measured < 0.5 * a.stated_px**2 and left > 0:
+                fitting = f"sigma_px = {significant(float(np.sqrt(left)))}"
+        said = f"better than stated, {fitting} would fit"
     return (
         f"{test.of}: {said}; v'Pv = {test.statistic:.2f}, chi-square of {r} between {test.lower:.2f} and "
         f"{test.upper:.2f} ({percent(1 - test.alpha)})"
     )
-
-
-def _fitting_sigmas(test: GlobalTest, a: Adjustment | None) -> str:
-    """Return the stated standard deviations that would pass a test, as sigma_px if that determines them."""
-    factor = float(np.sqrt(test.statistic / test.redundancy))
-    if a is not None and a.observations == 2 * int((~a.rejected).sum()):
-        measured = a.stated_px**2 - a.sigma_px**2  # part stated for targets; sigma_px is added to it
-        left = (factor * a.stated_px) ** 2 - measured
-        if 0 <= measured < 0.5 * a.stated_px**2 and left > 0:
-            return f"sigma_px = {significant(float(np.sqrt(left)))}"
-    return f"{significant(factor)} times the stated standard deviations"
 
 
 def describe_weights(result: SurveyResult) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.engine.accumulate import Blocks
-from sfm.adjustment.engine.collinearity import State, sum_of_squares
+from sfm.adjustment.engine.collinearity import sum_of_squares
 from sfm.adjustment.engine.normals import new_space, normal_equations
 from sfm.adjustment.engine.observed import observed_of
 from sfm.adjustment.engine.unknowns import Unknowns, estimate_of, start_weights, step, unknowns_of
@@ -241,7 +241,14 @@ def adjust_separately(
         for move in (_point_step, _orientation_step):
             normals = normal_equations(layout, observed, state, weight, space=space)
             reduced, points = move(normals.blocks, layout)
-            state, vPv = _halve_step(layout, state, weight, reduced, points, vPv)
+            share = 1.0
+            while share >= MIN_STEP_SHARE:  # halved until v'Pv does not increase
+                moved = step(layout, state, share * reduced, share * points)
+                reached = float(sum_of_squares(layout.observations, moved, weight))
+                if reached <= vPv:
+                    state, vPv = moved, reached
+                    break
+                share /= 2
         if before - vPv <= tolerance * before:
             return SeparateAdjustment(estimate_of(state, estimate), vPv, number, True)
     return SeparateAdjustment(estimate_of(state, estimate), vPv, max_rounds, False)
@@ -273,17 +280,3 @@ def _orientation_step(blocks: Blocks, layout: Unknowns) -> tuple[FloatArray, Flo
     dx = np.zeros(layout.reduced)
     dx[on] = -scale * cho_solve(factored, scale * g[on])
     return dx, np.zeros(layout.point_free.shape)
-
-
-def _halve_step(
-    layout: Unknowns, state: State, weight: FloatArray, reduced: FloatArray, points: FloatArray, vPv: float
-) -> tuple[State, float]:
-    """Halve the step until v'Pv does not increase, and return the new state and its v'Pv."""
-    share = 1.0
-    while share >= MIN_STEP_SHARE:
-        moved = step(layout, state, share * reduced, share * points)
-        reached = float(sum_of_squares(layout.observations, moved, weight))
-        if reached <= vPv:
-            return moved, reached
-        share /= 2
-    return state, vPv

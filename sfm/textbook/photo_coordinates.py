@@ -90,7 +90,14 @@ def distort_photo_coordinates(xy_mm: FloatArray, corrections: PhotoCorrections, 
     """
     xy = np.asarray(xy_mm, dtype=float)
     for step in reversed(_steps(corrections, c_mm)):
-        xy = _inverse(step, xy)
+        target = xy
+        for _ in range(INVERSE_STEPS):  # corrections are small compared with coordinates
+            miss = target - step(xy)
+            xy = xy + miss
+            if np.nanmax(np.abs(miss), initial=0.0) < INVERSE_TOLERANCE_MM:
+                break
+        else:
+            raise GeometryError("photo coordinates: a correction is too strong to be inverted")
     return xy + corrections.principal_point_mm
 
 
@@ -264,17 +271,6 @@ def _decentring(xy: FloatArray, P1: float, P2: float) -> FloatArray:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     return np.stack([P1 * (r2 + 2 * x * x) + 2 * P2 * x * y, P2 * (r2 + 2 * y * y) + 2 * P1 * x * y], axis=-1)
-
-
-def _inverse(step: Callable[[FloatArray], FloatArray], target: FloatArray) -> FloatArray:
-    """Solve step(xy) = target by fixed-point iteration; corrections are small compared with coordinates."""
-    xy = target
-    for _ in range(INVERSE_STEPS):
-        miss = target - step(xy)
-        xy = xy + miss
-        if np.nanmax(np.abs(miss), initial=0.0) < INVERSE_TOLERANCE_MM:
-            return xy
-    raise GeometryError("photo coordinates: a correction is too strong to be inverted")
 
 
 def _sign(rows: str) -> float:

@@ -95,10 +95,8 @@ def epoch_differences(first: Epoch, second: Epoch) -> Differences:
                 f"{epoch.name}: the covariance of all points together (point_covariance.npy) is missing; run "
                 "the survey again with this version"
             )
-    _refuse_same_photographs(first, second)
     together = first.common is not None and second.common is not None
-    if not together:
-        _refuse_shared_calibration(first, second)
+    _refuse_dependent(first, second, together=together)
     a, b = _with_prefixed_photographs(first.result, "a"), _with_prefixed_photographs(second.result, "b")
     pairing = pair_results(a, b)
     pa, pb = pairing.points.T
@@ -178,16 +176,15 @@ def _held_values(result: Solution) -> dict[str, tuple[tuple[str, float], ...]]:
     return held_values
 
 
-def _refuse_same_photographs(first: Epoch, second: Epoch) -> None:
-    """Refuse the same survey under two names, with displacements and standard deviations of 0."""
+def _refuse_dependent(first: Epoch, second: Epoch, *, together: bool) -> None:
+    """Refuse the same survey under two names, and a shared calibration unless adjusted together."""
     a, b = (epoch.result.network.image_points.xy for epoch in (first, second))
     if len(a) and a.shape == b.shape and np.array_equal(a, b):
         raise GeometryError(
             f"{first.name} and {second.name} have the same image points: they are one epoch, not two"
         )
-
-
-def _refuse_shared_calibration(first: Epoch, second: Epoch) -> None:
+    if together:
+        return
     theirs = {(camera, parameter): value for camera, parameter, value, _ in second.interior}
     for camera, parameter, value, _ in first.interior:
         other = theirs.get((camera, parameter))

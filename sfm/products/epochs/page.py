@@ -194,6 +194,10 @@ def _section(pair: EpochPair, number: int) -> Section:
         f"be detected with a probability of {general(100 * POWER, 2)} %."
     )
     points = (Table(_columns(factor, unit), _rows(displacements)), limits)
+    picture = None
+    if lengths.max() > 0:
+        figure = difference_figure(d.xyz, displacements.displacement, displacements.moved, d.unit)
+        picture = plot(f"displacements-{number}", PICTURE, figure)
     return Section(
         " to ".join(d.names),
         Table((Column(), Column("value", format=str)), [row for row in common if row[1]]),
@@ -201,7 +205,7 @@ def _section(pair: EpochPair, number: int) -> Section:
         Paragraph(describe_stable(displacements)),
         _steps(displacements),
         test,
-        _picture(displacements, number),
+        picture,
         FoldedParts(counted(len(d.points), "point"), *points, open=bool(displacements.moved.any())),
         *chain.from_iterable(_block(block, factor, unit) for block in pair.blocks),
         *_mounts(pair, factor, unit),
@@ -322,14 +326,6 @@ def _pair(pair: EpochPair) -> dict[str, Any]:
             values_of(mount, "camera difference sigma statistic critical changed") for mount in pair.mounts
         ],
     }
-
-
-def _picture(displacements: Displacements, number: int) -> Plot | None:
-    if not np.linalg.norm(displacements.displacement, axis=1).max() > 0:
-        return None
-    d = displacements.differences
-    figure = difference_figure(d.xyz, displacements.displacement, displacements.moved, d.unit)
-    return plot(f"displacements-{number}", PICTURE, figure)
 
 
 def _names(names: Iterable[str]) -> str:

@@ -87,9 +87,8 @@ def adjust_together(epochs: Sequence[Epoch]) -> tuple[tuple[Epoch, ...], tuple[S
     """
     shared = _shared_cameras(epochs)
     alone = [_adjust_alone(epoch, shared) for epoch in epochs]
-    keys = _shared_keys(alone)
+    keys, given = _shared_values(alone)
     conditions, owner = _conditions(alone, shared)
-    given = [_given_columns(single, keys) for single in alone]
     q = len(owner)
     sizes = [len(single.values) for single in alone]
     M, w = np.zeros((q, q)), np.zeros(q)
@@ -257,23 +256,24 @@ def _refuse_another(epoch: Epoch, a: Adjustment, Q: FloatArray, points: IntArray
         )
 
 
-def _shared_keys(alone: Sequence[_Alone]) -> tuple[str, ...]:
-    """Return the given values that two or more epochs share."""
+def _shared_values(alone: Sequence[_Alone]) -> tuple[tuple[str, ...], list[FloatArray]]:
+    """Return the given values that two or more epochs share, and their columns in each, (p + 3 k, g).
+
+    The column of a value that an epoch does not have is zero.
+    """
     keys: dict[str, None] = {}
     for k, single in enumerate(alone):
         for key, (_, value) in single.given.items():
             earlier = [other.given[key][1] for other in alone[:k] if key in other.given]
             if any(abs(a - value) <= MAX_SAME_DIFFERENCE * max(abs(a), 1.0) for a in earlier):
                 keys[f"{key} = {value:.12g}"] = None
-    return tuple(keys)
-
-
-def _given_columns(single: _Alone, keys: tuple[str, ...]) -> FloatArray:
-    """Return the columns of shared given values, zero for those not given in this epoch, (p + 3 k, g)."""
-    columns = {f"{key} = {value:.12g}": column for key, (column, value) in single.given.items()}
-    nothing = np.zeros(len(single.covariance))
-    shared = [columns.get(key, nothing) for key in keys]
-    return np.stack(shared, axis=1) if shared else np.zeros((len(nothing), 0))
+    shared = []
+    for single in alone:
+        columns = {f"{key} = {value:.12g}": column for key, (column, value) in single.given.items()}
+        nothing = np.zeros(len(single.covariance))
+        A = [columns.get(key, nothing) for key in keys]
+        shared.append(np.stack(A, axis=1) if A else np.zeros((len(nothing), 0)))
+    return tuple(keys), shared
 
 
 def _conditions(

@@ -200,18 +200,16 @@ def write_sheet(sheet: Sheet, path: Path) -> tuple[Path, ...]:
         with disk_errors(f"{name}: the sheet cannot be written"):
             if name.is_dir():
                 raise OutputError(f"{name}: is a folder, needed the name of a file")
-            if name.exists() and not (name.is_file() and CHECK.encode() in _head(name)):
+            beginning = b""
+            if name.is_file():
+                with name.open("rb") as file:
+                    beginning = file.read(MAX_SHEET_BYTES)
+            if name.exists() and CHECK.encode() not in beginning:
                 raise OutputError(f"{name}: exists and is not an earlier sheet, needed another name")
     with ExitStack() as files:
         for name, content in zip(names, contents, strict=True):
             files.enter_context(whole_file(name, "the sheet", replaces=True)).write_bytes(content)
     return tuple(names)
-
-
-def _head(path: Path) -> bytes:
-    """Return the beginning of a file, up to the largest size of a sheet."""
-    with path.open("rb") as file:
-        return file.read(MAX_SHEET_BYTES)
 
 
 @dataclass(frozen=True)

@@ -107,8 +107,11 @@ def match_windows(
     rows, reference, limits = keys.rows if rows is None else rows, keys.reference, keys.limits
     window_px = size.window_px
     shrink = size.shrink
-    network, estimate = _reduce_model(keys.network, estimate, shrink)
-    seen, camera = network.image_points, network.camera
+    # the model in the pixels of reduced photographs
+    network, camera = keys.network, keys.network.camera
+    seen = network.image_points
+    seen = replace(seen, xy=(seen.xy + 0.5) / shrink - 0.5, covariance=seen.covariance / shrink**2)
+    estimate = replace(estimate, cameras=tuple(camera.reduced(shrink) for camera in estimate.cameras))
     xy, covariance = np.full((len(seen), 2), np.nan), np.full((len(seen), 2, 2), np.nan)
     flag = np.zeros(len(seen), dtype=np.int64)
     at_template, number = np.zeros((len(reference), 2, 2)), np.zeros(len(reference), dtype=np.int64)
@@ -150,14 +153,6 @@ def match_windows(
     xy[reference[measured]] = place[reference[measured]]
     covariance[reference[measured]] = at_template[measured] / number[measured, None, None]
     return Windows(shrink * (xy + 0.5) - 0.5, shrink**2 * covariance, flag)
-
-
-def _reduce_model(network: Network, estimate: Estimate, shrink: int) -> tuple[Network, Estimate]:
-    """Return a model in the pixels of reduced photographs."""
-    seen = network.image_points
-    small = replace(seen, xy=(seen.xy + 0.5) / shrink - 0.5, covariance=seen.covariance / shrink**2)
-    cameras = tuple(camera.reduced(shrink) for camera in estimate.cameras)
-    return replace(network, image_points=small), replace(estimate, cameras=cameras)
 
 
 def best_size(

@@ -85,12 +85,21 @@ def render_photograph(
     view = _View(camera, position, rotation, rays)
     for face in painting_order(scene, position):
         _paint_face(fine, scene, int(face), view, n, scratch)
-    sigma = optics.blur_px * n
-    if sigma > 0:
-        reach = 2 * math.ceil(5 * sigma) + 1
-        cv2.GaussianBlur(fine, (reach, reach), sigma, dst=fine, borderType=cv2.BORDER_REPLICATE)
+    blur = optics.blur_px * n
+    if blur > 0:
+        reach = 2 * math.ceil(5 * blur) + 1
+        cv2.GaussianBlur(fine, (reach, reach), blur, dst=fine, borderType=cv2.BORDER_REPLICATE)
     light = fine.reshape(height, n, width, n).mean(axis=(1, 3), dtype=np.float32)
-    return _expose(light, optics, rng), project_targets(scene, camera, position, rotation)
+    y, x = np.ogrid[:height, :width]
+    corner = (width / 2) ** 2 + (height / 2) ** 2
+    r2 = ((x - (width - 1) / 2) ** 2 + (y - (height - 1) / 2) ** 2) / corner
+    signal = light * (optics.exposure * (1 - optics.vignetting * r2)).astype(np.float32)
+    sigma = np.sqrt(optics.noise**2 + optics.shot_noise**2 * np.clip(signal, 0, None))
+    signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32)
+    full = 2**optics.bits - 1
+    intensities = np.clip(np.rint(signal * full), 0, full)
+    photograph = np.asarray(intensities.astype(np.uint8 if optics.bits == 8 else np.uint16))
+    return photograph, project_targets(scene, camera, position, rotation)
 
 
 def render_photographs(
@@ -146,20 +155,6 @@ def corner_rays(camera: Camera) -> FloatArray:
             f"camera {camera.name}: its distortion cannot be inverted everywhere in the photograph"
         )
     return uv.reshape(height + 1, width + 1, 2)
-
-
-def _expose(light: FloatArray, optics: Optics, rng: np.random.Generator) -> AnyArray:
-    """Return the intensities that the sensor records for the light on it."""
-    height, width = light.shape
-    y, x = np.ogrid[:height, :width]
-    corner = (width / 2) ** 2 + (height / 2) ** 2
-    r2 = ((x - (width - 1) / 2) ** 2 + (y - (height - 1) / 2) ** 2) / corner
-    signal = light * (optics.exposure * (1 - optics.vignetting * r2)).astype(np.float32)
-    sigma = np.sqrt(optics.noise**2 + optics.shot_noise**2 * np.clip(signal, 0, None))
-    signal += sigma * rng.standard_normal(signal.shape, dtype=np.float32)
-    full = 2**optics.bits - 1
-    intensities = np.clip(np.rint(signal * full), 0, full)
-    return np.asarray(intensities.astype(np.uint8 if optics.bits == 8 else np.uint16))
 
 
 class _View(NamedTuple):
@@ -341,7 +336,14 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
     must_precede = may_precede & ~may_precede.T
     distance = np.linalg.norm(faces.centre - position, axis=1)
     rest = list(turned[np.argsort(-distance[turned], kind="stable")])
-    must_precede &= ~_disjoint(corners - position, slack)
+    # Two convex images are disjoint if a plane through the camera and an edge of one has the other outside.
+    from_camera = corners - position
+    sight = np.cross(from_camera, np.roll(from_camera, -1, axis=1))  # normals of these planes
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    side = np.einsum("fei,gci->fegc", sight, from_camera)
+    inner = np.einsum("fei,fi->fe", sight, from_camera.mean(axis=1))
+    outside = (side * -np.sign(inner)[:, :, None, None] >= -slack).all(axis=3).any(axis=1)
+    must_precede &= ~(outside | outside.T)
     order: list[int] = []
     while rest:
         ready = [g for g in rest if not any(must_precede[f, g] for f in rest)]
@@ -349,19 +351,6 @@ def painting_order(scene: Scene, position: FloatArray) -> IntArray:
         order.append(int((ready or rest)[0]))
         rest.remove(order[-1])
     return np.array(order, dtype=np.int64)
-
-
-def _disjoint(corners: FloatArray, slack: float) -> BoolArray:
-    """Return which faces have disjoint images, (f, f), from their corners minus the camera, (f, 4, 3).
-
-    Two convex images are disjoint if a plane through the camera and an edge of one has the other outside.
-    """
-    sight = np.cross(corners, np.roll(corners, -1, axis=1))  # normals of these planes
-    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-    side = np.einsum("fei,gci->fegc", sight, corners)
-    inner = np.einsum("fei,fi->fe", sight, corners.mean(axis=1))
-    outside = (side * -np.sign(inner)[:, :, None, None] >= -slack).all(axis=3).any(axis=1)
-    return np.asarray(outside | outside.T)
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,17 @@ def plot(stem: str, caption: str, figure: Figure) -> Plot:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())[:, :, :3]  # type: ignore[no-untyped-call]
-    return Plot(
-        stem, caption, _png(pixels), tuple(_png(pixels[rows, columns]) for rows, columns in _cells(figure))
-    )
+    specs = [panel.get_subplotspec() for panel in figure.axes if panel.axison]
+    shown = [spec.get_topmost_subplotspec() for spec in specs if spec is not None]
+    grid = shown[0].get_gridspec()
+    _, tops, lefts, _ = (np.asarray(edge) for edge in grid.get_grid_positions(figure))
+    width, height = figure.get_size_inches() * DPI
+    # edges of the panels, px, each with its labels
+    x = [0, *np.rint(lefts[1:] * width - LEFT_IN * DPI).astype(int), round(width)]
+    y = [0, *np.rint((1 - tops[1:]) * height - TOP_IN * DPI).astype(int), round(height)]
+    positions = dict.fromkeys((spec.rowspan.start, spec.colspan.start) for spec in shown)
+    panels = tuple(_png(pixels[y[r] : y[r + 1], x[c] : x[c + 1]]) for r, c in positions)
+    return Plot(stem, caption, _png(pixels), panels)
 
 
 def _png(pixels: AnyArray) -> bytes:
@@ -70,19 +78,6 @@ def _png(pixels: AnyArray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG", compress_level=COMPRESSION)
     return buffer.getvalue()
-
-
-def _cells(figure: Figure) -> list[tuple[slice, slice]]:
-    """Return the pixel rows and columns of each visible panel, including its labels."""
-    specs = [panel.get_subplotspec() for panel in figure.axes if panel.axison]
-    shown = [spec.get_topmost_subplotspec() for spec in specs if spec is not None]
-    grid = shown[0].get_gridspec()
-    _, tops, lefts, _ = (np.asarray(edge) for edge in grid.get_grid_positions(figure))
-    width, height = figure.get_size_inches() * DPI
-    x = [0, *np.rint(lefts[1:] * width - LEFT_IN * DPI).astype(int), round(width)]
-    y = [0, *np.rint((1 - tops[1:]) * height - TOP_IN * DPI).astype(int), round(height)]
-    positions = dict.fromkeys((spec.rowspan.start, spec.colspan.start) for spec in shown)
-    return [(slice(y[r], y[r + 1]), slice(x[c], x[c + 1])) for r, c in positions]
 
 
 def single_panel_figure(height_in: float) -> Figure:
