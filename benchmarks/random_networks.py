@@ -103,7 +103,7 @@ def random_network(rng: np.random.Generator) -> RandomNetwork:
             xy,
             np.tile(plan.noise_px**2 * np.eye(2), (len(xy), 1, 1)),
         ),
-        control,
+        observations=(control,),
     )
     error = STRIP_START if plan.arrangement == "strip" else 1.0
     return RandomNetwork(plan, network, truth, _start(rng, truth, control, error))

@@ -339,7 +339,7 @@ def with_cameras(content: Content, network: Network, estimate: Estimate) -> tupl
         gone |= CONVERTED | {"rejected"}
     if not gone:
         return replace(content, result=replace(result, network=network, estimate=estimate)), gone
-    network = replace(network, interior=InteriorObservations())
+    network = network.with_given(InteriorObservations())
     result = replace(
         result,
         network=network,
@@ -417,7 +417,7 @@ def _numbers(content: Content) -> Iterator[tuple[str, FloatArray]]:
     if estimate.mounts is not None:
         mounts = estimate.mounts
         yield "mount", np.column_stack([mounts.position, mounts.rotation.reshape(len(mounts.rig), 9)])
-    for kind in (*network.kinds, content.checks):
+    for kind in (*network.observations, content.checks):
         covariance = kind.covariances()
         n, d = covariance.shape[:2]
         variance = np.einsum("nii->ni", covariance)

@@ -110,7 +110,7 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
         camera_index,
         tuple(markers.labels),
         markers.image_points(images),
-        control,
+        observations=(control,),
     )
     return network, Estimate(cameras, position, rotation, markers.coordinates())
 

@@ -123,7 +123,7 @@ def read_export(
         np.array([row[:3] for _, row in observed]).reshape(-1, 3),
         np.array([np.diag(np.maximum(row[3:6], 0.0) ** 2) for _, row in observed]).reshape(-1, 3, 3),
     )
-    network = Network(photographs.names, camera_index, points, image_points, control_points)
+    network = Network(photographs.names, camera_index, points, image_points, observations=(control_points,))
     point_sigma = np.full((len(points), 3), np.nan)
     for _, key, row in object_rows:
         point_sigma[index[key]] = np.where(row[3:] > 0, row[3:], np.nan)

@@ -225,14 +225,13 @@ def read_content(folder: Path) -> Content:
         for k, camera in [_first_of(folder, cameras, owner, parameter)]
     ]
     rows = np.array(interior, dtype=float).reshape(-1, 4)
-    network = replace(
-        network,
-        control=control,
-        scale_bars=given.bars,
-        exterior=given.exterior,
-        interior=InteriorObservations(
+    network = network.with_given(
+        control,
+        given.exterior,
+        InteriorObservations(
             rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
         ),
+        given.bars,
     )
     summary = read_json(folder / "summary.json", Statistics, "the summary of a result")
     return Content(

@@ -138,7 +138,7 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     exterior = int(is_observed(_variances(network.exterior.covariance)).sum())
     sigma = network.interior.sigma
     interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
-    first = len(network.kinds) - len(network.observations)
+    first = len(network.observations) - len(network.further)
     further = sum(part.count for part in adjustment.observed if part.index >= first)
     bars = adjustment.observations - image - control - exterior - interior - further
     return ObservationCounts(

@@ -211,7 +211,7 @@ def with_tables(tables: Sequence[ObservationTable], network: Network) -> Network
             assert issubclass(table.of, RowKind)
             added.append(table.of.of_table(tuple(indices), table.value[rows], table.sigma[rows]))
     added = [kind for kind in added if len(kind)]
-    return replace(network, observations=(*network.observations, *added)) if added else network
+    return network.with_given(further=(*network.further, *added)) if added else network
 
 
 def _labels(tables: Sequence[ObservationTable]) -> list[dict[str, str]]:
@@ -231,7 +231,7 @@ def unused_observations(
     tables: Sequence[ObservationTable], copied: tuple[str, ...], network: Network
 ) -> tuple[Remark, ...]:
     """Return the remarks on observations of tables that are not used: without their points, or copies."""
-    frames = [kind for kind in network.observations if isinstance(kind, RigidFrames) and len(kind)]
+    frames = [kind for kind in network.further if isinstance(kind, RigidFrames) and len(kind)]
     hidden = {(kind.group, name) for kind in frames for name in kind.hidden}
     unused: list[str] = []
     for table, labels in zip(tables, _labels(tables), strict=True):
@@ -239,7 +239,7 @@ def unused_observations(
             names = tuple(column[row] for column in table.table.texts)
             if (labels.get(names[0]), *names[1:]) not in hidden:
                 unused.append(table.name(int(row)))
-    usable = with_tables(tables, replace(network, observations=())).observations
+    usable = with_tables(tables, network.with_given(further=())).further
     for table, labels in zip(tables, _labels(tables), strict=True):
         there = {kind.group for kind in usable if isinstance(kind, Group) and type(kind) is table.of}
         unused += [f"{table.kind} {label}" for label in labels.values() if label not in there]

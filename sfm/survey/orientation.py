@@ -132,9 +132,7 @@ def _orient_model(model: Model) -> Oriented:
     if not measured.network.named.all():
         refuse_no_base(measured.network, measured.cameras)
     # left out here: the adjustment judges these first
-    network = replace(
-        measured.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=()
-    )
+    network = measured.network.with_given(ExteriorObservations(), ScaleBars(), further=())
     orientation, wrong_c = _orient_with_best_c(survey, measured, network)
     chosen = choose_free_parameters(survey, network, orientation.estimate, extend=False)
     orientation, held = _hold_cameras_of_two(survey, network, replace(orientation, estimate=chosen.estimate))
@@ -210,7 +208,7 @@ def _orient_on_control(
 
     def without_control(before: Orientation | None) -> Iterator[Network]:
         if len(network.control) and (before is None or not _fits(network, before)[named].all()):
-            yield replace(network, control=ObjectPoints())
+            yield network.with_given(ObjectPoints())
 
     def more_fit(before: Orientation | None, after: Orientation | None) -> float:
         if before is None or after is None:

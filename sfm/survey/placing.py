@@ -63,7 +63,7 @@ def place_on_observations(network: Network, estimate: Estimate) -> Estimate:
         estimate: start values.
     """
     kinds = _of_motions(network, estimate)
-    if not kinds or not network.observations:
+    if not kinds or not network.further:
         return estimate
     start, rows, rounding = _about_centre(kinds, estimate)
     scaled = not has_held_mounts(estimate)
@@ -112,7 +112,7 @@ def _about_centre(kinds: Sequence[Kind], estimate: Estimate) -> tuple[Estimate, 
 
 def _of_motions(network: Network, estimate: Estimate) -> list[Weighted]:
     """Return scale bars and tabulated observations whose points and photographs have start values."""
-    tables = (kind for kind in network.observations if isinstance(kind, TableKind))
+    tables = (kind for kind in network.further if isinstance(kind, TableKind))
     kinds: tuple[Weighted, ...] = (network.scale_bars, *tables)
     return [usable for usable in (_usable(kind, estimate) for kind in kinds) if len(usable)]
 
@@ -334,7 +334,7 @@ def scale_to_bars(network: Network, estimate: Estimate, datum: Datum) -> Estimat
 
 def is_scaled(network: Network, estimate: Estimate) -> bool:
     """Return whether scale bars, other observations or mounts held fixed give a network its scale."""
-    return bool(len(network.scale_bars) or len(network.observations) or has_held_mounts(estimate))
+    return bool(len(network.scale_bars) or len(network.further) or has_held_mounts(estimate))
 
 
 def has_held_mounts(estimate: Estimate) -> bool:
@@ -347,7 +347,7 @@ def has_held_mounts(estimate: Estimate) -> bool:
 
 def mounts_give_scale(network: Network, estimate: Estimate) -> bool:
     """Return whether given mounts, held fixed or observed, contribute to the scale of a network."""
-    observed = any(isinstance(kind, MountObservations) for kind in network.observations)
+    observed = any(isinstance(kind, MountObservations) for kind in network.further)
     return observed or has_held_mounts(estimate)
 
 

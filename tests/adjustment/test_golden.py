@@ -139,7 +139,7 @@ def test_lab2_resections_in_one_network() -> None:
         xyz,
     )
     control = ObjectPoints(np.arange(len(names)), xyz, np.zeros((len(names), 3, 3)))
-    network = Network(images, np.zeros(4, dtype=np.int64), names, image_points, control)
+    network = Network(images, np.zeros(4, dtype=np.int64), names, image_points, observations=(control,))
     a = adjust(network, start, datum=Datum("control"), reject="none")
     assert a.converged
     assert (a.defect, a.unknowns) == (0, 24)
@@ -156,9 +156,7 @@ def test_lab2_resections_in_one_network() -> None:
         v = a.residuals[image_points.image == i] * GRID_MM[0]
         assert (v**2).sum() / (v.size - 6) == pytest.approx(expected[name][6], rel=1e-6)
 
-    weighted = replace(
-        network, control=replace(control, covariance=np.tile(1e-6 * np.eye(3), (len(names), 1, 1)))
-    )
+    weighted = network.with_given(replace(control, covariance=np.tile(1e-6 * np.eye(3), (len(names), 1, 1))))
     b = adjust(weighted, start, datum=Datum("control"), reject="none")
     assert b.converged
     assert b.redundancy == a.redundancy  # each observed coordinate brings one unknown

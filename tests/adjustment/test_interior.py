@@ -117,7 +117,7 @@ def test_normal_equations_equal_those_of_differences() -> None:
         ),
     )
     fixed = ObjectPoints(np.arange(10), truth.points, np.zeros((10, 3, 3)))  # so that nothing is eliminated
-    network = replace(network, control=fixed)
+    network = network.with_given(fixed)
     layout, state = unknowns_of(network, truth, use_control=True)
     names = interior_names(layout, truth)
     assert len(names) == len(set(names)) == IMAGES + 4 + 4
@@ -155,7 +155,7 @@ def _value(layout, state, column: int) -> float:  # type: ignore[no-untyped-def]
 def test_covariance_equals_the_inverse_of_the_whole() -> None:
     network, truth = zoomed("inverse", noise_px=0.1, points=15)
     control = ObjectPoints(np.arange(4), truth.points[:4], np.zeros((4, 3, 3)))
-    a = adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    a = adjust(network.with_given(control), truth, datum=Datum("control"), reject="none")
     m = marginal_of(a)
     interior = np.arange(6 * IMAGES, 6 * IMAGES + IMAGES + len(SHARED))
     Q = m.joint(interior, np.zeros(0, dtype=int))
@@ -199,7 +199,7 @@ def test_one_camera_is_the_case_of_all_parameters_shared() -> None:
 def test_separate_adjustment_ends_at_the_same_optimum() -> None:
     network, truth = zoomed("separate", noise_px=0.1, points=25)
     control = ObjectPoints(np.arange(25), truth.points, np.zeros((25, 3, 3)))
-    network = replace(network, control=control)
+    network = network.with_given(control)
     together = adjust(network, truth, datum=Datum("control"), reject="none")
     apart = adjust_separately(network, truth)
     assert apart.converged
@@ -220,7 +220,7 @@ def test_parameters_are_free_fixed_or_weighted_one_by_one() -> None:
         sigma=np.array([*[1e-3] * IMAGES, 1e-9]),
     )
     free = adjust(network, truth, datum=FREE, reject="none")
-    a = adjust(replace(network, interior=observed), truth, datum=FREE, reject="none")
+    a = adjust(network.with_given(observed), truth, datum=FREE, reject="none")
     assert a.observations == free.observations + IMAGES + 1
     assert a.redundancy == free.redundancy + IMAGES + 1
     for camera, was, Q, before in zip(
@@ -238,7 +238,7 @@ def test_a_calibration_and_a_survey_one_after_the_other_are_both_together() -> N
     """
     network, truth = make_network(seed_of("two steps"), images=8, points=30, model="brown", noise_px=0.01)
     control = ObjectPoints(np.arange(30), truth.points, np.zeros((30, 3, 3)))
-    network = replace(network, control=control)
+    network = network.with_given(control)
     seen = network.image_points
 
     def part(chosen: np.ndarray, interior: InteriorObservations | None = None) -> Adjustment:
@@ -250,8 +250,7 @@ def test_a_calibration_and_a_survey_one_after_the_other_are_both_together() -> N
             images=tuple(network.images[i] for i in images),
             camera=network.camera[images],
             image_points=points,
-            interior=interior or InteriorObservations(),
-        )
+        ).with_given(interior or InteriorObservations())
         start = replace(truth, position=truth.position[images], rotation=truth.rotation[images])
         return adjust(own, start, datum=Datum("control"), sigma_px=0.1, reject="none")
 

@@ -102,7 +102,7 @@ def test_covariance_of_fronts_and_pairs_equals_that_of_the_product_of_full_rows(
     if bars:  # kept points in the border; the scale is no longer free
         length = np.linalg.norm(truth.points[5] - truth.points[900])
         ends = np.array([5]), np.array([900])
-        network = replace(network, scale_bars=ScaleBars(*ends, np.array([length]), np.array([0.01])))
+        network = network.with_given(ScaleBars(*ends, np.array([length]), np.array([0.01])))
     a = run(network, truth, covariance=False, tolerance=1e-9)
     if pattern == "pairs":
         monkeypatch.setattr(iterate, "choose_solver", pair_by_pair)

@@ -58,8 +58,8 @@ def strip(
 def controlled(network: Network, truth: Estimate) -> Network:
     """Return the network with its four corner points known to 1 mm."""
     corners = np.array([0, 8, 45, 53])
-    return replace(
-        network, control=ObjectPoints(corners, truth.points[corners], np.tile(1e-6 * np.eye(3), (4, 1, 1)))
+    return network.with_given(
+        ObjectPoints(corners, truth.points[corners], np.tile(1e-6 * np.eye(3), (4, 1, 1)))
     )
 
 

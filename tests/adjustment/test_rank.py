@@ -58,7 +58,7 @@ def flat_parallel_network() -> tuple[Network, Estimate]:
 
 def test_c_and_height_of_a_flat_parallel_network_are_named() -> None:
     network, truth = flat_parallel_network()
-    network = replace(network, control=ObjectPoints(np.arange(25), truth.points, np.zeros((25, 3, 3))))
+    network = network.with_given(ObjectPoints(np.arange(25), truth.points, np.zeros((25, 3, 3))))
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     assert (a.defect, a.expected_defect) == (1, 0)
     assert len(a.undetermined) == 1
@@ -68,7 +68,7 @@ def test_c_and_height_of_a_flat_parallel_network_are_named() -> None:
 
 def test_two_control_points_leave_a_turn_open() -> None:
     network, truth = make_network(seed_of("two"), images=5, points=15)
-    network = replace(network, control=ObjectPoints(np.arange(2), truth.points[:2], np.zeros((2, 3, 3))))
+    network = network.with_given(ObjectPoints(np.arange(2), truth.points[:2], np.zeros((2, 3, 3))))
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     assert a.converged
     assert (a.defect, a.expected_defect) == (1, 0)  # control is meant to fix all seven
@@ -95,7 +95,7 @@ def test_motions_that_control_leaves_open_are_named(known: tuple[tuple[int, str]
         for axis in axes:
             covariance[k, "XYZ".index(axis), "XYZ".index(axis)] = 1e-8
     index = np.array([j for j, _ in known])
-    network = replace(network, control=ObjectPoints(index, truth.points[index], covariance))
+    network = network.with_given(ObjectPoints(index, truth.points[index], covariance))
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     assert len(a.undetermined) == 1 and a.undetermined[0].endswith(f"by the control: {words}")
 
@@ -229,7 +229,7 @@ def test_a_point_that_survey_observations_fix_better_than_rays_has_their_sigma(s
     control = ObjectPoints(fixed, truth.points[fixed], np.zeros((4, 3, 3)))
     ends = np.array([0, 0]), np.array([10, 11])
     to_fixed = CoordinateDifferences(*ends, truth.points[10:12] - truth.points[0], np.full((2, 3), sigma))
-    a = adjust(replace(network, control=control, observations=(to_fixed,)), truth, datum=Datum("control"))
+    a = adjust(network.with_given(control, further=(to_fixed,)), truth, datum=Datum("control"))
     stated = np.sqrt(np.diagonal(a.covariance.points[10])) / a.sigma0
     assert stated == pytest.approx(np.full(3, sigma), rel=1e-2)
     assert (np.diagonal(a.covariance.points[0]) == 0).all()  # fixed control

@@ -27,9 +27,8 @@ FREE = Datum("free")
 
 def controlled(network: Network, truth: Estimate, sigma: float) -> Network:
     """The network with its first five points as control of the given sigma, 0 = fixed."""
-    return replace(
-        network,
-        control=ObjectPoints(np.arange(5), truth.points[:5], np.tile(sigma**2 * np.eye(3), (5, 1, 1))),
+    return network.with_given(
+        ObjectPoints(np.arange(5), truth.points[:5], np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
     )
 
 
@@ -124,14 +123,13 @@ def test_covariance_equals_the_inverse_of_the_whole(kind: str) -> None:
     if kind in ("control", "weighted"):
         network = controlled(network, truth, 0.0 if kind == "control" else 1e-3)
     if kind == "bars":
-        network = replace(
-            network,
-            scale_bars=ScaleBars(
+        network = network.with_given(
+            ScaleBars(
                 np.array([0, 1]),
                 np.array([2, 3]),
                 np.linalg.norm(truth.points[[0, 1]] - truth.points[[2, 3]], axis=1),
                 np.array([1e-3, 2e-3]),
-            ),
+            )
         )
     datum = Datum(
         kind if kind in ("free", "minimal", "control") else "control" if kind == "weighted" else "free"
@@ -222,7 +220,7 @@ def test_weights_of_control_go_from_fixed_to_free() -> None:
 
     def with_sigma(sigma: float) -> Adjustment:
         control = ObjectPoints(np.arange(5), moved, np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
-        return adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+        return adjust(network.with_given(control), truth, datum=Datum("control"), reject="none")
 
     fixed, tight, loose = with_sigma(0.0), with_sigma(1e-9), with_sigma(0.3)
     free = adjust(network, truth, datum=FREE, reject="none")
@@ -236,15 +234,14 @@ def test_observed_orientation_and_interior_replace_control() -> None:
     rng = seed_of("observed")
     network, truth = make_network(rng, images=6, points=25)
     sigma = np.array([1e-3] * 3 + [np.inf] * 3)
-    network = replace(
-        network,
-        exterior=ExteriorObservations(
+    network = network.with_given(
+        ExteriorObservations(
             np.arange(6),
             truth.position + rng.normal(0, 1e-3, (6, 3)),
             angles_from_rotation(truth.rotation),
             np.tile(np.diag(sigma**2), (6, 1, 1)),
         ),
-        interior=InteriorObservations(np.array([0]), np.array([0]), np.array([10.0]), np.array([1e-6])),
+        InteriorObservations(np.array([0]), np.array([0]), np.array([10.0]), np.array([1e-6])),
     )
     a = adjust(network, perturb(truth, rng), datum=FREE, reject="none")
     assert (a.defect, a.expected_defect, a.undetermined) == (0, 0, ())
@@ -260,7 +257,7 @@ def test_scale_bars_scale_the_network() -> None:
     network, truth = make_network(rng, images=6, points=20)
     length = float(np.linalg.norm(truth.points[3] - truth.points[8]))
     bar = ScaleBars(np.array([3]), np.array([8]), np.array([2 * length]), np.array([1e-5]))
-    a = adjust(replace(network, scale_bars=bar), truth, datum=FREE, reject="none")
+    a = adjust(network.with_given(bar), truth, datum=FREE, reject="none")
     assert (a.defect, a.expected_defect) == (6, 6)
     assert np.linalg.norm(a.estimate.points[3] - a.estimate.points[8]) == pytest.approx(2 * length, abs=1e-8)
     assert a.redundancy == adjust(network, truth, datum=FREE, reject="none").redundancy
@@ -315,7 +312,7 @@ def test_a_network_far_from_the_origin_is_adjusted_as_one_near_it(kind: str) -> 
     far = np.array([2.0**22, 2.0**23, 0.0])
     network, truth = make_network(seed_of("far"), images=8, points=30)
     control = ObjectPoints(np.arange(5), truth.points[:5], np.zeros((5, 3, 3)))
-    network = replace(network, control=control)
+    network = network.with_given(control)
     start = perturb(truth, seed_of("far start"))
     distant, distant_start = shifted(network, start, far)
     near = adjust(network, start, datum=Datum(kind), reject="none")

@@ -78,7 +78,7 @@ def test_the_component_of_a_kind_is_tested_against_what_is_stated_for_it() -> No
         bars = ScaleBars(start, end, length + rng.normal(0, 1e-3, 5), np.full(5, 1e-3))
         noisy = replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape))
         found = by_kind(
-            adjust(replace(network, image_points=noisy, scale_bars=bars), truth, datum=FREE, reject="none")
+            adjust(replace(network, image_points=noisy).with_given(bars), truth, datum=FREE, reject="none")
         )
         tests = component_tests(found, alpha=alpha)
         assert [test.of for test in tests] == ["image points", "scale bars"]
@@ -180,24 +180,23 @@ def test_kinds_of_observation_share_the_redundancy() -> None:
     network, truth = make_network(rng, images=8, points=30)
     ends = np.array([[6, 9, 11], [8, 20, 25]])
     sigma = np.array([1e-3] * 3 + [np.inf] * 3)
-    network = replace(
-        network,
-        control=ObjectPoints(
+    network = network.with_given(
+        ObjectPoints(
             np.arange(5), truth.points[:5] + rng.normal(0, 1e-4, (5, 3)), np.tile(1e-8 * np.eye(3), (5, 1, 1))
         ),
-        scale_bars=ScaleBars(
-            ends[0],
-            ends[1],
-            np.linalg.norm(truth.points[ends[0]] - truth.points[ends[1]], axis=1) + rng.normal(0, 1e-4, 3),
-            np.full(3, 1e-4),
-        ),
-        exterior=ExteriorObservations(
+        ExteriorObservations(
             np.arange(4),
             truth.position[:4] + rng.normal(0, 1e-3, (4, 3)),
             np.zeros((4, 3)),
             np.tile(np.diag(sigma**2), (4, 1, 1)),
         ),
-        interior=InteriorObservations(np.array([0]), np.array([0]), np.array([10.001]), np.array([1e-3])),
+        InteriorObservations(np.array([0]), np.array([0]), np.array([10.001]), np.array([1e-3])),
+        ScaleBars(
+            ends[0],
+            ends[1],
+            np.linalg.norm(truth.points[ends[0]] - truth.points[ends[1]], axis=1) + rng.normal(0, 1e-4, 3),
+            np.full(3, 1e-4),
+        ),
     )
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     kinds = by_kind(a)

@@ -120,7 +120,7 @@ def dense() -> Dense:
     xy += rng.normal(0, 3e-4, 7)[seen.image][:, None] * (xy - (999.5, 749.5))
     covariance = 0.01 * np.tile([[1.3, 0.4], [0.4, 0.8]], (len(seen), 1, 1))
     given = InteriorObservations(np.array([0]), np.array([0]), np.array([10.0]), np.array([2e-3]))
-    network = replace(network, image_points=replace(seen, xy=xy, covariance=covariance), interior=given)
+    network = replace(network, image_points=replace(seen, xy=xy, covariance=covariance)).with_given(given)
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     # some take no part: the others are then no optimum, as after the last round of an adjustment
     out = np.zeros(len(seen), dtype=bool)
@@ -185,7 +185,7 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     given = InteriorObservations(
         np.array([0, 0, 1]), np.array([0, 1, 0]), np.array([10.0, 0.03, 10.2]), np.array([2e-3, 1e-3, 0.0])
     )
-    a = replace(dense.a, network=replace(dense.a.network, interior=given))
+    a = replace(dense.a, network=dense.a.network.with_given(given))
     weight = (interior_columns(a, [(0, 0)])[2][0] / 2e-3 / a.sigma0) ** 2
     found, prior, slope = score._free_interior(a)
     assert found.shape[2] == 2 and prior.tolist() == [pytest.approx([weight, 0.0]), [0.0, 0.0]]

@@ -91,7 +91,7 @@ def test_statistics_are_of_all_kinds(a: Adjustment) -> None:
         "c of camera camera 2",
     }
     bars = ScaleBars(np.array([0, 1]), np.array([5, 6]), np.array([1.0, 1.0]), np.array([9.0, 9.0]))
-    both = adjust(replace(a.network, scale_bars=bars), a.estimate, datum=Datum("free"), reject="none")
+    both = adjust(a.network.with_given(bars), a.estimate, datum=Datum("free"), reject="none")
     assert [one.of for one in statistics_of(both).global_tests] == list(statistics_of(both).kinds.names)
     assert len(statistics_of(both).global_tests) == 2
 
@@ -105,7 +105,7 @@ def test_given_values_are_told_apart_by_kind() -> None:
         np.array([0]), np.array([0]), truth.cameras[0].parameters[:1], np.array([1.0])
     )
     network = network.with_control(network.points[:6], truth.points[:6], 1e-3)
-    network = replace(network, scale_bars=bars, exterior=exterior, interior=interior)
+    network = network.with_given(exterior, interior, bars)
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     given = given_of(a, "m")
     assert given.control is not None and len(given.control.names) == 6
@@ -113,7 +113,7 @@ def test_given_values_are_told_apart_by_kind() -> None:
     assert given.interior is not None and given.further == ()
     assert [one.kind for one in given.exterior] == [CENTRE]  # no angle was observed
     assert given.of(ROTATION) is None or given.of(ROTATION) in given.kinds
-    free = replace(network, exterior=ExteriorObservations())
+    free = network.with_given(ExteriorObservations())
     given = given_of(adjust(free, truth, datum=Datum("free"), reject="none"), "m")
     assert given.control is None and given.bars is not None and given.exterior == ()
     assert Given(()).control is None

@@ -105,7 +105,7 @@ def test_points_known_to_a_pixel_make_a_calibration(pixels: float, result: bool)
     control = replace(a.network.control, covariance=covariance)
     far = replace(a.estimate, points=a.estimate.points + 90.0, position=a.estimate.position + 90.0)
     for estimate in (a.estimate, far):
-        other = replace(a, estimate=estimate, network=replace(a.network, control=control))
+        other = replace(a, estimate=estimate, network=a.network.with_given(control))
         assert camera_is_result(other) == result
 
 

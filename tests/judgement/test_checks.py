@@ -83,7 +83,7 @@ def test_observations_are_counted_by_kind() -> None:
     bars = ScaleBars(np.array([0]), np.array([9]), np.array([1.0]), np.array([1.0]))
     variance = np.tile(np.diag([1.0, 1.0, 1.0, np.inf, np.inf, 1.0]), (2, 1, 1))
     exterior = ExteriorObservations(np.arange(2), truth.position[:2], np.zeros((2, 3)), variance)
-    network = replace(network, interior=given, scale_bars=bars, exterior=exterior)
+    network = network.with_given(exterior, given, bars)
     a = adjust(network, truth, datum=Datum("control"), reject="none", max_iterations=3)
     found = checks.count_observations(a)
     assert found.image == 2 * len(network.image_points) and found.control == 12
@@ -91,9 +91,7 @@ def test_observations_are_counted_by_kind() -> None:
     assert found.total == found.image + 12 + 8 + 1 + 1 == a.observations and found.constraints == 0
     rejected = np.arange(len(a.rejected)) < 4
     assert checks.count_observations(replace(a, rejected=rejected)).image == found.image - 8
-    free = adjust(
-        replace(network, exterior=ExteriorObservations()), truth, datum=Datum("free"), reject="none"
-    )
+    free = adjust(network.with_given(ExteriorObservations()), truth, datum=Datum("free"), reject="none")
     found = checks.count_observations(free)
     assert (found.control, found.exterior, found.constraints) == (0, 0, 6)  # a bar gives the scale
 

@@ -281,7 +281,7 @@ def test_the_free_network_is_the_adjustment_itself_where_nothing_else_was_observ
     assert judge_alternatives(replace(a, converged=False)) == JudgedAssumptions()
     assert contradicted_parameters(replace(a, converged=False)) == ()
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([9.0]), np.array([1e-3]))
-    final = replace(a, network=replace(a.network, scale_bars=bars), sigma0=5.0)
+    final = replace(a, network=a.network.with_given(bars), sigma0=5.0)
     free = free_network(final)
     assert free is not None and len(free.network.scale_bars) == 0 and free.sigma0 < 2
     fixed = free_network(replace(a, datum="control"))
@@ -338,7 +338,7 @@ def test_each_camera_of_two_photographs_is_named() -> None:
 def test_four_given_points_have_a_shape_that_the_image_points_test(given: int, tested: int) -> None:
     network, truth = make_network(seed_of("shape"), images=6, points=14, free=("c",))
     control = ObjectPoints(np.arange(given), truth.points[:given], np.tile(1e-8 * np.eye(3), (given, 1, 1)))
-    network = replace(network, control=control)
+    network = network.with_given(control)
     held = adjust(network, truth, datum=Datum("control"), reject="none")
     free = adjust(without_given(network), truth, datum=Datum("free"), reject="none")
     found = hypotheses._with_free_shape(held, free)

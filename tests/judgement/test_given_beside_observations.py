@@ -40,7 +40,7 @@ def made() -> tuple[Network, Estimate, FreeNetwork]:
     length = np.linalg.norm(X[[10, 11]] - X[[16, 17]], axis=1)
     bars = ScaleBars(np.array([10, 11]), np.array([16, 17]), length, np.full(2, 1e-3))
     network = network.with_control(network.points[:8], X[:8], 1e-3)
-    return replace(network, observations=(heights,), scale_bars=bars), truth, free
+    return network.with_given(bars, further=(heights,)), truth, free
 
 
 def judged(
@@ -64,15 +64,15 @@ def test_tables_are_judged_beside_the_values_that_carry_the_datum(
     monkeypatch.setattr(
         given, "judge_tables", lambda tables, part, _, place, level: beside.append((part, place)) or ()
     )
-    found = judged(replace(network, exterior=centres), free, kind)
+    found = judged(network.with_given(centres), free, kind)
     ((part, place),) = beside
     in_control = kind == "control"
     assert (len(part.control), len(part.exterior), len(part.scale_bars)) == (
         (8, 2, 2) if in_control else (0, 0, 2)
     )
-    assert [len(one) for one in part.observations] == [5]
+    assert [len(one) for one in part.further] == [5]
     assert (place(part) is UNCHANGED) != in_control  # which control has decided before
-    assert not found.others_contradict and found.network.observations == network.observations
+    assert not found.others_contradict and found.network.further == network.further
 
 
 def test_observations_without_a_datum_of_control_are_not_judged(
@@ -86,7 +86,7 @@ def test_observations_without_a_datum_of_control_are_not_judged(
     flat = network.with_control(network.points[:8], network.control.xyz * [1, 1, 0], 1e-3)
     assert not judged(flat, None, "control").checks_handedness
     assert not judged(network, None, "free").checks_handedness
-    alone = replace(network, observations=())
+    alone = network.with_given(further=())
     assert [one.names("of") for one in judged(alone, None, "control").remarks] == [("bars", "control")]
     without = judge_given(network, free, GivenSettings(Datum("free"), "m"))
     assert [one.names("of") for one in without.remarks] == [("observations",)]
@@ -98,15 +98,15 @@ def test_wrong_observations_leave_the_network(
 ) -> None:
     """Named by their ends; a whole table by its kind, and the control stays."""
     network, _, free = made
-    heights = network.observations[0]
+    heights = network.further[0]
     assert isinstance(heights, HeightDifferences)
     off = np.where(np.isin(np.arange(5), wrong), [0.3, -0.2, 0.25, 0.4, -0.3], 0.0)[:, None]
-    spoiled = replace(network, observations=(replace(heights, value=heights.value + off),))
+    spoiled = network.with_given(further=(replace(heights, value=heights.value + off),))
     found = judged(spoiled, free, "control")
     kinds = ("kind_wrong",) if whole else ("observations_wrong",) if wrong else ()
     assert kinds_of(found.remarks) == ("given_weakly_checked", *kinds)  # the bars
     assert found.others_contradict == bool(wrong)
-    assert [len(one) for one in found.network.observations] == ([] if whole else [5 - len(wrong)])
+    assert [len(one) for one in found.network.further] == ([] if whole else [5 - len(wrong)])
     assert len(found.network.control) == 8 and len(found.network.scale_bars) == 2
 
 
@@ -120,7 +120,7 @@ def test_the_one_scale_of_bars_that_several_kinds_contradict_is_open(
 ) -> None:
     """Then the bar is judged as a table of distances beside them, and may be what is wrong."""
     network, _, free = made
-    network = replace(network, scale_bars=network.scale_bars.select(np.arange(bars)))
+    network = network.with_given(network.scale_bars.select(np.arange(bars)))
     wrong = tuple(Contradiction(f"kind {k}", whole=True) for k in range(kinds))
     asked: list[list[Table]] = []
 
@@ -156,8 +156,8 @@ def test_the_datum_stays_while_one_kind_of_given_points_is_used(
     position = truth.position * (mirror if centres else 1.0)
     variance = np.tile(np.diag([1e-6] * 3 + [np.inf] * 3), (6, 1, 1))
     exterior = ExteriorObservations(np.arange(6), position, np.zeros((6, 3)), variance)
-    network = replace(network.with_control(network.points[:12], xyz, 1e-3), exterior=exterior)
-    found = judged(replace(network, observations=(), scale_bars=ScaleBars()), free, "control")
+    network = network.with_control(network.points[:12], xyz, 1e-3).with_given(exterior)
+    found = judged(network.with_given(ScaleBars(), further=()), free, "control")
     assert found.datum.kind == kind
     assert [len(found.network.control), len(found.network.exterior)] == [
         0 if control else 12,

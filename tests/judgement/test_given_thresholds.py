@@ -207,7 +207,7 @@ def test_all_rows_of_a_long_table_that_is_wrong_are_left_out(monkeypatch: pytest
     )
     free = free_network.FreeNetwork(adjust(network, truth, datum=Datum("free")))
     settings = given_groups.GivenSettings(Datum("free"), "m")
-    judged = judge_given(replace(network, scale_bars=bars), free, settings)
+    judged = judge_given(network.with_given(bars), free, settings)
     (said,) = of_kind(judged.remarks, "scale_left_out")
     assert said.names("given") == ("the table of distances",)
     assert judged.network.scale_bars.start.tolist() == [0, 3]

@@ -250,7 +250,7 @@ def given_c(by: float, sigma: float = 2e-3) -> Adjustment:
     network, truth = make_network(seed_of("given c"), images=10, points=50, free=("c", "x0", "y0"))
     c = float(truth.cameras[0].parameters[0])
     given = InteriorObservations(np.array([0]), np.array([0]), np.array([c + by]), np.array([sigma]))
-    return solved(replace(network, interior=given), truth)
+    return solved(network.with_given(given), truth)
 
 
 def test_a_given_parameter_that_is_wrong_is_named_with_what_fits() -> None:
@@ -258,7 +258,7 @@ def test_a_given_parameter_that_is_wrong_is_named_with_what_fits() -> None:
     (found,) = judge_alternatives(a).causes
     assert found.kind == "given_parameter" and found.names("parameters") == ("c",)
     assert found.number("value") == pytest.approx(float(a.network.interior.value[0]))
-    free = solved(replace(a.network, interior=InteriorObservations()), a.estimate)
+    free = solved(a.network.with_given(InteriorObservations()), a.estimate)
     assert found.number("instead_of") == pytest.approx(
         float(free.estimate.cameras[0].parameters[0]), abs=1e-4
     )
@@ -547,7 +547,7 @@ def test_what_given_points_say_of_freedoms_is_what_an_adjustment_with_them_finds
     covariance[5:15] = np.diag([1e-6, 4e-6, 0.0])
     covariance[10:15, 1, 1] = np.inf
     given = ObjectPoints(np.arange(20), truth.points[:20], covariance)
-    network = replace(network, control=given)
+    network = network.with_given(given)
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     columns = columns_of(a)
     first = (network.image_points.image == 0)[:, None, None]

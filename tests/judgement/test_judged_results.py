@@ -172,7 +172,7 @@ def test_an_object_nearer_than_its_image_is_implausible(distance: float, implaus
     in_mm = replace(a, estimate=metres)
     assert bool(verdicts._scale(result_of(in_mm, "mm"))) == implausible
     assert verdicts._scale(result_of(a, "")) == ()
-    free = replace(a, network=replace(a.network, scale_bars=ScaleBars()))
+    free = replace(a, network=a.network.with_given(ScaleBars()))
     assert verdicts._scale(result_of(free, unit)) == ()  # nothing gives a scale
 
 
@@ -302,7 +302,7 @@ def test_a_kind_of_given_values_that_scatters_more_than_stated_is_named(bars: in
     off = 0.02 * np.array([1.0, -1.0, 1.0, -1.0, 1.0])[:bars]
     given = ScaleBars(start, end, length + off, np.full(bars, 1e-3))
     network = network.with_control(network.points[:8], truth.points[:8], 1e-3)
-    a = adjust(replace(network, scale_bars=given), truth, datum=Datum("control"), reject="none")
+    a = adjust(network.with_given(given), truth, datum=Datum("control"), reject="none")
     statistics = statistics_of(a)
     found = [one for one in verdicts._kinds(statistics, set(), LEVEL) if one.names("of") == ("scale bars",)]
     assert len(found) == named

@@ -185,7 +185,7 @@ def test_with_control_the_shift_is_that_of_the_cameras() -> None:
         seed_of("shift of cameras"), images=6, points=20, cameras=2, free=("c", "x0")
     )
     control = ObjectPoints(np.arange(20), truth.points, np.zeros((20, 3, 3)))
-    plain = adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
+    plain = adjust(network.with_given(control), truth, datum=Datum("control"), reject="none")
     sigma = [plain.interior_sigma(k) for k in range(2)]
     assert np.isfinite(sigma[0][:2]).all() and not sigma[0][2] > 0
 

@@ -356,7 +356,7 @@ def test_image_points_alone_need_two_degrees_of_freedom(
     a: Adjustment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([9.0]), np.array([1e-3]))
-    final = replace(a, network=replace(a.network, scale_bars=bars))
+    final = replace(a, network=a.network.with_given(bars))
     for redundancy, converged, undetermined, there in (
         (2, True, (), True),
         (1, True, (), False),

@@ -23,13 +23,12 @@ from tests.synthetic import make_network, seed_of
 
 def test_reduced_network_keeps_measurements_of_what_is_left() -> None:
     network, truth = make_network(seed_of("reduce"), images=6, points=20, visibility=0.7)
-    network = replace(
-        network,
-        control=ObjectPoints(np.array([2, 5, 7]), truth.points[[2, 5, 7]], np.zeros((3, 3, 3))),
-        scale_bars=ScaleBars(np.array([1, 2]), np.array([3, 9]), np.array([1.0, 2.0]), np.array([0.1, 0.2])),
-        exterior=ExteriorObservations(
+    network = network.with_given(
+        ObjectPoints(np.array([2, 5, 7]), truth.points[[2, 5, 7]], np.zeros((3, 3, 3))),
+        ExteriorObservations(
             np.array([0, 4]), truth.position[[0, 4]], np.zeros((2, 3)), np.tile(np.eye(6), (2, 1, 1))
         ),
+        ScaleBars(np.array([1, 2]), np.array([3, 9]), np.array([1.0, 2.0]), np.array([0.1, 0.2])),
     )
     images, points = np.ones(6, dtype=bool), np.ones(20, dtype=bool)
     images[0] = points[2] = points[3] = False
@@ -148,7 +147,7 @@ SPOILED: tuple[tuple[Spoil, str], ...] = (
     ),
     (
         lambda n, e: (
-            replace(n, control=ObjectPoints(np.arange(3), e.points[:3], np.zeros((3, 3)))),
+            n.with_given(ObjectPoints(np.arange(3), e.points[:3], np.zeros((3, 3)))),
             e,
         ),
         r"covariances of the control of shape \(3, 3\), expected \(3, 3, 3\)",
@@ -248,11 +247,11 @@ def test_control_that_no_measurement_can_have_is_refused() -> None:
     ):
         held = ObjectPoints(np.arange(4), xyz, np.tile(covariance, (4, 1, 1)))
         if good:
-            a = sfm.adjust(replace(network, control=held), truth, datum=sfm.Datum("control"))
+            a = sfm.adjust(network.with_given(held), truth, datum=sfm.Datum("control"))
             assert len(a.network.control) == 4
         else:
             with pytest.raises(GeometryError, match="positive definite"):
-                sfm.adjust(replace(network, control=held), truth)
+                sfm.adjust(network.with_given(held), truth)
 
 
 @pytest.mark.parametrize("mixed", [[1.0, 0, 0], [0.6, 0.6, -0.6], [np.nan, 0, 0]])
@@ -270,7 +269,7 @@ def test_observations_of_ones_own_are_added_and_checked() -> None:
     exact = truth.points[ends[1], 2:] - truth.points[ends[0], 2:]
     levelled = HeightDifferences(*ends, exact, np.full((3, 1), 1e-5))
     found = adjust(network.with_observations(levelled), truth)
-    assert len(found.network.observations) == 1 and found.expected_defect == 4
+    assert len(found.network.further) == 1 and found.expected_defect == 4
     solved = found.estimate.points
     np.testing.assert_allclose(solved[ends[1], 2:] - solved[ends[0], 2:], exact, atol=5e-5)
     wrong = (
@@ -296,7 +295,7 @@ def test_a_point_with_one_ray_has_no_coordinates_in_a_result() -> None:
     assert found.undetermined == ("point 4: 1 ray, 2 are needed",)
     np.testing.assert_array_equal(found.estimate.points[:3], adjust(network, truth).estimate.points[:3])
     control = ObjectPoints(np.arange(4), truth.points[:4], np.tile(1e-8 * np.eye(3), (4, 1, 1)))
-    known = adjust(replace(network, control=control), truth, datum="control")  # known otherwise
+    known = adjust(network.with_given(control), truth, datum="control")  # known otherwise
     assert known.estimate.determined.all()
 
 

@@ -131,7 +131,7 @@ def test_control_takes_memory_in_proportion_to_its_points() -> None:
     network, truth = make_network(seed_of("control"), images=3, points=1500)
     n = len(network.points)
     control = ObjectPoints(np.arange(n), truth.points, np.tile(np.eye(3) * 1e-6, (n, 1, 1)))
-    network = replace(network, control=control)
+    network = network.with_given(control)
     datum = Datum("control")
     layout, state = unknowns_of(network, truth, use_control=True)
     observed = observed_of(network, layout, state, use_control=True)

@@ -167,7 +167,7 @@ def test_start_from_control():
     ids = np.array([0, 5, 11, 17, 23, 31])
     shifted = truth.points + np.array([1000.0, 2000.0, 50.0])
     control = ObjectPoints(ids, shifted[ids], np.zeros((6, 3, 3)))
-    result = orient(replace(network, control=control), unknown(truth))
+    result = orient(network.with_given(control), unknown(truth))
     assert result.kind == "control" and result.pair is None and result.failures == ()
     np.testing.assert_allclose(result.estimate.points, shifted, atol=0.01)
     np.testing.assert_array_equal(result.estimate.points[ids], shifted[ids])
@@ -177,7 +177,7 @@ def test_three_control_points_give_the_frame():
     network, truth = make_network(seed_of("three control"), images=8, points=40, free=())
     ids = np.array([3, 8, 30])
     control = ObjectPoints(ids, 2 * truth.points[ids] + 5.0, np.zeros((3, 3, 3)))
-    result = orient(replace(network, control=control), unknown(truth))
+    result = orient(network.with_given(control), unknown(truth))
     assert result.pair is not None
     np.testing.assert_allclose(result.estimate.points, 2 * truth.points + 5.0, atol=0.02)
 
@@ -197,7 +197,7 @@ def test_control_without_coordinates_is_intersected():
     ids = np.array([0, 5, 11, 17])
     control = ObjectPoints(ids, 3 * truth.points[ids] + 10.0, np.zeros((4, 3, 3)))  # of another frame
     start = replace(unknown(truth), position=truth.position, rotation=truth.rotation)
-    result = orient(replace(network, control=control), start)
+    result = orient(network.with_given(control), start)
     assert result.kind == "given" and result.remarks == ()
     assert result.estimate.determined.all() and result.fits.all()
 

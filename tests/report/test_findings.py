@@ -255,7 +255,7 @@ def findings(reject: str, *, error_px: float = 0.0, bar: bool = False) -> Findin
     if bar:
         length = np.linalg.norm(truth.points[[0, 1]] - truth.points[[2, 3]], axis=1)
         bars = ScaleBars(np.array([0, 1]), np.array([2, 3]), length, np.full(2, 1e-3))
-        network = replace(network, scale_bars=bars)
+        network = network.with_given(bars)
     a = adjust(network, truth, datum=Datum("free"), reject=reject)
     return findings_of(SurveyResult("alarms", "m", 8, (), a, np.full(40, -1), None, reject=reject))
 

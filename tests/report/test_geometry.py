@@ -128,7 +128,7 @@ def test_points_with_one_ray_each_have_no_angle() -> None:
     network, truth = make_network(seed_of("one ray each"), images=2, points=20, free=())
     control = ObjectPoints(np.arange(20), truth.points, np.zeros((20, 3, 3)))
     seen = network.image_points
-    network = replace(network, image_points=seen.select(seen.point % 2 == seen.image), control=control)
+    network = replace(network, image_points=seen.select(seen.point % 2 == seen.image)).with_given(control)
     result = result_of(adjust(network, truth, datum=Datum("control"), reject="none"))
     assert np.isnan(geometry_of(result.adjustment).angle_deg).all()
     assert "intersection angle  not known\n" in text_report(findings_of(result))

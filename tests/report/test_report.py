@@ -465,7 +465,7 @@ def test_reasons_are_reported_from_what_is_most_like_a_target(result: SurveyResu
 def test_fixed_coordinates_have_neither_unknown_precision_nor_residuals() -> None:
     network, truth = make_network(seed_of("all fixed"), images=4, points=12, noise_px=0.1)
     fixed = ObjectPoints(np.arange(12), truth.points, np.zeros((12, 3, 3)))
-    a = adjust(replace(network, control=fixed), truth, datum=Datum("control"))
+    a = adjust(network.with_given(fixed), truth, datum=Datum("control"))
     found = findings_of(SurveyResult("fixed", "mm", 4, (), a, np.arange(12), None))
     page = html_of(found)
     assert np.isnan(found.precision.rms).all() and "standard deviation [" not in page
@@ -478,11 +478,11 @@ def test_a_network_without_scale_has_no_metric_unit(result: SurveyResult) -> Non
     free = replace(result, control_check=None)
     assert not free.has_scale
     known = ObjectPoints(np.arange(2), free.adjustment.estimate.points[:2], np.zeros((2, 3, 3)))
-    network = replace(free.adjustment.network, control=known)
+    network = free.adjustment.network.with_given(known)
     assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
     assert "network units" in html_of(findings_of(free))
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
-    network = replace(free.adjustment.network, scale_bars=bars)
+    network = free.adjustment.network.with_given(bars)
     assert replace(free, adjustment=replace(free.adjustment, network=network)).length_unit == "m"
 
 
@@ -669,7 +669,7 @@ def test_plots_of_small_and_plain_results() -> None:
     network, truth = make_network(seed_of("plots"), images=3, points=12, noise_px=0.0, cameras=2, free=())
     names = tuple(f"$x_{k}^ä.jpg" for k in range(3))
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([0.1]))
-    plain: Network = replace(network, images=names, scale_bars=bars)
+    plain: Network = replace(network, images=names).with_given(bars)
     a = adjust(plain, truth, datum=Datum("free"))
     plots = all_plots(plot_data(findings_of(SurveyResult("plots", "$m", 3, (), a, np.full(12, -1), None))))
     assert [plot.stem for plot in plots] == [

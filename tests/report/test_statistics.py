@@ -96,13 +96,13 @@ def synthetic() -> tuple[Network, Estimate]:
 
 def with_control(network: Network, xyz: np.ndarray, sigma: float) -> Network:
     covariance = np.tile(np.eye(3) * sigma**2, (len(xyz), 1, 1))
-    return replace(network, control=ObjectPoints(np.arange(len(xyz)), xyz, covariance))
+    return network.with_given(ObjectPoints(np.arange(len(xyz)), xyz, covariance))
 
 
 def with_bars(network: Network, truth: Estimate, errors: tuple[float, ...], sigma: float) -> Network:
     start, end = np.arange(len(errors)), np.arange(len(errors)) + 10
     length = np.linalg.norm(truth.points[end] - truth.points[start], axis=1) * (1 + np.array(errors))
-    return replace(network, scale_bars=ScaleBars(start, end, length, np.full(len(errors), sigma)))
+    return network.with_given(ScaleBars(start, end, length, np.full(len(errors), sigma)))
 
 
 def spoiled(camera: Camera, factor: float) -> Camera:
@@ -153,7 +153,7 @@ def test_a_given_angle_that_differs_is_a_warning_without_a_shift_of_the_result(
     observed = ExteriorObservations(
         np.arange(len(angles)), np.zeros_like(angles), angles, np.tile(variance, (len(angles), 1, 1))
     )
-    a = adjust(replace(network, exterior=observed), truth, datum=Datum("control"), reject="none")
+    a = adjust(network.with_given(observed), truth, datum=Datum("control"), reject="none")
     found = [one for one in findings_of(result_of(a)).verdict.remarks if one.kind.endswith("_differs")]
     assert [one.kind for one in found] == ["given_differs"] * (sigmas > 0)
     assert all(one.severity == "warning" and one.number("sigmas") > 5 for one in found)
@@ -171,9 +171,7 @@ def test_a_false_calibration_certificate_is_noticed_where_it_shifts_points(
     one = np.zeros(1, dtype=np.int64)
     given = np.array([camera.parameters[s] + sigmas * sigma])
     certificate = InteriorObservations(one, one + s, given, np.array([sigma]))
-    result = result_of(
-        adjust(replace(network, interior=certificate), truth, datum=Datum("free"), reject="none")
-    )
+    result = result_of(adjust(network.with_given(certificate), truth, datum=Datum("free"), reject="none"))
     found = given_of(result.adjustment, "m").interior
     assert found is not None and found.names == (f"c of camera {camera.name}",)
     counts = count_observations(result.adjustment)
@@ -205,9 +203,7 @@ def test_fixed_coordinates_do_not_make_the_points_look_more_precise(fixed: int) 
     covariance = np.tile(1e-6 * np.eye(3), (6, 1, 1))
     covariance[:fixed] = 0.0
     control = ObjectPoints(rows, truth.points[rows], covariance)
-    result = result_of(
-        adjust(replace(network, control=control), truth, datum=Datum("control"), reject="none")
-    )
+    result = result_of(adjust(network.with_given(control), truth, datum=Datum("control"), reject="none"))
     a = result.adjustment
     sigma = np.sqrt(np.einsum("nii->ni", a.covariance.points[fixed:]))
     rms = point_precision(a)[0]
@@ -514,11 +510,9 @@ def test_w_of_given_values_is_standard_normal() -> None:
     length, w, r, plain = np.linalg.norm(truth.points[end] - truth.points[start], axis=1), [], [], []
     for _ in range(60):
         xyz = truth.points[:5] + rng.standard_normal((5, 3)) @ factor.T
-        one = replace(
-            network,
-            image_points=replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape)),
-            control=ObjectPoints(np.arange(5), xyz, np.tile(factor @ factor.T, (5, 1, 1))),
-            scale_bars=ScaleBars(start, end, length + rng.normal(0, 3e-4, 4), np.full(4, 3e-4)),
+        one = replace(network, image_points=replace(k, xy=k.xy + rng.normal(0, 0.1, k.xy.shape))).with_given(
+            ObjectPoints(np.arange(5), xyz, np.tile(factor @ factor.T, (5, 1, 1))),
+            ScaleBars(start, end, length + rng.normal(0, 3e-4, 4), np.full(4, 3e-4)),
         )
         a = adjust(one, truth, datum=Datum("control"), reject="none")
         control, bars = given_of(a, "m").control, given_of(a, "m").bars

@@ -46,7 +46,7 @@ class Equipped:
 def _tables(scene: Equipped) -> None:
     words = (*BASE, *scene.rng.choice(OTHERS, 2, replace=False).tolist())
     scene.network, scene.truth = network_of(f"tables {scene.rng.integers(1 << 30)}", words)
-    scene.tables = {word: [kind] for word, kind in zip(words, scene.network.observations, strict=True)}
+    scene.tables = {word: [kind] for word, kind in zip(words, scene.network.further, strict=True)}
 
 
 def _changed(scene: Equipped) -> str:

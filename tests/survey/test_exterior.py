@@ -208,7 +208,7 @@ def test_control_places_a_network_from_a_twentieth_of_its_length(
     figure = size * np.array([[-1, -b, 0], [1, -b, 0], [1, b, 0], [-1, b, 0.5 * b]])
     network, truth = make_network(seed_of("breadth"), images=3, points=4, free=(), figure=figure)
     control = ObjectPoints(np.arange(4), truth.points + 3.0 * size, np.zeros((4, 3, 3)))
-    found = placing.place_on_exterior(replace(network, control=control), truth)
+    found = placing.place_on_exterior(network.with_given(control), truth)
     assert (found is truth) is placed
     if not placed:
         np.testing.assert_allclose(found.points, control.xyz, atol=1e-9 * size)
@@ -375,5 +375,5 @@ def test_mounts_that_are_observed_or_held_fixed_give_the_scale(observed: bool, h
     truth = replace(truth, mounts=replace(truth.mounts, free=free))
     if observed:
         mount = truth.mounts.position[1:], np.zeros((1, 3)), np.eye(6)[None]
-        network = replace(network, observations=(MountObservations(np.array([1]), *mount),))
+        network = network.with_given(further=(MountObservations(np.array([1]), *mount),))
     assert placing.mounts_give_scale(network, truth) is (observed or held)

@@ -91,7 +91,7 @@ def test_a_point_whose_ray_is_rejected_holds_no_camera(given: bool) -> None:
     xy[np.flatnonzero(seen.point == 7)[0]] += [40.0, -40.0]  # of two rays: one is left of the point
     wrong = replace(network, image_points=replace(seen, xy=xy))
     if given:
-        wrong = replace(wrong, control=ObjectPoints(np.array([7]), truth.points[7:8], np.zeros((1, 3, 3))))
+        wrong = wrong.with_given(ObjectPoints(np.array([7]), truth.points[7:8], np.zeros((1, 3, 3))))
     free = chosen(wrong, truth, extend=False).cameras[0].free
     assert free == chosen(network, truth, extend=False).cameras[0].free != ()
 
@@ -174,7 +174,7 @@ def test_control_determines_what_three_photographs_do_not() -> None:
     network, truth = make_network(seed_of("three photographs and control"), images=3, points=40)
     given = np.arange(0, 40, 2)
     control = ObjectPoints(given, truth.points[given], np.zeros((len(given), 3, 3)))
-    found = chosen(replace(network, control=control), truth, datum="control")
+    found = chosen(network.with_given(control), truth, datum="control")
     assert {"c", "K1"} <= set(found.cameras[0].free)
 
 
@@ -186,7 +186,7 @@ def test_wrong_control_does_not_decide_what_is_free(off: float) -> None:
     xyz = truth.points[given]
     xyz[2, 1] += off
     control = ObjectPoints(given, xyz, np.tile(1e-8 * np.eye(3), (len(given), 1, 1)))
-    found = chosen(replace(network, control=control), truth, datum="control")
+    found = chosen(network.with_given(control), truth, datum="control")
     assert found.cameras == chosen(network, truth).cameras and "b1" in found.cameras[0].free
 
 
@@ -196,7 +196,7 @@ def test_control_determines_c_of_many_photographs_that_do_not() -> None:
     control = ObjectPoints(given, truth.points[given], np.tile(1e-8 * np.eye(3), (len(given), 1, 1)))
     alone, with_control = (
         set(chosen(one, truth, datum="control").cameras[0].free)
-        for one in (network, replace(network, control=control))
+        for one in (network, network.with_given(control))
     )
     assert "c" not in alone and "c" in with_control
     assert alone == set(chosen(network, truth).cameras[0].free)

@@ -274,7 +274,7 @@ def test_scale_bars_keep_their_scale_where_control_places_the_network(bars: bool
     network, truth = make_network(seed_of("placed"), images=4, points=10)
     given = ObjectPoints(np.arange(5), 1.01 * truth.points[:5], np.zeros((5, 3, 3)))
     one = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-4])) if bars else ScaleBars()
-    placed, check = place_on_control(replace(network, control=given, scale_bars=one), truth)
+    placed, check = place_on_control(network.with_given(given, one), truth)
     assert fit_similarity(truth.points, placed.points).scale == pytest.approx(1.0 if bars else 1.01)
     assert check.scale == pytest.approx(1.01 if bars else 1.0)
 

@@ -163,7 +163,9 @@ def test_the_optimum_is_that_of_opencv() -> None:
             xy.astype(np.float32).reshape(-1, 2).astype(float),
             np.tile(0.01 * np.eye(2), (m * n, 1, 1)),
         ),
-        control=ObjectPoints(np.arange(n), points.astype(np.float32).astype(float), np.zeros((n, 3, 3))),
+        observations=(
+            ObjectPoints(np.arange(n), points.astype(np.float32).astype(float), np.zeros((n, 3, 3))),
+        ),
     )
     found = adjust(
         network, Estimate((start,), position, rotation, points), datum=Datum("control"), reject="none"

@@ -134,8 +134,7 @@ def beside_opencv(found: Adjustment, plane: FloatArray) -> FloatArray:
         image_points=replace(
             points, xy=xy.astype(float), covariance=np.tile(0.01 * np.eye(2), (len(xy), 1, 1))
         ),
-        control=ObjectPoints(np.arange(len(X)), X.astype(float), np.zeros((len(X), 3, 3))),
-    )
+    ).with_given(ObjectPoints(np.arange(len(X)), X.astype(float), np.zeros((len(X), 3, 3))))
     estimate = replace(found.estimate, cameras=(start,), points=X.astype(float))
     mine = adjust(network, estimate, datum=Datum("control"), reject="none")
     values = np.array([mine.estimate.cameras[0].value(name) for name in free])

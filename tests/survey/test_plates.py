@@ -170,10 +170,8 @@ def adjusted(images: int, *, sigma: float = 0.0, other: float = 1.0) -> Adjustme
     seen, (camera,) = network.image_points, truth.cameras
     centre = camera.frame[:2]
     turn = np.where(seen.image % 2 == 1, other, 1.0)[:, None]
-    network = replace(
-        network,
-        image_points=replace(seen, xy=centre + turn * (seen.xy - centre)),
-        control=ObjectPoints(np.arange(60), truth.points, np.tile(sigma**2 * np.eye(3), (60, 1, 1))),
+    network = replace(network, image_points=replace(seen, xy=centre + turn * (seen.xy - centre))).with_given(
+        ObjectPoints(np.arange(60), truth.points, np.tile(sigma**2 * np.eye(3), (60, 1, 1)))
     )
     return adjust(network, perturb(truth, rng), datum=Datum("control"), reject="none")
 
@@ -186,7 +184,7 @@ def test_known_coordinates_check_two_rays(sigma: float) -> None:
     assert kinds_of(ray_remarks(free)) == ("rays_tested", "third_ray_missing")
     network = on_control.network
     known = network.control
-    some = replace(network, control=ObjectPoints(known.point[:40], known.xyz[:40], known.covariance[:40]))
+    some = network.with_given(ObjectPoints(known.point[:40], known.xyz[:40], known.covariance[:40]))
     two = ray_remarks(replace(on_control, network=some))
     assert kinds_of(two) == ("rays_tested", "third_ray_missing") and two[1].number("two") == 20
 

@@ -84,7 +84,7 @@ def test_a_survey_of_a_rig_states_its_mount(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.rig_covariance, result.adjustment.covariance.rigs)
     shutil.copy(tmp_path / "out" / "mounts.csv", tmp_path)
     path = written(tmp_path, network, truth, RIG + 'mounts = "mounts.csv"\n')
-    (given,) = run_survey(read_survey(path)).network.observations
+    (given,) = run_survey(read_survey(path)).network.further
     assert len(given) == 1  # the row of the reference is none
     (stored,) = json.loads((tmp_path / "out" / "summary.json").read_text("utf-8"))["rigs"]
     assert stored["mounts"][0]["base"] == {"value": mount.base, "sigma": mount.base_sigma}

@@ -48,10 +48,10 @@ def test_scale_comes_from_bars_before_control_and_two_control_points_are_enough(
     network, truth = make_network(rng, images=4, points=10)
     half = replace(truth, points=truth.points / 2)
     two = ObjectPoints(np.array([0, 1]), truth.points[:2], np.zeros((2, 3, 3)))
-    assert object_scale(replace(network, control=two), half) == pytest.approx(2.0)
+    assert object_scale(network.with_given(two), half) == pytest.approx(2.0)
     length = np.linalg.norm(truth.points[3] - truth.points[2])
     bar = ScaleBars(np.array([2]), np.array([3]), np.array([3 * length]), np.array([1e-3]))
-    assert object_scale(replace(network, control=two, scale_bars=bar), half) == pytest.approx(6.0)
+    assert object_scale(network.with_given(two, bar), half) == pytest.approx(6.0)
     assert np.isnan(object_scale(network, half))
 
 

@@ -90,14 +90,14 @@ def network_of(name: str, kinds: tuple[str, ...] = tuple(TABLES)) -> tuple[Netwo
     line, plumb = at * [0.6, 0.5, -0.4] + [0.1, 0.2, 0.1], at * [0.0, 0.0, 1.0] + [0.2, -0.3, 0.0]
     figure = np.concatenate([line, plumb]) + 1e-4 * rng.standard_normal((14, 3))
     network, truth = make_network(rng, images=8, points=34, free=(), figure=figure)
-    return replace(network, observations=tuple(observed(kind, truth, rng) for kind in kinds)), truth
+    return network.with_given(further=tuple(observed(kind, truth, rng) for kind in kinds)), truth
 
 
 @pytest.mark.parametrize("kind", list(TABLES))
 def test_derivatives_are_those_of_differences(kind: str) -> None:
     """Of v'Pv for groups, whose own parameters are fitted anew; else of every value."""
     network, truth = network_of("derivatives", (kind,))
-    (one,) = network.observations
+    (one,) = network.further
     weight = np.linalg.inv(one.covariances())
 
     def seen(values: Estimate) -> FloatArray:
@@ -141,13 +141,12 @@ def network_of_all() -> tuple[Network, Estimate]:
     interior = InteriorObservations(
         np.array([0, 0]), np.array([0, 3]), np.zeros(2), np.array([1e-3, 1e-5]), correlated
     )
-    return replace(
-        network,
-        control=ObjectPoints(first + 20, np.zeros((3, 3)), np.tile(C, (3, 1, 1))),
-        scale_bars=ScaleBars(first + 14, first + 25, np.ones(3), np.full(3, 1e-4)),
-        exterior=ExteriorObservations(first, np.zeros((3, 3)), np.zeros((3, 3)), np.tile(pose, (3, 1, 1))),
-        interior=interior,
-        observations=(*(observed(kind, truth, rng) for kind in TABLES), mount),
+    return network.with_given(
+        ObjectPoints(first + 20, np.zeros((3, 3)), np.tile(C, (3, 1, 1))),
+        ExteriorObservations(first, np.zeros((3, 3)), np.zeros((3, 3)), np.tile(pose, (3, 1, 1))),
+        interior,
+        ScaleBars(first + 14, first + 25, np.ones(3), np.full(3, 1e-4)),
+        further=(*(observed(kind, truth, rng) for kind in TABLES), mount),
     ), truth
 
 
@@ -156,7 +155,7 @@ def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
     """25 draws, rig included: chi-square of a point and of the mount, v'Pv; redundancy numbers add up."""
     network, truth = network_of_all()
     points, mount, vPv, redundancy, constants = 0.0, 0.0, [], 0, []
-    (tape,) = (kind for kind in network.observations if isinstance(kind, OffsetDistances))
+    (tape,) = (kind for kind in network.further if isinstance(kind, OffsetDistances))
     (true_constant,) = tape.own_parameters(values_of(truth)).value
     rng = seed_of(f"scatter {datum}")
     for _ in range(25):
@@ -191,7 +190,7 @@ def test_without_errors_every_kind_has_the_values_of_the_truth() -> None:
 
 def test_every_observation_has_a_name_and_a_unit_of_each_component() -> None:
     network, truth = network_of_all()
-    for kind in network.kinds:
+    for kind in network.observations:
         assert len(kind.names(network, truth)) == len(kind)
         units = np.array(kind.units(truth, "mm"))
         assert units.shape == np.diagonal(kind.covariances(), axis1=1, axis2=2).shape
@@ -206,7 +205,7 @@ def test_heights_level_a_survey_and_distances_scale_it(tmp_path: Path) -> None:
     """From a free network in any attitude; an unknown point is named, and a gross error shows."""
     network, truth = network_of("levelled", ("height difference", "distance"))
     rows = {}
-    for kind, one in zip(("height difference", "distance"), network.observations, strict=True):
+    for kind, one in zip(("height difference", "distance"), network.further, strict=True):
         cells = [
             f"{network.points[i]},{network.points[j]},{float(value)!r},1e-4"
             for i, j, (value,) in zip(one.start, one.end, one.value, strict=True)  # type: ignore[attr-defined]
@@ -240,7 +239,7 @@ def test_start_values_in_any_attitude_come_to_the_observations() -> None:
     turned = Similarity(0.3, rotation_from_vector(np.array([2.0, -1.0, 0.5])), np.array([5.0, 1.0, 2.0]))
     placed = place_on_observations(network, turned.apply_estimate(truth))
     assert placed.points == pytest.approx(truth.points, abs=1e-3)
-    assert place_on_observations(replace(network, observations=()), truth) is truth
+    assert place_on_observations(network.with_given(further=()), truth) is truth
 
 
 @pytest.mark.parametrize(
@@ -262,7 +261,7 @@ def test_wrong_tables_are_refused(text: str, said: str, tmp_path: Path) -> None:
 def test_a_wrong_antenna_position_leaves_and_its_photograph_stays(tmp_path: Path) -> None:
     """1 m off, of eight; and a group of too few points is named."""
     network, truth = network_of("gross", ("antenna position",))
-    (one,) = network.observations
+    (one,) = network.further
     value, sigma = one.position.copy(), one.sigma  # type: ignore[attr-defined]
     value[3, 0] += 1.0
     cells = [
@@ -380,7 +379,7 @@ def test_a_mistake_in_a_whole_table_is_named(
     kind: str, mistake: str, open_with_heights: bool, tmp_path: Path
 ) -> None:
     network, truth = network_of(f"mistake {kind}", (kind, "height difference", "distance"))
-    right, heights, tape = network.observations
+    right, heights, tape = network.further
     given = {kind: [right.mistakes()[mistake]], "height difference": [heights], "distance": [tape]}
     remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
     said = [one for one in remarks if one.kind in ("kind_wrong", "observations_wrong")]
@@ -396,7 +395,7 @@ def test_left_handed_differences_have_two_readings_unless_heights_decide(
     level: bool, readings: tuple[str, ...], tmp_path: Path
 ) -> None:
     network, truth = network_of("left-handed", ("coordinate difference", "height difference", "rigid frame"))
-    right, heights, frame = network.observations
+    right, heights, frame = network.further
     swapped = right.with_values(right.values * [1.0, -1.0, 1.0])  # as X and Y exchanged, and a rotation by Z
     given = {"coordinate difference": [swapped], "rigid frame": [frame]}
     given |= {"height difference": [heights]} if level else {}
@@ -417,7 +416,7 @@ def test_left_handed_differences_have_two_readings_unless_heights_decide(
     ],
 )
 def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, angles: float) -> None:
-    (right,) = network_of("units", ("relative orientation",))[0].observations
+    (right,) = network_of("units", ("relative orientation",))[0].further
     assert isinstance(right, TableKind)
     found = right.mistakes()[mistake]
     factors = np.array([lengths] * 3 + [angles] * 3)
@@ -429,7 +428,7 @@ def test_other_units_are_of_lengths_or_of_angles(mistake: str, lengths: float, a
 def test_angles_in_radians_are_named_and_degrees_are_not(wrong: bool, tmp_path: Path) -> None:
     """As a script writes them into a column of degrees, with their standard deviations."""
     network, truth = network_of("radians", ("horizontal direction", "height difference", "distance"))
-    directions, heights, tape = network.observations
+    directions, heights, tape = network.further
     assert isinstance(directions, TableKind)
     if wrong:
         directions = directions.with_values(np.radians(directions.values))
@@ -446,7 +445,7 @@ def test_points_that_are_not_on_their_plane_are_in_no_other_unit(offset: float, 
     network, truth = network_of(f"off {offset}", ("distance",))
     points, value = np.arange(14, 20), np.full((6, 1), offset)
     plane = planes_and_lines.Planes("wall", points, value, np.full((6, 1), 1e-3))
-    given = {"plane": [plane], "distance": list(network.observations)}
+    given = {"plane": [plane], "distance": list(network.further)}
     remarks = run_with(tmp_path, network, truth, given).remarks  # type: ignore[arg-type]
     (found,) = [one for one in remarks if one.kind == "kind_wrong"]
     assert found.names("of") == ("planes",) and not found.names("mistake")
@@ -457,7 +456,7 @@ def test_points_that_are_not_on_their_plane_are_in_no_other_unit(offset: float, 
 def test_of_two_verticals_that_contradict_one_another_neither_is_right_alone(tmp_path: Path) -> None:
     """Axes and heights in a free datum: each agrees without the other, and nothing else decides."""
     network, truth = network_of("two verticals", ("coordinate difference", "height difference"))
-    axes, heights = network.observations
+    axes, heights = network.further
     assert isinstance(heights, HeightDifferences)
     slope = 0.1 * (truth.points[heights.end, 0] - truth.points[heights.start, 0])
     tilted = replace(heights, value=heights.value + slope[:, None])
@@ -469,7 +468,7 @@ def test_of_two_verticals_that_contradict_one_another_neither_is_right_alone(tmp
 
 def test_of_rows_of_the_same_points_only_the_wrong_one_is_left_out(tmp_path: Path) -> None:
     network, truth = network_of("same points twice", ("height difference", "distance"))
-    heights, tape = network.observations
+    heights, tape = network.further
     assert isinstance(heights, HeightDifferences)
     twice = [*range(len(heights)), 2]
     value = heights.value[twice].copy()
@@ -478,19 +477,18 @@ def test_of_rows_of_the_same_points_only_the_wrong_one_is_left_out(tmp_path: Pat
     result = run_with(tmp_path, network, truth, {"height difference": [again], "distance": [tape]})
     (said,) = of_kind(result.remarks, "observations_wrong")
     assert said.names("observations") == (f"height difference {heights.names(network, truth)[2]}",)
-    (kept,) = [one for one in result.network.observations if isinstance(one, HeightDifferences)]
+    (kept,) = [one for one in result.network.further if isinstance(one, HeightDifferences)]
     assert len(kept) == len(heights)
 
 
 def test_factors_of_several_rounds_multiply() -> None:
     network, truth = network_of("rounds", ("height difference", "distance"))
     tables = [
-        Table(kind, k, np.arange(len(kind.parts(network, truth))))
-        for k, kind in enumerate(network.observations)
+        Table(kind, k, np.arange(len(kind.parts(network, truth)))) for k, kind in enumerate(network.further)
     ]
     rounds = [Contradiction("height differences", factor=factor) for factor in (2.0, 3.0)]
     heights, tape = (table.kind for table in as_judged(tables, rounds))
-    before, of_tape = network.observations
+    before, of_tape = network.further
     assert isinstance(heights, TableKind) and isinstance(before, TableKind) and tape is of_tape
     np.testing.assert_allclose(heights.sigma, 6 * before.sigma)
 
@@ -501,12 +499,12 @@ def test_of_a_long_table_some_rows_are_judged_and_all_follow(
 ) -> None:
     monkeypatch.setattr(free_network, "MAX_PLACES", 10)
     network, truth = network_of("long table", ("coordinate difference", "height difference"))
-    heights, (start, end) = network.observations[1], np.triu_indices(12, 1)
+    heights, (start, end) = network.further[1], np.triu_indices(12, 1)
     dZ = (truth.points[end, 2] - truth.points[start, 2])[:, None]
     long = HeightDifferences(start, end, (-1 if wrong else 1) * dZ, np.full((len(dZ), 1), 1e-3))
-    given = {"coordinate difference": [network.observations[0]], "height difference": [long]}
+    given = {"coordinate difference": [network.further[0]], "height difference": [long]}
     result = run_with(tmp_path, network, truth, given)  # type: ignore[arg-type]
-    kept = [one for one in result.network.observations if isinstance(one, type(heights))]
+    kept = [one for one in result.network.further if isinstance(one, type(heights))]
     assert [len(one) for one in kept] == ([] if wrong else [66])
     said = of_kind(result.remarks, "kind_wrong")
     assert [one.names("mistake") for one in said] == ([("exchanged",)] if wrong else [])
@@ -523,7 +521,7 @@ def test_angles_that_cannot_be_distinguished_are_refused(tmp_path: Path) -> None
 def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
     """One direction to another target, one height between exchanged points, a set of a second set-up."""
     network, truth = network_of("single", ("horizontal direction", "height difference", "distance"))
-    first, heights, tape = network.observations
+    first, heights, tape = network.further
     assert isinstance(first, HorizontalDirections) and isinstance(heights, HeightDifferences)
     value, dZ = first.value.copy(), heights.value.copy()
     value[2] += 0.01
@@ -546,7 +544,7 @@ def test_a_single_wrong_observation_leaves_its_group(tmp_path: Path) -> None:
         (f"height difference {ends}",): ("exchanged",),
     }
     assert len(reported(tmp_path, result)["further_observations"]["horizontal direction"]) == 5 + 6
-    sets = [kind for kind in result.network.observations if isinstance(kind, HorizontalDirections)]
+    sets = [kind for kind in result.network.further if isinstance(kind, HorizontalDirections)]
     assert [len(one.value) for one in sets] == [5, 6]
     assert sets[1].group == f"{sets[0].group} (2)"
 
@@ -567,7 +565,7 @@ def test_the_constant_of_simulated_distances_is_that_of_the_table(
 def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path) -> None:
     """A constant of 0.1 m; one distance that is misread leaves."""
     network, truth = network_of("constant", ("distance with additive constant",))
-    (one,) = network.observations
+    (one,) = network.further
     assert isinstance(one, OffsetDistances)
     value = one.value + 0.1
     value[3] += 0.05
@@ -580,7 +578,7 @@ def test_distances_with_a_constant_give_the_scale_whatever_it_is(tmp_path: Path)
     (true,) = one.own_parameters(values_of(truth)).value + 0.1
     assert abs(constant["values"][0] - true) < 5 * np.sqrt(constant["covariance"][0][0]) < 5e-3
     assert "additive constant" in (tmp_path / "out" / "report.html").read_text("utf-8")
-    (kept,) = result.network.observations
+    (kept,) = result.network.further
     assert len(kept.value) == 6
     (said,) = of_kind(result.tests, "scale_unchecked")
     assert said.names("given") == ("the distances with additive constant tape",)
@@ -606,17 +604,17 @@ def test_a_frame_alone_gives_the_scale_and_leaves_position_and_attitude_open(lin
     if line:
         local = np.linspace(-0.5, 0.5, 7)[:, None] * [np.sqrt(0.77), 0, 0]
     frame = RigidFrames("frame", np.arange(7) + 14 * (not line), local, np.full((7, 3), 1e-4))
-    a = adjust(replace(network, observations=(frame,)), truth, reject="none", datum=Datum("free"))
+    a = adjust(network.with_given(further=(frame,)), truth, reject="none", datum=Datum("free"))
     assert a.defect == a.expected_defect == 6 and not a.undetermined
     assert np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2)).max() < 3e-4
 
 
 def with_tip(network: Network, truth: Estimate, local: FloatArray) -> tuple[Network, FloatArray]:
     """Return the network with a tip in its frame, known to 0.1 mm, and where the tip is."""
-    (frame,) = (kind for kind in network.observations if isinstance(kind, RigidFrames))
+    (frame,) = (kind for kind in network.further if isinstance(kind, RigidFrames))
     tipped = replace(frame, hidden=("tip",), hidden_value=local, hidden_sigma=np.full((1, 3), 1e-4))
-    others = tuple(kind for kind in network.observations if kind is not frame)
-    return replace(network, observations=(*others, tipped)), tipped.own_parameters(values_of(truth)).value
+    others = tuple(kind for kind in network.further if kind is not frame)
+    return network.with_given(further=(*others, tipped)), tipped.own_parameters(values_of(truth)).value
 
 
 @pytest.mark.slow
@@ -672,7 +670,7 @@ def test_a_tip_beside_a_bar_is_not_determined(tmp_path: Path) -> None:
     points = truth.points.copy()
     points[at] = bar + offset
     network, truth = make_network(seed_of("bar"), images=8, points=34, free=(), figure=points)
-    (tape,) = network_of("bar", ("distance",))[0].observations
+    (tape,) = network_of("bar", ("distance",))[0].further
     tape = tape.simulated(values_of(truth))
     rows = [
         f"probe,{network.points[j]},{x},0,0,1e-4,1e-4,1e-4"
@@ -770,7 +768,7 @@ def test_a_point_is_once_in_a_group_and_a_distance_as_often_as_measured(
 def test_copied_rows_count_once(kind: str, tmp_path: Path) -> None:
     """A copied table made its observations count twice, and their precision 1.4 times too good."""
     network, truth = network_of("copies", (kind,))
-    (one,) = network.observations
+    (one,) = network.further
     names = network.images if TABLES[kind].texts_of == PHOTOGRAPH else network.points
     sigma = np.sqrt(np.einsum("nii->ni", one.covariances()))
     ends = [one.image] if hasattr(one, "image") else [one.start, one.end]  # type: ignore[attr-defined]
@@ -841,5 +839,5 @@ def test_a_plumb_line_through_points_that_are_apart_ends_no_adjustment(seed: int
     line = PlumbLines("v", np.array([20, 21]), np.zeros((2, 2)), np.full((2, 2), 2e-4))
     free = np.isin(truth.cameras[0].names, ("c", "x0", "y0", "K1", "K2", "P1", "P2", "b1", "b2"))
     start = replace(truth, cameras=(replace(truth.cameras[0], free=free),))
-    observed = replace(network, control=control, observations=(line,))
+    observed = network.with_given(control, further=(line,))
     adjust(observed, start, datum=Datum("control"), reject="tau")

@@ -220,7 +220,7 @@ def test_a_grid_of_a_plate_does_not_scatter() -> None:
     free = FreeNetwork(adjust(network, truth, datum=Datum("free")))
     for plates, kind in (((), "given_scatter"), ((network.points[:8],), "given_not_exact")):
         settings = GivenSettings(Datum("control"), "m", plates=tuple(map(frozenset, plates)))
-        judged = judge_given(replace(network, control=control), free, settings)
+        judged = judge_given(network.with_given(control), free, settings)
         assert kind in kinds_of(judged.remarks)
         assert ("scale_unchecked" in kinds_of(judged.remarks)) is not bool(plates)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -84,7 +82,7 @@ def test_rounds_end_at_the_simultaneous_optimum(free: tuple[str, ...], control: 
     rng = seed_of(f"separate {free} {control}")
     network, truth = make_network(rng, images=6, points=20, free=free)
     if control:
-        network = replace(network, control=ObjectPoints(np.arange(8), truth.points[:8], np.zeros((8, 3, 3))))
+        network = network.with_given(ObjectPoints(np.arange(8), truth.points[:8], np.zeros((8, 3, 3))))
     start = perturb(truth, rng, position=1e-3, angle_deg=0.1, points=1e-3)
     both = adjust(network, start, datum=Datum("control" if control else "free"), reject="none")
     turn = adjust_separately(network, start)
@@ -100,4 +98,4 @@ def test_scale_bars_are_refused() -> None:
     network, truth = make_network(seed_of("bars"), images=4, points=10)
     bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-3]))
     with pytest.raises(GeometryError, match="expected image points and fixed control only"):
-        adjust_separately(replace(network, scale_bars=bars), truth)
+        adjust_separately(network.with_given(bars), truth)

@@ -447,10 +447,8 @@ def more_command(
         if not sigma > 0:
             raise GeometryError("the standard deviation of its image points is not known")
         network = replace(
-            stored.network,
-            image_points=replace(seen, covariance=seen.covariance * (sigma / stated) ** 2),
-            scale_bars=given.bars,
-        )
+            stored.network, image_points=replace(seen, covariance=seen.covariance * (sigma / stated) ** 2)
+        ).with_given(given.bars)
         further = further_photographs(
             network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
         )

@@ -93,7 +93,7 @@ def judge_given(
         checks = settings.checks_scale or with_mounts
         given = _judged(replace(task, settings=replace(settings, checks_scale=checks)))
     given = replace(given, remarks=(*of_mounts, *given.remarks), mounts=mounts)
-    if not (network.observations or with_mounts):
+    if not (network.further or with_mounts):
         return given
     if task is None or place is None or (given.datum.kind == "control" and not given.tests):
         unjudged = remark("given_not_judged", of=("observations",))
@@ -126,10 +126,10 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     """Return the judged values with the survey observations and mounts that do not contradict others."""
     settings, network, mounts = task.settings, given.network, given.mounts
     in_control = given.datum.kind == "control"
-    in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.observations)]
+    in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.further)]
     tables = [Table(kind, k, parts) for k, parts, kind in in_free if len(kind)]
     part = _in_free_network(task, given, tables)
-    kinds = [*confirmed(part), *part.observations]
+    kinds = [*confirmed(part), *part.further]
     reference = task.free.reference_of(kinds if mounts is None else [*kinds, mounts])
     if reference is None:
         return given
@@ -144,27 +144,27 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     ):
         # several kinds contradict the one scale that the bars have: which of them is wrong is open
         distances = Distances(bars.start, bars.end, bars.values, bars.sigma[:, None])
-        table = Table(distances, len(network.observations), there)
-        part = replace(part, scale_bars=ScaleBars())
+        table = Table(distances, len(network.further), there)
+        part = part.with_given(ScaleBars())
         wrong = judge_tables([*tables, table], part, reference, place, settings.level)
         kept = [row for left in as_judged([table], wrong) for row in left.parts.tolist()]
         out = np.setdiff1d(there, kept)
         in_use = np.isin(np.arange(len(network.scale_bars)), out, invert=True)
-        network = replace(network, scale_bars=network.scale_bars.select(in_use))
-        part = replace(part, scale_bars=task.in_free(network.scale_bars)[1])
-    part = replace(part, observations=tuple(table.kind for table in as_judged(tables, wrong)))
+        network = network.with_given(network.scale_bars.select(in_use))
+        part = part.with_given(task.in_free(network.scale_bars)[1])
+    part = part.with_given(further=tuple(table.kind for table in as_judged(tables, wrong)))
     of_mounts: tuple[Remark, ...] = ()
     if mounts is not None and len(mounts):
         mounts, of_mounts = judge_mount_scales(mounts, part, reference, place, settings.level)
     estimate = task.free.adjustment.estimate
-    kinds = [*network.observations, given.network.scale_bars]
+    kinds = [*network.further, given.network.scale_bars]
     names = [kind.parts(network, estimate) for kind in kinds]
-    every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.observations)]
+    every = [Table(kind, k, np.arange(len(names[k]))) for k, kind in enumerate(network.further)]
     observations = tuple(table.kind for table in as_judged(every, wrong))
     remarks = tuple(contradiction.remark(names) for contradiction in wrong) + of_mounts
     return replace(
         given,
-        network=replace(network, observations=observations),
+        network=network.with_given(further=observations),
         remarks=given.remarks + remarks,
         mounts=mounts,
         others_contradict=bool(remarks),
@@ -175,13 +175,12 @@ def _in_free_network(task: Task, given: JudgedGiven, tables: Sequence[Table]) ->
     """Return the free network with the given values that take part, and the observations of the tables."""
     network = given.network
     if given.datum.kind != "control":
-        network = replace(network, control=ObjectPoints(), exterior=ExteriorObservations())
-    return replace(
-        task.free.adjustment.network,
-        control=task.in_free(network.control)[1],
-        exterior=task.in_free(network.exterior)[1],
-        scale_bars=task.in_free(network.scale_bars)[1],
-        observations=tuple(table.kind for table in tables),
+        network = network.with_given(ObjectPoints(), ExteriorObservations())
+    return task.free.adjustment.network.with_given(
+        task.in_free(network.control)[1],
+        task.in_free(network.exterior)[1],
+        task.in_free(network.scale_bars)[1],
+        further=tuple(table.kind for table in tables),
     )
 
 
@@ -196,7 +195,7 @@ def _judged(task: Task) -> JudgedGiven:
     contradiction = contradiction_of(task, used)
     if contradiction is not None:
         used = []
-    network = replace(network, scale_bars=scales.bars)
+    network = network.with_given(scales.bars)
     for group in groups:
         of = "control" if group.of == "control" else "exterior"
         judged = group.as_judged(getattr(network, of), rescale=task.settings.rescale, used=group in used)

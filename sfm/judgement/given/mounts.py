@@ -96,7 +96,7 @@ def judge_mount_scales(
         place: gives the object frame from the frame of the free network, by all given values of a network.
         level: probability that right mounts are reported as wrong.
     """
-    right = [kind for kind in (*confirmed(network), *network.observations) if len(kind)]
+    right = [kind for kind in (*confirmed(network), *network.further) if len(kind)]
     free = reference.marginal.adjustment.estimate
     mounts, has_scale = free.mounts, given.position.any(axis=1).all()  # a base of 0 has none
     if mounts is None or not has_scale:
@@ -123,7 +123,7 @@ def judge_mount_scales(
         contradicting = cameras
         sources = {"bars": network.scale_bars, "control": network.control, "centres": network.exterior}
         others = [name for name, values in sources.items() if len(values)]
-        others += [kind.name for kind in network.observations]
+        others += [kind.name for kind in network.further]
     by = numbers_of_scale(off, sigma, level)
     said = remark("scale_contradicted", cameras=contradicting, others=others, **by)
     return given.select(np.zeros(len(given), dtype=bool)), (said,)

@@ -126,7 +126,7 @@ class _Judge:
     def model(self, kinds: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
         """Return the differences of observations from what the right values imply, and the kind of each."""
         right = [kind for kind in confirmed(self.network) if len(kind)]
-        placing = self.place(replace(self.network, observations=tuple(kinds)))
+        placing = self.place(self.network.with_given(further=tuple(kinds)))
         model, kind = self.reference.differences([*right, *kinds], placing)
         of_right = kind < len(right)
         return model.beside(of_right[model.item]), kind[~of_right] - len(right)
@@ -180,7 +180,7 @@ class _Judge:
 
         If the kind contradicts the image points alone, at the scale of all, these are among the others.
         """
-        placing = self.place(replace(self.network, observations=tuple(table.kind for table in tables)))
+        placing = self.place(self.network.with_given(further=tuple(table.kind for table in tables)))
         right = [kind for kind in confirmed(self.network) if len(kind)]
         kinds = [*right, *(table.kind for table in tables)]
         model, kind = self.reference.differences(kinds, placing)

@@ -510,7 +510,7 @@ def adjust_image_points(
     """
     alone = without_given(network)
     if datum == "control":
-        alone = replace(alone, control=network.control)
+        alone = alone.with_given(network.control)
     part, start, rows = _sample(alone, estimate)
     try:
         free = adjust(

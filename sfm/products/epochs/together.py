@@ -228,13 +228,13 @@ def _network_of(epoch: Epoch) -> Network:
     ]
     table = np.array(rows, dtype=float).reshape(-1, 4)
     return replace(
-        result.network,
-        image_points=replace(seen, covariance=seen.covariance * factor**2, stated=None),
-        scale_bars=epoch.bars,
-        control=epoch.control,
-        interior=InteriorObservations(
+        result.network, image_points=replace(seen, covariance=seen.covariance * factor**2, stated=None)
+    ).with_given(
+        epoch.control,
+        InteriorObservations(
             table[:, 0].astype(np.int64), table[:, 1].astype(np.int64), table[:, 2], table[:, 3]
         ),
+        epoch.bars,
     )
 
 

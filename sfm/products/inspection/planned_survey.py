@@ -127,7 +127,7 @@ class PlannedSurvey:
         for start, end, sigma in self.bars:
             network = network.with_scale_bar(start, end, 1.0, sigma)
         network = with_tables(self.tables, network)
-        network = replace(network, observations=(*network.observations, self.given_mounts))
+        network = network.with_given(further=(*network.further, self.given_mounts))
         truth = Estimate(self.cameras, stations.position, stations.rotation, self.xyz, stations.rig)
         return simulate_network(network, truth, np.random.default_rng(seed))
 
@@ -335,7 +335,7 @@ def write_simulation(
     for kind, of in TABLES.items():
         of_kind = [
             row
-            for observations in network.observations
+            for observations in network.further
             if type(observations) is of
             for row in observations.table_rows(network)
         ]
@@ -408,7 +408,7 @@ def _rig_section(folder: Path, network: Network, truth: Estimate) -> list[str]:
     _write(folder / MOMENTS, ("image", "moment"), zip(network.images, network.moment.tolist(), strict=True))
     lines = ["[[rig]]", f"name = {json.dumps(rig)}", f"cameras = {json.dumps(cameras)}"]
     lines += [f'moment = "{MOMENTS}"']
-    (given,) = (kind for kind in network.observations if isinstance(kind, MountObservations))
+    (given,) = (kind for kind in network.further if isinstance(kind, MountObservations))
     if len(given):
         sigma = np.sqrt(np.diagonal(given.covariance, axis1=1, axis2=2))
         values = np.hstack([IN_FILES * given.values, IN_FILES * sigma]).tolist()

@@ -409,7 +409,7 @@ def _observed(plan: Plan) -> dict[str, Any]:
     tables = {
         kind: [
             row
-            for observations in network.observations
+            for observations in network.further
             if type(observations) is of
             for row in observations.table_rows(network)
         ]
@@ -423,7 +423,7 @@ def _observed(plan: Plan) -> dict[str, Any]:
     if mounts is None:
         return observed
     sigma = {int(a): np.zeros(6) for a in np.flatnonzero(~mounts.free.any(axis=1))}
-    for observations in network.observations:
+    for observations in network.further:
         if isinstance(observations, MountObservations):
             deviations = np.sqrt(np.diagonal(observations.covariance, axis1=1, axis2=2))
             sigma |= dict(zip(observations.camera.tolist(), deviations, strict=True))

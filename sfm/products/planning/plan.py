@@ -116,7 +116,7 @@ def describe_plan(
     every = np.ones(len(prediction.planned.names), dtype=bool)
     network = prediction.adjustment.network
     # Points with observations besides image points need a code as their name.
-    observed = [at for kind in network.kinds for of, at in kind.blocks() if of == POINT]
+    observed = [at for kind in network.observations for of, at in kind.blocks() if of == POINT]
     named = np.isin(prediction.point, np.concatenate([*observed, np.zeros(0, dtype=np.int64)]))
     coded = np.union1d(choose_coded(seen), np.flatnonzero(named))
     camera = prediction.cameras[0]

@@ -230,7 +230,7 @@ def predict_network(
         stations.camera[photographs],
         names,
         seen,
-        scale_bars=_scale_bars(planned, place, bars),
+        observations=(_scale_bars(planned, place, bars),),
         moment=None if stations.taken_at is None else stations.taken_at[photographs],
     )
     estimate = Estimate(
@@ -257,7 +257,7 @@ def predict_network(
 
 def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
     """Refuse observations without values, such as lines, that the planned points contradict."""
-    for kind in (kind for kind in network.observations if isinstance(kind, Group) and len(kind)):
+    for kind in (kind for kind in network.further if isinstance(kind, Group) and len(kind)):
         off = np.abs(kind.linearise(values_of(estimate)).difference.ravel())
         beyond = off / kind.sigma.ravel()
         worst = int(beyond.argmax())
@@ -365,7 +365,7 @@ def simulate_network(
         off it by the stated errors.
     """
     if rng is not None:
-        for kind in network.kinds:
+        for kind in network.observations:
             truth = replace(truth, points=kind.displaced(values_of(truth), rng))
     seen = network.image_points
     xy = np.empty(seen.xy.shape)
@@ -377,14 +377,12 @@ def simulate_network(
         xy += np.einsum("kab,kb->ka", root, rng.standard_normal(xy.shape))
     values = values_of(truth)
     return (
-        replace(
-            network,
-            image_points=replace(seen, xy=xy),
-            control=network.control.simulated(values, rng),
-            scale_bars=network.scale_bars.simulated(values, rng),
-            exterior=network.exterior.simulated(values, rng),
-            interior=network.interior.simulated(values, rng),
-            observations=tuple(kind.simulated(values, rng) for kind in network.observations),
+        replace(network, image_points=replace(seen, xy=xy)).with_given(
+            network.control.simulated(values, rng),
+            network.exterior.simulated(values, rng),
+            network.interior.simulated(values, rng),
+            network.scale_bars.simulated(values, rng),
+            further=tuple(kind.simulated(values, rng) for kind in network.further),
         ),
         truth,
     )

@@ -269,8 +269,8 @@ def contributions(prediction: Prediction) -> tuple[Contribution, ...]:
         every = np.ones(len(network.image_points), dtype=bool)
         network, start = reduce_network(network, replace(a.estimate, mounts=None), images, points, every)
         parts.append(_contribution_of(a, RIG, moments, network, start))
-    for name in dict.fromkeys(kind.name for kind in a.network.kinds if len(kind)):
-        count = sum(len(kind) for kind in a.network.kinds if kind.name == name)
+    for name in dict.fromkeys(kind.name for kind in a.network.observations if len(kind)):
+        count = sum(len(kind) for kind in a.network.observations if kind.name == name)
         parts.append(_contribution_of(a, name, count, *_without(a.network, a.estimate, name)))
     return tuple(parts)
 
@@ -279,11 +279,11 @@ def _contribution_of(
     a: Adjustment, name: str, count: int, network: Network, estimate: Estimate
 ) -> Contribution:
     """Return the contribution of a kind from the network without it and the whole network."""
-    rest = tuple(kind for kind in network.observations if not kind.needs_scale)
+    rest = tuple(kind for kind in network.further if not kind.needs_scale)
     known, less = _determined(a), None
-    for observations in (network.observations, rest):  # other kinds need a scale, which only this may give
+    for observations in (network.further, rest):  # other kinds need a scale, which only this may give
         with suppress(GeometryError):
-            less = less or predict(replace(network, observations=observations), estimate)
+            less = less or predict(network.with_given(further=observations), estimate)
     left = np.zeros(0, dtype=bool) if less is None else _determined(less)
     names = () if less is None else less.network.points
     place = {point: j for j, point in enumerate(names) if left[j]}
@@ -304,16 +304,13 @@ def _without(network: Network, estimate: Estimate, name: str) -> tuple[Network, 
     """Return a network without the observations of a kind."""
     mounts = estimate.mounts
     if name == MountObservations.name and mounts is not None:
-        given = [
-            a for kind in network.observations if isinstance(kind, MountObservations) for a in kind.camera
-        ]
+        given = [a for kind in network.further if isinstance(kind, MountObservations) for a in kind.camera]
         free = mounts.free.copy()
         free[given] = True
         estimate = replace(estimate, mounts=replace(mounts, free=free))
-    return replace(
-        network,
-        scale_bars=ScaleBars() if name == ScaleBars.name else network.scale_bars,
-        observations=tuple(kind for kind in network.observations if kind.name != name),
+    return network.with_given(
+        ScaleBars() if name == ScaleBars.name else network.scale_bars,
+        further=tuple(kind for kind in network.further if kind.name != name),
     ), estimate
 
 

@@ -97,7 +97,7 @@ def orient(
             + f", {len(rows)} of them with windows that do not overlap: too few to adjust; are these the "
             "photographs of the model?"
         ) from error
-    alone = replace(part, control=ObjectPoints(), scale_bars=ScaleBars())
+    alone = part.with_given(ObjectPoints(), ScaleBars())
     adjusted = adjust(alone, start, datum=Datum("free"), reject="huber", covariance=False)
     refuse_undetermined(alone, adjusted, lost)
     v = np.abs(adjusted.residuals)
@@ -330,12 +330,9 @@ def join_targets(network: Network, estimate: Estimate, targets: ModelTargets) ->
     n, added = len(network.points), targets.network
     first, second, control, bars = network.image_points, added.image_points, added.control, added.scale_bars
     joined = ImagePoints.joined([first, replace(second, point=n + second.point)])
-    return replace(
-        network,
-        points=network.points + added.points,
-        image_points=joined,
-        control=ObjectPoints(n + control.point, control.xyz, control.covariance),
-        scale_bars=bars.renumbered(n + np.arange(len(added.points))),
+    return replace(network, points=network.points + added.points, image_points=joined).with_given(
+        ObjectPoints(n + control.point, control.xyz, control.covariance),
+        bars.renumbered(n + np.arange(len(added.points))),
     ), replace(estimate, points=np.concatenate([estimate.points, targets.points]))
 
 

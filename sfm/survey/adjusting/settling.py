@@ -228,7 +228,7 @@ def adjust_finally(task: Task, part: Network, estimate: Estimate, rejected: Bool
 
     outer = (part.control, part.exterior) if task.datum.kind == "control" else ()
     weighted = any(is_observed(np.einsum("nii->ni", given.covariance)).any() for given in outer)
-    others = len(part.scale_bars) or len(part.interior) or len(part.observations) or weighted
+    others = len(part.scale_bars) or len(part.interior) or len(part.further) or weighted
     if (others or len(part.sources) > 1) and task.survey.adjust.weights == "components":
         return _adjust_with_components(adjust_part, part, task.factor)
     return adjust_part(np.ones(len(part.image_points)))

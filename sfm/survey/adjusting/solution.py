@@ -232,8 +232,8 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     varying: names of the cameras with c per photograph, if c is adjusted.
     """
     network, estimate = matched.network, matched.estimate
-    tables = tuple(kind for kind in network.observations if not isinstance(kind, MountObservations))
-    network = replace(network, observations=tables)  # mounts only take part if photographs confirm them
+    tables = tuple(kind for kind in network.further if not isinstance(kind, MountObservations))
+    network = network.with_given(further=tables)  # mounts only take part if photographs confirm them
     datum = survey.datum.kind
     unused: tuple[Remark, ...] = ()
     if survey.exterior is not None and datum == "control":
@@ -249,7 +249,7 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         estimate = replace(estimate, points=np.where(estimate.determined[:, None], held, np.nan))
     frame = given_values(survey, network) if matched.given else None
     chosen = choose_free_parameters(
-        survey, replace(network, scale_bars=ScaleBars(), observations=()), estimate, datum=datum
+        survey, network.with_given(ScaleBars(), further=()), estimate, datum=datum
     )
     cameras = list(chosen.cameras)
     for a, settings in enumerate(cameras):
@@ -294,7 +294,7 @@ def _free_network(start: _Prepared) -> StableAdjustment | None:
     if _has_no_identity(task.survey):
         return None
     report_step("adjusting the image points alone")
-    network = replace(task.network, scale_bars=ScaleBars(), exterior=ExteriorObservations(), observations=())
+    network = task.network.with_given(ExteriorObservations(), ScaleBars(), further=())
     try:
         return settle_by_photograph(replace(task.in_free_datum, network=network), estimate)
     except GeometryError:
@@ -315,23 +315,19 @@ def _with_confirmed_values(
     """Return the task with the given values that the image points confirm, and their judgement."""
     task, survey, network = start.task, start.task.survey, start.task.network
     if free is not None:  # with its per-photograph cameras, if any
-        network = replace(
-            free.task.network,
-            control=network.control,
-            scale_bars=network.scale_bars,
-            exterior=network.exterior,
-            observations=network.observations,
+        network = free.task.network.with_given(
+            network.control, network.exterior, network.scale_bars, further=network.further
         )
     mounts = survey.given_mounts
     if start.estimate.mounts is not None:  # of a camera that no moment pairs with others, nothing is used
         mounts = mounts.select(np.array(start.estimate.mounts.rig)[mounts.camera] != "")
     if _has_no_identity(survey):
-        unjudged = len(network.observations) > 0 or len(mounts) > 0
+        unjudged = len(network.further) > 0 or len(mounts) > 0
         remarks = (remark("given_not_judged", of=("observations",)),) if unjudged else ()
         return task, JudgedGiven(network, task.datum, remarks, mounts=mounts)
     report_step("testing the given values")
     is_plate = is_plate_control(survey.control, plate_control(survey.targets))
-    others = replace(start.task.network, scale_bars=ScaleBars())
+    others = start.task.network.with_given(ScaleBars())
     settings = GivenSettings(
         task.datum,
         survey.unit,
@@ -392,7 +388,7 @@ def _settle_with_given(
     if given.mounts is not None and len(given.mounts):
         scaled = task.datum.kind == "control" or len(task.network.scale_bars) > 0
         estimate = hold_mounts(estimate, given.mounts, scaled=scaled)
-        if task.network.observations and task.datum.kind != "control":
+        if task.network.further and task.datum.kind != "control":
             estimate = place_on_observations(task.network, estimate)
         task = replace(task, network=with_given_mounts(given.mounts, task.network))
     if free is None:

@@ -131,10 +131,10 @@ def weak_scale(a: Adjustment) -> tuple[Remark, ...]:
     """Return the remark on a scale that only survey observations give, with low precision."""
     network = a.network
     given = a.datum == "control" or len(network.scale_bars) or len(network.control.complete) >= 2
-    if given or mounts_give_scale(network, a.estimate) or not network.observations or not a.has_scale:
+    if given or mounts_give_scale(network, a.estimate) or not network.further or not a.has_scale:
         return ()
     sigma = scale_sigma(network, a.estimate)
-    names = list(dict.fromkeys(kind.name for kind in network.observations))
+    names = list(dict.fromkeys(kind.name for kind in network.further))
     return (remark("scale_weak", observations=names, sigma=(100 * sigma, "%")),) if sigma > WEAK_SCALE else ()
 
 
@@ -144,10 +144,10 @@ def scale_alone(a: Adjustment) -> tuple[Remark, ...]:
     if a.datum == "control" or len(network.scale_bars) or len(network.control.complete) >= 2:
         return ()
     sources = []
-    for kind in network.observations:
+    for kind in network.further:
         if isinstance(kind, MountObservations):
             sources += [f"the mount of {name}" for name in kind.names(network, a.estimate)]
-        elif np.isfinite(scale_sigma(replace(network, observations=(kind,)), a.estimate)):
+        elif np.isfinite(scale_sigma(network.with_given(further=(kind,)), a.estimate)):
             name = f"{kind.single} {kind.group}" if isinstance(kind, Group) else kind.name
             sources.append(f"the {name}")
     if mounts is not None:

@@ -395,7 +395,7 @@ def find_second_objects(
         every = np.ones(len(seen), dtype=bool)
         start = empty_estimate(network, orientation.estimate.cameras)
         part = reduce_network(network, start, left, points, every)[0]
-        part = replace(part, control=type(part.control)(), exterior=type(part.exterior)())
+        part = part.with_given(type(part.control)(), type(part.exterior)())
         try:
             other = orient(part, empty_estimate(part, orientation.estimate.cameras))
         except GeometryError:

@@ -215,7 +215,7 @@ def _photograph_camera(
         np.zeros(1, dtype=np.int64),
         tuple(str(k) for k in range(n)),
         ImagePoints(np.zeros(n, dtype=np.int64), np.arange(n), xy, seen.covariance[rows]),
-        ObjectPoints(np.arange(n), points, np.zeros((n, 3, 3))),
+        observations=(ObjectPoints(np.arange(n), points, np.zeros((n, 3, 3))),),
     )
     nothing = np.zeros(len(camera.names), dtype=bool)
     begin = _scaled_resection(camera, xy, points, np.ones(1))

@@ -287,7 +287,7 @@ def split_cameras(
         np.array(_correlation(observed, rho)) if rho else None,
     )
     return (
-        replace(network, camera=owner, interior=interior),
+        replace(network, camera=owner).with_given(interior),
         replace(estimate, cameras=tuple(variants)),
     )
 
@@ -339,13 +339,12 @@ def without_idle_cameras(network: Network, estimate: Estimate, *, count: int) ->
         None if seen.correlation is None else seen.correlation[np.ix_(keep, keep)],
     )
     observations = tuple(
-        kind.of_cameras(used) if isinstance(kind, MountObservations) else kind
-        for kind in network.observations
+        kind.of_cameras(used) if isinstance(kind, MountObservations) else kind for kind in network.further
     )
     mounts = None if estimate.mounts is None else estimate.mounts.select(used)
     cameras = tuple(c for c, on in zip(estimate.cameras, used, strict=True) if on)
     return (
-        replace(network, camera=number[network.camera], interior=interior, observations=observations),
+        replace(network, camera=number[network.camera]).with_given(interior, further=observations),
         replace(estimate, cameras=cameras, mounts=mounts),
     )
 

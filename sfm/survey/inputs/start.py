@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -108,18 +107,20 @@ def network_of(
         camera,
         points,
         image_points,
-        control=control_points(survey.control, points),
-        scale_bars=scale_bars(survey.scale_bars, points) if bars is None else bars,
+        observations=(
+            control_points(survey.control, points),
+            scale_bars(survey.scale_bars, points) if bars is None else bars,
+        ),
     )
     if survey.exterior is not None and survey.datum.kind == "control":
-        network = replace(network, exterior=exterior_observations(survey.exterior, images))
+        network = network.with_given(exterior_observations(survey.exterior, images))
     return with_given_mounts(survey.given_mounts, with_moments(survey, with_tables(survey.tables, network)))
 
 
 def with_given_mounts(mounts: MountObservations, network: Network) -> Network:
     """Return the network with given mounts as observations, except for mounts that are held fixed."""
     loose = mounts.select(np.flatnonzero(np.trace(mounts.covariance, axis1=1, axis2=2) > 0))
-    return replace(network, observations=(*network.observations, loose)) if len(loose) else network
+    return network.with_given(further=(*network.further, loose)) if len(loose) else network
 
 
 def exterior_observations(table: ObservedExterior, images: Sequence[str]) -> ExteriorObservations:

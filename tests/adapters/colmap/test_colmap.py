@@ -152,12 +152,12 @@ def test_control_is_held() -> None:
     control = ObjectPoints(np.arange(4), truth.points[:4], np.zeros((4, 3, 3)))
     start = perturb(truth, seed_of("colmap control"))
     start.points[:4] = truth.points[:4]
-    found = adjust_with_colmap(replace(network, control=control), start, gauge="control")
+    found = adjust_with_colmap(network.with_given(control), start, gauge="control")
     np.testing.assert_array_equal(found.estimate.points[:4], truth.points[:4])
     assert np.abs(found.estimate.points - truth.points).max() < 0.01
     weighted = replace(control, covariance=np.tile(np.eye(3) * 1e-6, (4, 1, 1)))
     with pytest.raises(BackendError, match="control with standard deviations"):
-        adjust_with_colmap(replace(network, control=weighted), start, gauge="control")
+        adjust_with_colmap(network.with_given(weighted), start, gauge="control")
 
 
 def test_principal_point_is_free_only_when_asked() -> None:

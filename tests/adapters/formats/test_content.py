@@ -84,10 +84,10 @@ def survey(form: str, rng: np.random.Generator) -> Content:
         if chance(rng):
             C[0] = np.diag([1e-4, np.inf, 1e-4])
         C[1] *= rng.integers(0, 2)  # fixed
-        network = replace(network, control=ObjectPoints(chosen[:4], truth.points[chosen[:4]] + 0.01, C))
+        network = network.with_given(ObjectPoints(chosen[:4], truth.points[chosen[:4]] + 0.01, C))
     if chance(rng):
         length, sigma = rng.uniform(0.5, 2, 2), rng.uniform(1e-4, 1e-3, 2)
-        network = replace(network, scale_bars=ScaleBars(chosen[4:6], chosen[6:8], length, sigma))
+        network = network.with_given(ScaleBars(chosen[4:6], chosen[6:8], length, sigma))
     if chance(rng):
         C = covariances(rng, 2, 6, diagonal=chance(rng))
         if chance(rng):
@@ -95,14 +95,14 @@ def survey(form: str, rng: np.random.Generator) -> Content:
             C[:, :3, 3:] = C[:, 3:, :3] = 0.0
         angles = rng.uniform(-1, 1, (2, 3))
         exterior = ExteriorObservations(np.array([1, 3]), truth.position[[1, 3]], angles, C)
-        network = replace(network, exterior=exterior)
+        network = network.with_given(exterior)
     if camera.free.any() and chance(rng):
         own = np.flatnonzero(camera.free)[:2]
         R = np.array([[1, 0.3], [0.3, 1]]) if chance(rng) and len(own) == 2 else None
         found = InteriorObservations(
             np.zeros(len(own), dtype=np.int64), own, camera.parameters[own] + 1e-3, np.full(len(own), 1e-2), R
         )
-        network = replace(network, interior=found)
+        network = network.with_given(found)
     joint = covariances(rng, 1, 3 * POINTS)[0] if chance(rng) else None
     marginal = covariances(rng, POINTS, 3, diagonal=True) if chance(rng) else None
     if joint is not None:
@@ -151,18 +151,15 @@ def test_tables_are_a_survey_with_all_that_was_given(unit: str, tmp_path: Path) 
     network, truth = make_network(seed_of("whole survey"), images=6, points=20, free=("c", "x0", "y0", "K1"))
     sigma = np.tile(np.eye(3) * 1e-8, (4, 1, 1))
     exterior = np.diag([1e-6] * 3 + [np.inf] * 3)
-    network = replace(
-        network,
-        control=ObjectPoints(np.arange(4), truth.points[:4], sigma),
-        scale_bars=ScaleBars(
+    network = network.with_given(
+        ObjectPoints(np.arange(4), truth.points[:4], sigma),
+        ExteriorObservations(np.array([0]), truth.position[[0]], np.zeros((1, 3)), exterior[None]),
+        InteriorObservations(np.array([0]), np.array([0]), truth.cameras[0].parameters[:1], np.array([1e-3])),
+        ScaleBars(
             np.array([5]),
             np.array([6]),
             np.linalg.norm(truth.points[[5]] - truth.points[[6]], axis=1),
             np.array([1e-4]),
-        ),
-        exterior=ExteriorObservations(np.array([0]), truth.position[[0]], np.zeros((1, 3)), exterior[None]),
-        interior=InteriorObservations(
-            np.array([0]), np.array([0]), truth.cameras[0].parameters[:1], np.array([1e-3])
         ),
     )
     checks = ObjectPoints(np.array([8, 9]), truth.points[8:10], sigma[:2])
@@ -231,7 +228,7 @@ def test_what_has_no_coordinates_is_named_where_it_goes(tmp_path: Path) -> None:
 def test_convert_names_each_kind_that_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     network, truth = make_network(seed_of("named"), images=5, points=12, model="opencv")
     bar = ScaleBars(np.array([0]), np.array([1]), np.array([1.0]), np.array([1e-4]))
-    network = replace(network.with_control(["1", "2"], truth.points[:2]), scale_bars=bar)
+    network = network.with_control(["1", "2"], truth.points[:2]).with_given(bar)
     content = Content(Solution("x", network, truth, unit="mm", datum="free", redundancy=7))
     write_content(tmp_path / "in", "tables", content)
     convert(tmp_path / "in", tmp_path / "out.xml")

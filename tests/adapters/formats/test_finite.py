@@ -46,17 +46,22 @@ def _content(model: str, *, calibrated: bool = False) -> Content:
     solved = adjust(network, replace(truth, cameras=(lens,)), reject="none")
     rng = np.random.default_rng(0)
     angles = rng.normal(0, 0.1, (2, 3))
-    network = replace(
-        network,
-        points=tuple(str(j + 1) for j in range(len(network.points))),
-        control=ObjectPoints(np.arange(3), solved.estimate.points[:3], np.tile(1e-6 * np.eye(3), (3, 1, 1))),
-        exterior=ExteriorObservations(
-            np.arange(2), solved.estimate.position[:2], angles, np.tile(1e-4 * np.eye(6), (2, 1, 1))
-        ),
-        interior=InteriorObservations(
-            np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64), lens.parameters[:1], np.array([0.01])
-        ),
-    ).with_scale_bar("1", "5", 1.0, 0.001)
+    network = (
+        replace(network, points=tuple(str(j + 1) for j in range(len(network.points))))
+        .with_given(
+            ObjectPoints(np.arange(3), solved.estimate.points[:3], np.tile(1e-6 * np.eye(3), (3, 1, 1))),
+            ExteriorObservations(
+                np.arange(2), solved.estimate.position[:2], angles, np.tile(1e-4 * np.eye(6), (2, 1, 1))
+            ),
+            InteriorObservations(
+                np.zeros(1, dtype=np.int64),
+                np.zeros(1, dtype=np.int64),
+                lens.parameters[:1],
+                np.array([0.01]),
+            ),
+        )
+        .with_scale_bar("1", "5", 1.0, 0.001)
+    )
     seen = network.image_points
     checks = ObjectPoints(np.array([4]), solved.estimate.points[4:5], 1e-6 * np.eye(3)[None])
     result = replace(solved.solution, network=network, estimate=solved.estimate, unit="m")

@@ -331,7 +331,7 @@ def test_metashape_chunk_transform_and_missing_orientation(tmp_path: Path) -> No
     position[1] = np.nan
     path = tmp_path / "x.xml"
     control = ObjectPoints(np.array([2]), truth.points[2:3], np.diag([1e-6, 4e-6, 9e-6])[None])
-    write_metashape(path, replace(network, control=control), replace(truth, position=position))
+    write_metashape(path, network.with_given(control), replace(truth, position=position))
     again, estimate = read_metashape(path)
     assert list(estimate.oriented) == [True, False, True, True, True, True]
     np.testing.assert_array_equal(again.control.point, [2])

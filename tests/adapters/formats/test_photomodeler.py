@@ -320,7 +320,7 @@ def _with_control(tmp_path: Path) -> tuple[Path, Network, Estimate]:
         np.tile(1e-6 * np.eye(3), (8, 1, 1)),
     )
     points = tuple(str(j + 1) for j in range(40))
-    network = replace(network, points=points, control=control, image_points=replace(seen, stated=stated))
+    network = replace(network, points=points, image_points=replace(seen, stated=stated)).with_given(control)
     lens = truth.cameras[0]
     values = tuple((n, v) for n, v in zip(lens.names, lens.parameters.tolist(), strict=True) if n != "b1")
     square = float(lens.pixel_mm[0])

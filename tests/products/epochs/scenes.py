@@ -62,11 +62,10 @@ def epoch(
     interior: tuple[tuple[str, str, float, float], ...] = ()
     if calibration is not None:
         rows = np.flatnonzero(lens.plays(Role.FOCAL))
-        network = replace(
-            network,
-            interior=InteriorObservations(
+        network = network.with_given(
+            InteriorObservations(
                 np.zeros(2, dtype=np.int64), rows, calibration, np.full(2, CALIBRATION_SIGMA_PX)
-            ),
+            )
         )
         interior = tuple(
             (lens.name, lens.names[k], value, CALIBRATION_SIGMA_PX)

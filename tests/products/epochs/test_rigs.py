@@ -43,7 +43,7 @@ def epoch(
     rotation = truth.rotation.copy()
     rotation[1::2] = rotation[::2] @ turned[1]
     truth = replace(truth, rotation=rotation)
-    drawn, truth = simulate_network(replace(network, observations=observations), truth, seed_of(name))
+    drawn, truth = simulate_network(network.with_given(further=observations), truth, seed_of(name))
     a = adjust(drawn, truth, reject="none", datum=Datum("free"), sigma_px=0.1)
     return Epoch(name, stored_of(name, a), sigma0=a.sigma0, sigma0_px=a.sigma0_px)
 
@@ -94,7 +94,7 @@ def test_epochs_of_rigs_are_adjusted_together_and_those_with_observations_refuse
     assert all(camera.same for camera in found.cameras) and not found.changed
     read = []
     for one in (epoch(name, free=("c",)) for name in ("e", "f")):
-        network = replace(one.result.network, observations=())
+        network = one.result.network.with_given(further=())
         read.append(replace(one, result=replace(one.result, network=network)))
     with pytest.raises(GeometryError, match="survey observations, mounts"):
         analyse_epochs(read, together=True)

@@ -48,16 +48,18 @@ def merged(epochs: tuple[Epoch, Epoch]) -> tuple[Network, Estimate]:
             np.vstack([one.xy for one in seen]),
             np.vstack([one.covariance for one in seen]),
         ),
-        ObjectPoints(
-            np.array([j for j, _, _ in control]),
-            np.array([x for _, x, _ in control]),
-            np.array([C for _, _, C in control]),
-        ),
-        ScaleBars(
-            np.concatenate([bars[k].start + n * k for k in range(2)]),
-            np.concatenate([bars[k].end + n * k for k in range(2)]),
-            np.concatenate([one.length for one in bars]),
-            np.concatenate([one.sigma for one in bars]),
+        observations=(
+            ObjectPoints(
+                np.array([j for j, _, _ in control]),
+                np.array([x for _, x, _ in control]),
+                np.array([C for _, _, C in control]),
+            ),
+            ScaleBars(
+                np.concatenate([bars[k].start + n * k for k in range(2)]),
+                np.concatenate([bars[k].end + n * k for k in range(2)]),
+                np.concatenate([one.length for one in bars]),
+                np.concatenate([one.sigma for one in bars]),
+            ),
         ),
     )
     estimate = Estimate(
@@ -115,14 +117,13 @@ def adjusted_as_one(given: tuple[Epoch, Epoch], found: Differences) -> tuple[Flo
     network, estimate = merged(given)
     lens = estimate.cameras[0]
     rows = given[0].interior
-    network = replace(
-        network,
-        interior=InteriorObservations(
+    network = network.with_given(
+        InteriorObservations(
             np.zeros(len(rows), dtype=np.int64),
             np.array([lens.names.index(parameter) for _, parameter, _, _ in rows], dtype=np.int64),
             np.array([value for _, _, value, _ in rows]),
             np.array([sigma for _, _, _, sigma in rows]),
-        ),
+        )
     )
     a = adjust(network, estimate, datum="control", sigma_px=0.1, reject="none")
     assert a.converged

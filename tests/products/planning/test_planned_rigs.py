@@ -57,7 +57,7 @@ def planned_survey(folder: Path, network: Network, truth: Estimate, sigma: float
     ]
     header = ("camera", *columns, *(f"s{name}" for name in columns))
     (folder / "mounts.csv").write_text(csv_text(header, mounts), "utf-8")
-    for number, one in enumerate(network.observations, 1):
+    for number, one in enumerate(network.further, 1):
         for kind, of in TABLES.items():
             if type(one) is of:
                 table = csv_text((*of.texts, *of.columns()), one.table_rows(network))
@@ -73,7 +73,7 @@ def test_a_plan_states_what_rig_and_every_kind_of_observation_add(
 ) -> None:
     network, truth = network_of_all()
     path = planned_survey(tmp_path, network, truth)
-    for table, one in enumerate(network.observations, 1):
+    for table, one in enumerate(network.further, 1):
         if isinstance(one, TableKind) and one.texts_of == PHOTOGRAPH:
             text = (tmp_path / f"{table}.csv").read_text("utf-8")
             for k in range(5):  # of photographs of the plan
@@ -131,7 +131,7 @@ def test_gain_is_that_of_the_plan_where_two_kinds_give_the_scale() -> None:
 
     def framed(network: Network) -> Network:
         frame = RigidFrames.of_group("frame", np.arange(4)[:, None], plate.xyz[:4], np.full((4, 3), 1e-5), {})
-        return replace(network, observations=(*network.observations, frame))
+        return network.with_given(further=(*network.further, frame))
 
     seeing, bars = Seeing(sigma_px=0.1), [ScaleBarPlan(*ends, 5e-3)]
     without = predict_network(plate, camera, stations, seeing, bars=bars)
@@ -157,7 +157,7 @@ def test_gain_is_that_of_the_plan_where_two_kinds_give_the_scale() -> None:
 def test_what_only_one_kind_gives_is_named(kind: str, given: tuple[int, int, bool]) -> None:
     network, truth = make_network(seed_of("gives"), images=8, points=34, free=())
     one = observed(kind, truth, seed_of(kind))
-    a = predict(replace(network, observations=(one,)), truth)
+    a = predict(network.with_given(further=(one,)), truth)
     every = np.arange(len(truth.points))
     assert open_counts(predict(network, truth), every).tolist() == [3, 3, 1]
     fixed = np.array([3, 3, 1]) - open_counts(a, every)
@@ -172,7 +172,7 @@ def test_points_off_their_planned_line_are_refused() -> None:
 
     def on_line(network: Network) -> Network:
         wire = TABLES["line"].of_group("wire", points[:, None], np.zeros((3, 0)), np.full((3, 1), 1e-4), {})
-        return replace(network, observations=(wire,))
+        return network.with_given(further=(wire,))
 
     with pytest.raises(GeometryError, match=r"plan: line wire: point \S+ is 0\.\d+ off it.* sigma 0\.0001"):
         predict_network(plate, truth.cameras[0], stations, Seeing(sigma_px=0.1), given=on_line)
@@ -191,7 +191,7 @@ def test_points_are_weak_by_what_an_observation_gives_badly(kind: str, cause: st
         ].of_table(  # type: ignore[attr-defined]
             (ends[:-1], ends[1:]), np.zeros((3, 1)), np.full((3, 1), 0.05)
         )
-        return replace(network, observations=(level,))
+        return network.with_given(further=(level,))
 
     bars = [ScaleBarPlan(plate.names[0], plate.names[5], 0.05)] if kind == "bar" else []
     given = None if bars else levelled
@@ -261,11 +261,11 @@ def test_every_kind_is_written_as_the_table_that_it_is_read_from(tmp_path: Path)
 
     network, truth = network_of_all()
     planned_survey(tmp_path, network, truth)
-    for number, one in enumerate(network.observations, 1):
+    for number, one in enumerate(network.further, 1):
         if isinstance(one, TableKind):
             (kind,) = (kind for kind, of in TABLES.items() if type(one) is of)
             table = read_observation_table(kind, tmp_path / f"{number}.csv", "survey.toml")
-            (again,) = with_tables((table,), network).observations[len(network.observations) :]
+            (again,) = with_tables((table,), network).further[len(network.further) :]
             if isinstance(one, Group):
                 assert isinstance(again, Group) and again.row_points(network) == one.row_points(network)
                 assert again.group == one.group
@@ -280,9 +280,9 @@ def test_image_points_of_a_planned_rig_give_its_mounts_within_their_standard_dev
     """With all kinds of observations, whose names a simulated survey keeps; mounts given as observations."""
     network, truth = network_of_all()
     observations = tuple(
-        one for one in network.observations if not (isinstance(one, TableKind) and one.texts_of == PHOTOGRAPH)
+        one for one in network.further if not (isinstance(one, TableKind) and one.texts_of == PHOTOGRAPH)
     )
-    path = planned_survey(tmp_path, replace(network, observations=observations), truth, sigma=1e-3)
+    path = planned_survey(tmp_path, network.with_given(further=observations), truth, sigma=1e-3)
     out = tmp_path / "plan"
     (tmp_path / "points.csv").write_text(
         csv_text(
