@@ -39,7 +39,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.networks import SIZE_PX, block, convergent
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 
@@ -196,10 +196,8 @@ def run_adjust(
         start,
         datum=Datum("free"),
         reject="none",
-        method="gauss-newton",
-        tolerance=tolerance,
         covariance=covariance,
-        redundancy_numbers=False,
+        options=AdjustmentOptions(method="gauss-newton", tolerance=tolerance, redundancy_numbers=False),
     )
     return float((a.residuals**2).sum() / 2)
 

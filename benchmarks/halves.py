@@ -35,7 +35,7 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.quality.correlations import estimate_error_correlation
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, without_given
@@ -69,7 +69,7 @@ def main() -> None:
             seen = network.image_points
             alike = np.tile(0.01 * np.eye(2), (len(seen), 1, 1))
             network = replace(network, image_points=replace(seen, covariance=alike))
-        whole = adjust(network, estimate, reject="none", redundancy_numbers=False)
+        whole = adjust(network, estimate, reject="none", options=AdjustmentOptions(redundancy_numbers=False))
         correlation = estimate_error_correlation(whole)
         if correlation is not None:
             s_px = whole.sigma0_px * correlation.common**0.5
@@ -140,7 +140,7 @@ def _adjusted(network: Network, estimate: Estimate, points: BoolArray) -> Adjust
     everything = np.ones(len(network.image_points), dtype=bool)
     images = np.ones(len(network.images), dtype=bool)
     part, start = reduce_network(network, estimate, images, points, everything)
-    return adjust(part, start, reject="none", redundancy_numbers=False)
+    return adjust(part, start, reject="none", options=AdjustmentOptions(redundancy_numbers=False))
 
 
 def _halves(xyz: FloatArray, centres: FloatArray, way: str, draws: int) -> Iterator[BoolArray]:

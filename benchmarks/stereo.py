@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.model.camera import Camera, project
 from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_vector
@@ -165,7 +165,13 @@ def main() -> None:
     errors, sigmas, rms = [], [], []
     for xy in drawn:
         measured = replace(network, image_points=replace(network.image_points, xy=xy))
-        a = adjust(measured, truth, datum=Datum("control"), reject="none", sigma_px=NOISE_PX)
+        a = adjust(
+            measured,
+            truth,
+            datum=Datum("control"),
+            reject="none",
+            options=AdjustmentOptions(sigma_px=NOISE_PX),
+        )
         mount = rigs_of(a)[0].mounts[0]
         errors.append(np.array([mount.base, *mount.rotation_deg]) - exact)
         sigmas.append(np.array([mount.base_sigma, *mount.rotation_sigma_deg]))

@@ -34,7 +34,7 @@ from adapters.colmap.adjuster import ColmapBackend
 from benchmarks.random_networks import MODELS, Plan, RandomNetwork, random_network
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.solutions import SAME_SIGMAS, reprojection, rotation_angle_deg
 from sfm.comparison.two_adjusters.adjusters import BackendAdjustment
 from sfm.model.conventions import BoolArray, FloatArray
@@ -257,10 +257,9 @@ def _adjust(made: RandomNetwork, *, covariance: bool, start: Estimate | None = N
         made.network,
         made.start if start is None else start,
         datum=Datum(made.plan.datum),
-        sigma_px=made.plan.noise_px,
         reject="none",
-        max_iterations=MAX_ITERATIONS,
         covariance=covariance,
+        options=AdjustmentOptions(sigma_px=made.plan.noise_px, max_iterations=MAX_ITERATIONS),
     )
 
 

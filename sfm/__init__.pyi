@@ -3,6 +3,7 @@
 from sfm.adjustment.covariance import change_datum as change_datum
 from sfm.adjustment.datum import Datum as Datum
 from sfm.adjustment.result import Adjustment as Adjustment
+from sfm.adjustment.solve import AdjustmentOptions as AdjustmentOptions
 from sfm.judgement.survey_result import SurveyResult as SurveyResult
 from sfm.model import camera as camera
 from sfm.model import conventions as conventions

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import Camera, camera_from_values, project
 from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.model.estimate import Estimate
@@ -103,8 +104,15 @@ def spoiled(truth: Estimate, name: str, size: float) -> Estimate:
     )
 
 
-def run(network: Network, start: Estimate, **options: object) -> Adjustment:
-    return adjust(network, start, datum=Datum("free"), reject="none", **options)  # type: ignore[arg-type]
+def run(network: Network, start: Estimate, covariance: bool = True, **options: Any) -> Adjustment:
+    return adjust(
+        network,
+        start,
+        datum=Datum("free"),
+        reject="none",
+        covariance=covariance,
+        options=AdjustmentOptions(**options),
+    )
 
 
 def in_sigmas(Q: FloatArray, reference: FloatArray) -> float:

@@ -133,7 +133,7 @@ def test_an_argument_of_another_type_is_refused_by_its_name(name: str) -> None:
         lambda: sfm.orient(NETWORK, ["lens"]),
         lambda: sfm.project(TRUTH.cameras[0], [0, 0, 0], np.eye(3), [1, 2, 3]),
         lambda: sfm.fit_similarity(XYZ, XYZ, weights=np.zeros(4)),
-        lambda: sfm.adjust(NETWORK, TRUTH, image_sigma_factor=STACK),
+        lambda: sfm.adjust(NETWORK, TRUTH, options=sfm.AdjustmentOptions(image_sigma_factor=STACK)),
         lambda: sfm.adjust(NETWORK, TRUTH, rejected=np.zeros(3, dtype=bool)),
         lambda: sfm.adjustment.w_test(ADJUSTMENT, alpha=7.0),
         lambda: sfm.comparison.robust_weights(np.zeros((5, 3)), np.zeros((3, 2)), np.ones(5, dtype=bool)),

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import halves
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from tests.synthetic import make_network, observed_anew, seed_of
 
 
@@ -16,7 +16,7 @@ def whole() -> Adjustment:
     """Return a network of independent errors of 0.1 px, as stated, and its adjustment."""
     network, truth = make_network(seed_of("halves"), images=6, points=120, planar=True, noise_px=0.0)
     noisy = observed_anew(network, truth, 0.1, seed_of("noise of halves"))
-    return adjust(noisy, truth, reject="none", redundancy_numbers=False)
+    return adjust(noisy, truth, reject="none", options=AdjustmentOptions(redundancy_numbers=False))
 
 
 @pytest.mark.parametrize("way", halves.WAYS)

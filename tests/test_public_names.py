@@ -28,7 +28,17 @@ from tests.synthetic import make_network, seed_of
 
 ROOT = Path(sfm.__file__).resolve().parent
 PUBLIC = {
-    *("Adjustment", "Camera", "CameraSetup", "Datum", "Estimate", "KnownPoints", "KolinearError", "Network"),
+    *(
+        "Adjustment",
+        "AdjustmentOptions",
+        "Camera",
+        "CameraSetup",
+        "Datum",
+        "Estimate",
+        "KnownPoints",
+        "KolinearError",
+        "Network",
+    ),
     *(
         "Observations",
         "ObservationTable",

@@ -18,7 +18,7 @@ The computation is in `engine`, the assessment of quality in `quality`.
     >>> xy = np.vstack([sfm.project(lens, centre, np.eye(3), points) for centre in centres])
     >>> network = sfm.Network.from_arrays(np.repeat(list("abcd"), 12), np.tile(range(12), 4).astype(str), xy)
     >>> start = sfm.orient(network, [lens]).estimate
-    >>> adjustment = sfm.adjustment.adjust(network, start, sigma_px=0.1)
+    >>> adjustment = sfm.adjustment.adjust(network, start)
     >>> adjustment.converged, adjustment.redundancy  # 96 coordinates, 60 unknowns, 7 of the datum
     (True, 43)
 """

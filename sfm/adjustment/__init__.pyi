@@ -11,5 +11,6 @@ from sfm.adjustment.quality.statistics import CoordinateTest as CoordinateTest
 from sfm.adjustment.quality.statistics import tau_test as tau_test
 from sfm.adjustment.quality.statistics import w_test as w_test
 from sfm.adjustment.result import Adjustment as Adjustment
+from sfm.adjustment.solve import AdjustmentOptions as AdjustmentOptions
 from sfm.adjustment.solve import adjust as adjust
 from sfm.adjustment.solve import predict as predict

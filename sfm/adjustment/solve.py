@@ -8,7 +8,7 @@ normal equations are undamped. `predict` gives the same statistics for a planned
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,23 +67,44 @@ MAX_LINEAR = 0.1
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # derivatives of psi of the M-estimators
 
 
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """Options of an adjustment that hardly any network needs.
+
+    Attributes:
+        sigma_px: standard deviation of unit weight, px. The network states the weights, so this changes
+            sigma0 but not sigma0_px.
+        image_sigma_factor: factor on the stated standard deviations of the image points, one number or (k,).
+            The network of the result keeps the stated ones.
+        alpha: probability that the test of one image coordinate rejects a good one; if not given, such that
+            all of them together reject any with the probability `false_alarm` of the adjustment.
+        method: "gauss-newton" (line search) or "levenberg-marquardt" (ends with undamped Gauss-Newton).
+        max_iterations: largest number of steps in each round of the robust test.
+        tolerance: |A dx| / |v| at which the iteration has converged.
+        redundancy_numbers: whether to compute redundancy numbers and standardised residuals, if there is a
+            covariance.
+    """
+
+    sigma_px: float = 0.1
+    image_sigma_factor: float | FloatArray = 1.0
+    alpha: float | None = None
+    method: str = "levenberg-marquardt"
+    max_iterations: int = 50
+    tolerance: float = TOLERANCE
+    redundancy_numbers: bool = True
+
+
 @checked_arguments()
 def adjust(
     network: Network,
     estimate: Estimate,
     *,
     datum: Datum | str = FREE,
-    sigma_px: float = 0.1,
-    image_sigma_factor: float | FloatArray = 1.0,
     reject: str = "tau",
-    alpha: float | None = None,
     false_alarm: float = FALSE_ALARM,
     rejected: BoolArray | None = None,
-    method: str = "levenberg-marquardt",
-    max_iterations: int = 50,
-    tolerance: float = TOLERANCE,
     covariance: bool = True,
-    redundancy_numbers: bool = True,
+    options: AdjustmentOptions | None = None,
 ) -> Adjustment:
     """Return the least-squares adjustment of a network.
 
@@ -95,25 +116,15 @@ def adjust(
         estimate: start values; a photograph or point without one (NaN) takes no part and is reported. So is
             a point with one ray that nothing else determines; it has no coordinates (NaN) in the result.
         datum: definition of position, attitude and scale; or only its kind.
-        sigma_px: standard deviation of unit weight, px. The network states the weights, so this changes
-            sigma0 but not sigma0_px.
-        image_sigma_factor: factor on the stated standard deviations of the image points, one number or (k,).
-            The network of the result keeps the stated ones.
         reject: "tau" (data snooping by Pope's test), "huber" or "tukey" (reweighting; Tukey's biweight starts
             from Huber's result and rejects image points with weight 0) or "none".
-        alpha: probability that the test of one image coordinate rejects a good one; if not given, such that
-            all of them together reject any with the probability `false_alarm`.
         false_alarm: probability that a right result is called wrong; the level of every test of the result
             follows from it.
         rejected: image points that data snooping leaves out at the start, such as those rejected before,
             (k,). They return if they pass the test. The other options of `reject` start with all image
             points.
-        method: "gauss-newton" (line search) or "levenberg-marquardt" (ends with undamped Gauss-Newton).
-        max_iterations: largest number of steps in each round of the robust test.
-        tolerance: |A dx| / |v| at which the iteration has converged.
         covariance: whether to compute covariance and redundancy numbers; they are NaN otherwise.
-        redundancy_numbers: whether to compute redundancy numbers and standardised residuals, if there is a
-            covariance.
+        options: further options; those of `AdjustmentOptions` by default.
 
     Raises:
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
@@ -126,6 +137,8 @@ def adjust(
         True
     """
     datum = Datum(datum) if isinstance(datum, str) else datum
+    options = options or AdjustmentOptions()
+    method, sigma_px, alpha = options.method, options.sigma_px, options.alpha
     check_network(network, estimate)
     check_number("sigma_px", sigma_px, 0.0)
     check_number("false_alarm", false_alarm, 0.0, 1.0)
@@ -140,7 +153,7 @@ def adjust(
     resolved = without_far_points(datum.resolve(network), estimate.points)
     local = local_of(network, estimate, resolved)
     k = len(network.image_points)
-    given = np.asarray(image_sigma_factor, dtype=float)
+    given = np.asarray(options.image_sigma_factor, dtype=float)
     if given.shape not in ((), (k,)) or not (np.isfinite(given) & (given > 0)).all():
         raise GeometryError(f"image_sigma_factor of shape {given.shape}, expected positive numbers, 1 or {k}")
     factor = np.broadcast_to(given, (k,))
@@ -152,10 +165,11 @@ def adjust(
     )
     observed = observed_of(local.network, layout, state, use_control=use_control)
     problem = problem_of(layout, observed, local.datum)
-    run = Run(problem, method, max_iterations, tolerance, exact=covariance or reject == "tau")
+    exact = covariance or reject == "tau"
+    run = Run(problem, method, options.max_iterations, options.tolerance, exact=exact)
     with own_threads():
         optimum, weight = find_optimum(run, state, reject=reject, alpha=alpha, without=without[layout.order])
-        Q = cofactors(optimum, layout, cross=redundancy_numbers) if covariance else None
+        Q = cofactors(optimum, layout, cross=options.redundancy_numbers) if covariance else None
         result = _result(local, run, optimum, weight, Q, sigma_px, SLOPES.get(reject))
         if not optimum.converged or (covariance and not result.undetermined and _has_open_c(result)):
             result = _with_open_start(result, local, problem, state, weight)

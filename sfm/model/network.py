@@ -362,7 +362,7 @@ class Network:
             >>> from sfm.model.observations import HeightDifferences
             >>> ends = np.array([0, 1]), np.array([2, 3])
             >>> level = HeightDifferences(*ends, np.array([[0.02], [-0.01]]), np.full((2, 1), 1e-4))
-            >>> [kind.name for kind in result.network.with_observations(level).observations]
+            >>> [kind.name for kind in result.network.with_observations(level).further]
             ['height differences']
         """
         size = {POINT: len(self.points), PHOTOGRAPH: len(self.images)}

@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
 from sfm.model.camera import KNOWN_WITHOUT, Camera, corner_shift
 from sfm.model.distortion.models import MODELS, Role
@@ -213,7 +213,11 @@ def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: flo
     """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
         adjustment = adjust(
-            part, start, datum=Datum(datum), false_alarm=false_alarm, redundancy_numbers=False
+            part,
+            start,
+            datum=Datum(datum),
+            false_alarm=false_alarm,
+            options=AdjustmentOptions(redundancy_numbers=False),
         )
     except (GeometryError, np.linalg.LinAlgError):
         return None

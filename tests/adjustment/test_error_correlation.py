@@ -17,7 +17,7 @@ from sfm.adjustment.quality.correlations import (
     with_neighbours,
 )
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import MOVED, Alternative
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
@@ -59,7 +59,7 @@ def adjusted(network: Network, truth: Estimate, errors: FloatArray) -> Adjustmen
     """Return the adjustment of the image points with other errors."""
     seen = network.image_points
     moved = replace(network, image_points=replace(seen, xy=seen.xy + errors))
-    return adjust(moved, truth, reject="none", redundancy_numbers=False)
+    return adjust(moved, truth, reject="none", options=AdjustmentOptions(redundancy_numbers=False))
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_every_covariance_has_the_common_errors(unequal: tuple[Network, Estimate
 def test_common_errors_take_little_memory() -> None:
     """Neither all image points by all unknowns nor all by all of a photograph: these took 7 kB each."""
     network, truth = make_network(seed_of("memory"), images=12, points=500, planar=True, noise_px=0.3)
-    a = adjust(network, truth, reject="none", redundancy_numbers=False)
+    a = adjust(network, truth, reject="none", options=AdjustmentOptions(redundancy_numbers=False))
     tracemalloc.start()
     a = with_error_correlation(a, ErrorCorrelation(alone=0.8, common=0.2, length_px=200.0))
     peak = tracemalloc.get_traced_memory()[1]

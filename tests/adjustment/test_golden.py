@@ -13,7 +13,7 @@ from adapters.formats.photomodeler import read_photomodeler
 from adapters.formats.sba_text import read_sba_text
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import camera_from_values
 from sfm.model.conventions import angles_from_rotation, pixel_from_image, rotation_from_angles
 from sfm.model.estimate import Estimate
@@ -68,7 +68,9 @@ def flyover() -> tuple[Network, Estimate]:
 def test_flyover_as_a_free_network() -> None:
     """Figures recomputed from the published measurements: datasets/flyover/README.md."""
     network, start = flyover()
-    a = adjust(network, start, datum=Datum("free"), reject="none", method="gauss-newton")
+    a = adjust(
+        network, start, datum=Datum("free"), reject="none", options=AdjustmentOptions(method="gauss-newton")
+    )
     assert a.converged
     assert (a.defect, a.redundancy, a.unknowns) == (7, 3, 36)
     assert a.sigma0**2 * a.redundancy == pytest.approx(2.355596, abs=5e-7)
@@ -105,12 +107,18 @@ def test_flyover_corrections_added_to_degrees_do_not_adjust() -> None:
     estimate = start
     for _ in range(12):
         solution = adjust(
-            network, estimate, datum=Datum("free"), reject="none", method="gauss-newton", max_iterations=1
+            network,
+            estimate,
+            datum=Datum("free"),
+            reject="none",
+            options=AdjustmentOptions(method="gauss-newton", max_iterations=1),
         )
         step = angles_from_rotation(solution.estimate.rotation) - angles_from_rotation(estimate.rotation)
         wrong = angles_from_rotation(estimate.rotation) + np.radians(step)
         estimate = replace(solution.estimate, rotation=np.array([rotation_from_angles(*w) for w in wrong]))
-    stuck = adjust(network, estimate, datum=Datum("free"), reject="none", max_iterations=0)
+    stuck = adjust(
+        network, estimate, datum=Datum("free"), reject="none", options=AdjustmentOptions(max_iterations=0)
+    )
     assert stuck.rms_px > 2 * best.rms_px
 
 
@@ -174,7 +182,14 @@ def test_sba_problems_reach_the_printed_optimum(cameras: int, start: float, opti
         return float((a.residuals**2).sum() / len(a.residuals))
 
     def run(**options: int) -> Adjustment:
-        return adjust(network, estimate, datum=Datum("free"), reject="none", covariance=False, **options)
+        return adjust(
+            network,
+            estimate,
+            datum=Datum("free"),
+            reject="none",
+            covariance=False,
+            options=AdjustmentOptions(**options),
+        )
 
     assert mean_square(run(max_iterations=0)) == pytest.approx(start, rel=5e-6)
     a = run()
@@ -216,7 +231,9 @@ def test_camcal_with_fixed_control_prints_as_the_report_of_dbat(method: str) -> 
         camera_from_values(c.name, "brown_dbat", c.size_px, (pixel[0], pixel[1]), c_mm=7.3), free=c.free
     )
     start = replace(start, cameras=(rough,))
-    a = adjust(network, start, datum=Datum("control"), reject="none", method=method)
+    a = adjust(
+        network, start, datum=Datum("control"), reject="none", options=AdjustmentOptions(method=method)
+    )
     assert a.converged
     assert (a.redundancy, a.unknowns, a.observations, a.defect) == (3725, 423, 4148, 0)
     assert agrees(a.sigma0_px, "0.16148")

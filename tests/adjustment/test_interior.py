@@ -17,7 +17,7 @@ from sfm.adjustment.engine.solvers.dense import schur_complement
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import interior_names, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.solutions import reprojection
 from sfm.model.camera import Camera, project
 from sfm.model.conventions import FloatArray
@@ -78,7 +78,9 @@ def spoilt(truth: Estimate, name: str) -> Estimate:
 @pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt"])
 def test_c_of_each_photograph_is_recovered_with_shared_distortion(method: str) -> None:
     network, truth = zoomed("zoom", noise_px=0.0)
-    a = adjust(network, spoilt(truth, "start"), datum=FREE, reject="none", method=method)
+    a = adjust(
+        network, spoilt(truth, "start"), datum=FREE, reject="none", options=AdjustmentOptions(method=method)
+    )
     assert a.converged and a.defect == 7 and not a.undetermined
     for found, true in zip(a.estimate.cameras, truth.cameras, strict=True):
         assert found.parameters == pytest.approx(true.parameters, rel=1e-6, abs=1e-9)
@@ -252,7 +254,7 @@ def test_a_calibration_and_a_survey_one_after_the_other_are_both_together() -> N
             image_points=points,
         ).with_given(interior or InteriorObservations())
         start = replace(truth, position=truth.position[images], rotation=truth.rotation[images])
-        return adjust(own, start, datum=Datum("control"), sigma_px=0.1, reject="none")
+        return adjust(own, start, datum=Datum("control"), reject="none")
 
     together = part(np.ones(8, dtype=bool))
     first = part(np.arange(8) < 4)
@@ -292,7 +294,7 @@ def test_gradient_vanishes_at_the_truth() -> None:
 def test_sigma0_at_the_start_values_is_that_of_their_residuals() -> None:
     network, truth = make_network(seed_of("start"), images=6, points=30)
     start = replace(truth, points=truth.points + 0.01)
-    a = adjust(network, start, reject="none", max_iterations=50)
+    a = adjust(network, start, reject="none", options=AdjustmentOptions(max_iterations=50))
     v = reprojection(network, start)
     sigma = float(np.sqrt(network.image_points.covariance[0, 0, 0]))
     assert a.start_sigma0 == pytest.approx(np.sqrt((v**2).sum() / sigma**2 / a.redundancy), rel=1e-6)

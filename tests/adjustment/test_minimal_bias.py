@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.quality.statistics import non_centrality, reliability, tau_critical
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from tests.synthetic import make_network, seed_of
 
 # Thompson's tau as published in ASME PTC 19.1 at the level 0.05: Pope's of the mean of n observations, where
@@ -45,7 +45,7 @@ def test_the_test_exceeds_its_critical_value_as_often_as_stated(r: int) -> None:
 @pytest.mark.parametrize("reject", ["none", "tau", "tukey"])
 def test_minimal_bias_belongs_to_the_test_that_rejects(reject: str) -> None:
     network, truth = make_network(seed_of("level"), images=6, points=30)
-    a = adjust(network, truth, reject=reject, alpha=2e-6)
+    a = adjust(network, truth, reject=reject, options=AdjustmentOptions(alpha=2e-6))
     found = reliability(a)
     level = {"none": 0.001, "tau": 2e-6, "tukey": 3.0e-7}[reject]
     assert found.critical == pytest.approx(tau_critical(level, a.redundancy), abs=1e-3)
@@ -84,11 +84,13 @@ def test_an_error_of_the_minimal_size_is_rejected_in_four_of_five_cases() -> Non
     rng = seed_of("rejected in four of five")
     network, truth = make_network(rng, images=6, points=25, noise_px=0.0, free=())
     seen, found = network.image_points, 0
-    first = adjust(network, truth, alpha=2e-6)
+    first = adjust(network, truth, options=AdjustmentOptions(alpha=2e-6))
     bias = reliability(first).minimal_bias[17, 0] / first.sigma0
     for _ in range(80):
         xy = seen.xy + rng.normal(0, 0.1, seen.xy.shape)
         xy[17, 0] += bias
-        a = adjust(replace(network, image_points=replace(seen, xy=xy)), truth, alpha=2e-6)
+        a = adjust(
+            replace(network, image_points=replace(seen, xy=xy)), truth, options=AdjustmentOptions(alpha=2e-6)
+        )
         found += bool(a.rejected[17])
     assert 0.66 < found / 80 < 0.92

@@ -9,7 +9,7 @@ import pytest
 
 from sfm.adjustment.covariance import change_datum, marginal_of
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import camera_from_values, project
 from sfm.model.conventions import BoolArray, FloatArray, rotation_from_angles
 from sfm.model.estimate import Estimate
@@ -108,7 +108,7 @@ def test_points_on_parallel_rays_are_named() -> None:
     k = network.image_points
     xy = project(truth.cameras[0], position[0], rotation[0], truth.points)[k.point]
     network = replace(network, image_points=replace(k, xy=xy))
-    a = adjust(network, truth, datum=FREE, reject="none", max_iterations=2)
+    a = adjust(network, truth, datum=FREE, reject="none", options=AdjustmentOptions(max_iterations=2))
     assert sum("rays are parallel" in words for words in a.undetermined) >= 19
 
 

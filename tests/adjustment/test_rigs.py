@@ -20,7 +20,7 @@ from sfm.adjustment.engine.solvers.fronts import fronts_of, pairs_of
 from sfm.adjustment.engine.solvers.multifrontal import MultifrontalSolver
 from sfm.adjustment.engine.unknowns import Unknowns, start_weights, step, unknowns_of
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -108,11 +108,19 @@ def test_covariance_is_the_scatter_of_repeated_surveys() -> None:
     datum = Datum("minimal", points=["1", "2", "3"])
     sums = {"points": 0.0, "exterior": 0.0, "mount": 0.0}
     xy = network.image_points.xy
-    exact = adjust(network, truth, reject="none", datum=datum, sigma_px=0.01).estimate
+    exact = adjust(
+        network, truth, reject="none", datum=datum, options=AdjustmentOptions(sigma_px=0.01)
+    ).estimate
     marginal = None
     for _ in range(draws):
         noisy = replace(network.image_points, xy=xy + 0.01 * rng.standard_normal(xy.shape))
-        a = adjust(replace(network, image_points=noisy), exact, reject="none", datum=datum, sigma_px=0.01)
+        a = adjust(
+            replace(network, image_points=noisy),
+            exact,
+            reject="none",
+            datum=datum,
+            options=AdjustmentOptions(sigma_px=0.01),
+        )
         unit = a.sigma0**2
         if marginal is None:
             marginal = marginal_of(a)
@@ -147,7 +155,7 @@ def test_all_solvers_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     found = []
     for solver in (choose_solver, by_pairs, by_fronts):
         monkeypatch.setattr(iterate, "choose_solver", solver)
-        found.append(adjust(network, truth, reject="none", tolerance=1e-10))
+        found.append(adjust(network, truth, reject="none", options=AdjustmentOptions(tolerance=1e-10)))
     for a in found[1:]:
         assert a.estimate.points == pytest.approx(found[0].estimate.points, abs=1e-9)
         assert a.covariance.points == pytest.approx(found[0].covariance.points, rel=1e-6, abs=1e-16)

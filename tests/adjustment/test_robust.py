@@ -23,7 +23,7 @@ from sfm.adjustment.quality.gross_errors.robust import (
 )
 from sfm.adjustment.quality.statistics import tau_critical
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -59,7 +59,7 @@ def test_data_snooping_finds_gross_errors_and_keeps_the_rest(sigmas: float) -> N
 
 def test_a_good_network_keeps_nearly_all() -> None:
     network, truth, _ = spoiled(seed_of("good"), 0.0, 0.0)
-    a = adjust(network, truth, datum=FREE, alpha=0.01)
+    a = adjust(network, truth, datum=FREE, options=AdjustmentOptions(alpha=0.01))
     expected = 2 * 0.01 * len(network.image_points)
     assert abs(a.rejected.sum() - expected) < 4 * np.sqrt(expected) + 2
 
@@ -265,7 +265,7 @@ def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: 
     network, bad = exchanged(network, photographs, 0, int(np.argmax(extent)))
     plain = adjust(network, truth, datum=FREE, reject="none", covariance=False)
     assert plain.sigma0 > 20
-    a = adjust(network, truth, datum=FREE, reject=reject, alpha=1e-5)
+    a = adjust(network, truth, datum=FREE, reject=reject, options=AdjustmentOptions(alpha=1e-5))
     assert a.converged
     assert a.defect == a.expected_defect == 7
     assert bad.sum() == 2 * photographs
@@ -277,9 +277,9 @@ def test_exchanged_names_are_rejected_though_they_bend_the_network(photographs: 
 
 def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth = make_network(seed_of("broken"), images=10, points=30)
-    clean = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
+    clean = adjust(network, truth, datum=FREE, reject="tau", options=AdjustmentOptions(alpha=1e-5))
     monkeypatch.setattr(rejection, "_optimum_of_all", refuse)
-    again = adjust(network, truth, datum=FREE, reject="tau", alpha=1e-5)
+    again = adjust(network, truth, datum=FREE, reject="tau", options=AdjustmentOptions(alpha=1e-5))
     assert again.converged
     np.testing.assert_array_equal(again.rejected, clean.rejected)
     assert again.vPv == pytest.approx(clean.vPv, rel=1e-9)
@@ -287,9 +287,9 @@ def test_an_adjustment_that_gross_errors_break_is_begun_again(monkeypatch: pytes
 
 def test_snooping_keeps_the_last_round_that_could_be_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     network, truth, _ = spoiled(seed_of("last round"), 0.05, 50.0)
-    plain = adjust(network, truth, datum=FREE, reject="none", tolerance=1e-3)
+    plain = adjust(network, truth, datum=FREE, reject="none", options=AdjustmentOptions(tolerance=1e-3))
     monkeypatch.setattr(rejection.Run, "again", once_more(rejection.Run.again))
-    a = adjust(network, truth, datum=FREE, alpha=1e-5)
+    a = adjust(network, truth, datum=FREE, options=AdjustmentOptions(alpha=1e-5))
     assert a.rejected.sum() > 0
     assert a.vPv < plain.vPv
 
@@ -324,7 +324,7 @@ def test_reweighting_ends_where_its_rounds_do_not_converge(monkeypatch: pytest.M
         return found
 
     monkeypatch.setattr(rejection.Run, "again", counted)
-    a = adjust(network, truth, datum=FREE, covariance=False, max_iterations=3)
+    a = adjust(network, truth, datum=FREE, covariance=False, options=AdjustmentOptions(max_iterations=3))
     assert not a.converged and not any(rounds)
     assert (
         len(rounds) == 3 + 1 + 3 + 3 + 1 + 1

@@ -12,7 +12,7 @@ from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.gross_errors.robust import _Rays, would_pass
 from sfm.adjustment.quality.gross_errors.robust import snoop as many_at_once
 from sfm.adjustment.quality.statistics import standardised_residuals, tau_critical
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.errors import GeometryError
 from sfm.model.network import ImagePoints
 from tests.synthetic import make_network, seed_of
@@ -62,7 +62,9 @@ def rejected(network, truth, snoop=None):
         patch.setattr(rejection, "snoop", counted)
         patch.setattr(rejection, "MAX_ROUNDS", 5000)
         alpha = 1 - 0.95 ** (1 / (2 * len(network.image_points)))
-        found = adjust(network, truth, datum=Datum("free"), alpha=alpha, covariance=False)
+        found = adjust(
+            network, truth, datum=Datum("free"), covariance=False, options=AdjustmentOptions(alpha=alpha)
+        )
     return found.rejected, len(rounds)
 
 
@@ -78,11 +80,17 @@ def test_image_points_rejected_before_may_be_left_out_from_the_start():
     """The same are rejected in fewer rounds; good ones among them are taken back."""
     network, truth, _ = spoiled_network(1)
     alpha = 1 - 0.95 ** (1 / (2 * len(network.image_points)))
-    first = adjust(network, truth, alpha=alpha, covariance=False)
+    first = adjust(network, truth, covariance=False, options=AdjustmentOptions(alpha=alpha))
     for also in (0, 5):
         without = first.rejected.copy()
         without[np.flatnonzero(~first.rejected)[:also]] = True
-        again = adjust(network, first.estimate, alpha=alpha, covariance=False, rejected=without)
+        again = adjust(
+            network,
+            first.estimate,
+            covariance=False,
+            rejected=without,
+            options=AdjustmentOptions(alpha=alpha),
+        )
         np.testing.assert_array_equal(again.rejected, first.rejected)
         np.testing.assert_allclose(again.estimate.points, first.estimate.points, atol=1e-6)
     assert again.iterations < first.iterations
@@ -123,7 +131,13 @@ def test_a_rejected_image_point_comes_back_where_it_would_pass_in_the_adjustment
     alone = np.zeros(len(seen), dtype=bool)
     alone[ray] = True
     for share in (0.98, 1.0):
-        found = adjust(moved(share * limit), truth, rejected=alone, alpha=alpha, covariance=False)
+        found = adjust(
+            moved(share * limit),
+            truth,
+            rejected=alone,
+            covariance=False,
+            options=AdjustmentOptions(alpha=alpha),
+        )
         assert found.rejected[ray] == (share == 1.0)
 
 
@@ -226,7 +240,7 @@ def test_a_point_that_keeps_rays_from_one_place_leaves():
         position=np.vstack([truth.position, truth.position[:1] + 1e-6]),
         rotation=np.concatenate([truth.rotation, truth.rotation[:1]]),
     )
-    found = adjust(network, start, datum=Datum("free"), alpha=1e-4)
+    found = adjust(network, start, datum=Datum("free"), options=AdjustmentOptions(alpha=1e-4))
     assert found.converged and found.iterations < 20
     assert found.rejected[points.point < 5].all() and not found.rejected[points.point >= 5].any()
     assert np.isnan(found.covariance.points[:5]).all() and np.isfinite(found.covariance.points[5:]).all()

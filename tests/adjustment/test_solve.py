@@ -12,7 +12,7 @@ from sfm.adjustment.datum import Datum, free_motions
 from sfm.adjustment.engine.collinearity import collinearity, new_workspace, residuals
 from sfm.adjustment.engine.unknowns import step, unknowns_of
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.conventions import angles_from_rotation, rotation_from_angles
 from sfm.model.distortion.models import GENERAL_MODELS, MODELS
 from sfm.model.errors import GeometryError
@@ -267,8 +267,10 @@ def test_two_methods_and_several_cameras_reach_the_same_optimum() -> None:
     rng = seed_of("methods")
     network, truth = make_network(rng, images=9, points=30, cameras=3, visibility=0.7)
     start = perturb(truth, rng, c=0.05, distortion=False)
-    a = adjust(network, start, datum=FREE, reject="none", method="gauss-newton")
-    b = adjust(network, start, datum=FREE, reject="none", method="levenberg-marquardt")
+    a = adjust(network, start, datum=FREE, reject="none", options=AdjustmentOptions(method="gauss-newton"))
+    b = adjust(
+        network, start, datum=FREE, reject="none", options=AdjustmentOptions(method="levenberg-marquardt")
+    )
     assert a.converged and b.converged
     assert a.sigma0 == pytest.approx(b.sigma0, rel=1e-10)
     assert np.abs(a.residuals - b.residuals).max() < 1e-5
@@ -294,7 +296,7 @@ def test_refusals() -> None:
     with pytest.raises(GeometryError, match="reject 'ransac', expected one of"):
         adjust(network, truth, datum=FREE, reject="ransac")
     with pytest.raises(GeometryError, match="method 'newton', expected one of"):
-        adjust(network, truth, datum=FREE, method="newton")
+        adjust(network, truth, datum=FREE, options=AdjustmentOptions(method="newton"))
     with pytest.raises(GeometryError, match="kind 'loose', expected one of"):
         Datum("loose")
     line = np.zeros(12, dtype=bool)

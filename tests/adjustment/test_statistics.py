@@ -24,7 +24,7 @@ from sfm.adjustment.quality.statistics import (
 )
 from sfm.adjustment.quality.variance_components import by_camera, by_kind, by_photograph, estimate_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.errors import GeometryError
@@ -116,7 +116,9 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     network = replace(network, image_points=replace(k, xy=k.xy + noise))
 
     def run(factor: FloatArray) -> Adjustment:
-        return adjust(network, truth, datum=FREE, reject="none", image_sigma_factor=factor)
+        return adjust(
+            network, truth, datum=FREE, reject="none", options=AdjustmentOptions(image_sigma_factor=factor)
+        )
 
     a, factor, settled = estimate_components(run, group, ("one", "two"))
     assert settled
@@ -136,7 +138,9 @@ def test_no_image_point_is_weighted_as_better_than_a_thousandth_of_a_pixel(
     network = replace(network, image_points=replace(k, xy=k.xy + noise_px * rng.standard_normal(k.xy.shape)))
 
     def run(factor: FloatArray) -> Adjustment:
-        return adjust(network, truth, datum=FREE, reject="none", image_sigma_factor=factor)
+        return adjust(
+            network, truth, datum=FREE, reject="none", options=AdjustmentOptions(image_sigma_factor=factor)
+        )
 
     a, factor, settled = estimate_components(run, np.zeros(len(network.image_points), dtype=int), ("all",))
     assert settled and factor[0] * a.stated_px == pytest.approx(ends, rel=0.1)

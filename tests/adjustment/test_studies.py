@@ -14,7 +14,7 @@ from scipy import stats
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.gross_errors import rejection
 from sfm.adjustment.quality.statistics import tau_critical
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.conventions import FloatArray, angles_from_rotation
 from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import kinds_of
@@ -186,7 +186,12 @@ def test_convergence_from_bad_start_values() -> None:
         )
         for method in reached:
             a = adjust(
-                network, start, datum=FREE, reject="none", covariance=False, method=method, max_iterations=100
+                network,
+                start,
+                datum=FREE,
+                reject="none",
+                covariance=False,
+                options=AdjustmentOptions(method=method, max_iterations=100),
             )
             reached[method] += a.converged and not a.rejected.any() and abs(a.sigma0 / best.sigma0 - 1) < 1e-6
     print(f"reached the optimum: {reached} of {copies}")

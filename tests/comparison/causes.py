@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import compare_results
 from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
@@ -87,7 +87,7 @@ def _measured(name: str, truth: Estimate, network: Network, rng: np.random.Gener
         seen = seen.with_scale_bar(
             network.points[a], network.points[b], length + BAR_SIGMA * rng.standard_normal(), BAR_SIGMA
         )
-    return stored_of(name, adjust(seen, truth, sigma_px=NOISE_PX, reject="none"))
+    return stored_of(name, adjust(seen, truth, reject="none", options=AdjustmentOptions(sigma_px=NOISE_PX)))
 
 
 def _changed(result: Solution, case: str, rng: np.random.Generator) -> Solution:

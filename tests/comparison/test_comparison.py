@@ -14,7 +14,7 @@ from adapters.formats.photomodeler import read_photomodeler
 from benchmarks.random_networks import random_network
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.solutions import compare, interior_effect_px, rotation_angle_deg
 from sfm.comparison.two_adjusters import adjusters
@@ -148,7 +148,7 @@ def test_groups_are_freed_whole_and_alike() -> None:
 
 def test_common_problem_drops_what_does_not_take_part() -> None:
     network, truth = make_network(seed_of("common"), model="brown", points=30, images=6)
-    adjustment = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, truth, datum=Datum("free"), reject="none")
     rejected = adjustment.rejected.copy()
     rejected[(network.image_points.point == 11) & (network.image_points.image > 0)] = True
     rejected[0] = True
@@ -172,7 +172,7 @@ def test_both_adjusters_end_at_the_same_optimum(model: str, planar: bool, camera
         rng, model=model, planar=planar, cameras=cameras, noise_px=0.1, visibility=0.8
     )
     start = perturb(truth, rng)
-    adjustment = adjust(network, start, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, start, datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, adjust_with_colmap)
     assert found.model == ("opencv" if model == "opencv" else "full_opencv")
     assert found.comparison.exceeded == ()
@@ -185,7 +185,7 @@ def test_both_adjusters_end_at_the_same_optimum(model: str, planar: bool, camera
 def test_a_rational_distortion_that_has_grown_may_still_converge() -> None:
     """After 40 steps the largest of k1 to k6 is 50,000; after 46 it has converged there."""
     made = random_network(np.random.default_rng([77, 1459]))
-    adjustment = adjust(made.network, made.start, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(made.network, made.start, datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, adjust_with_colmap, model="full_opencv")
     assert found.held == ()
     assert found.adjustment.converged and found.adjustment.iterations > 40
@@ -197,7 +197,7 @@ def test_a_rational_distortion_that_has_grown_may_still_converge() -> None:
 def test_both_adjusters_end_at_the_same_optimum_in_a_model_of_colmap(model: str) -> None:
     rng = seed_of(f"same optimum {model}")
     network, truth = make_network(rng, model=model, noise_px=0.1, visibility=0.8)
-    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, adjust_with_colmap)
     assert found.model == model and found.agree and found.comparison.exceeded == ()
     assert found.comparison.cost[1] == pytest.approx(found.comparison.cost[0], rel=1e-9)
@@ -206,7 +206,7 @@ def test_both_adjusters_end_at_the_same_optimum_in_a_model_of_colmap(model: str)
 def test_a_backend_that_stops_early_is_reported_from_one_that_ends_elsewhere() -> None:
     rng = seed_of("stops early")
     network, truth = make_network(rng, model="opencv")
-    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, backend(lambda points: points * (1 + 1e-4 * rng.random((60, 3)))))
     assert found.agree and found.stopped_early and found.comparison.max_sigmas > 0.05
     found = compare_adjusters(adjustment, backend(lambda points: points[::-1].copy()))
@@ -227,7 +227,7 @@ def backend(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Network, Es
 @pytest.mark.parametrize("model", ["opencv", "full_opencv"])
 def test_camcal_reference_points_end_at_the_same_optimum(model: str) -> None:
     network, estimate = read_photomodeler(CAMCAL / "camcal-pmexport.txt")
-    adjustment = adjust(network, estimate, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, estimate, datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, adjust_with_colmap, model=model)
     assert found.comparison.exceeded == ()
     assert found.agree
@@ -241,7 +241,7 @@ def test_a_rational_distortion_that_ends_elsewhere_is_compared_with_it_held(
     """Two minima whose numerator and denominator nearly cancel are no difference of the solvers."""
     rng = seed_of("two minima")
     network, truth = make_network(rng, model="full_opencv", noise_px=0.1)
-    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, perturb(truth, rng), datum=Datum("free"), reject="none")
     calls: list[Estimate] = []
     solved = adjusters._adjusted
 
@@ -309,7 +309,9 @@ def panel(model: str) -> tuple[Network, Estimate]:
 @pytest.mark.parametrize("model", ["opencv", "brown"])
 def test_retro_panel_reference_points_end_at_the_same_optimum(model: str) -> None:
     network, estimate = panel(model)
-    adjustment = adjust(network, estimate, datum=Datum("free"), sigma_px=0.02, reject="none")
+    adjustment = adjust(
+        network, estimate, datum=Datum("free"), reject="none", options=AdjustmentOptions(sigma_px=0.02)
+    )
     assert adjustment.rms_px < 0.02
     found = compare_adjusters(adjustment, adjust_with_colmap)
     assert found.comparison.exceeded == ()
@@ -320,7 +322,7 @@ def test_retro_panel_reference_points_end_at_the_same_optimum(model: str) -> Non
 def test_conditional_covariances_of_both_stand_beside_the_marginal() -> None:
     """What COLMAP calls the covariance of a point is that with photographs and cameras held."""
     network, truth = make_network(seed_of("conditional"), model="opencv", noise_px=0.1)
-    adjustment = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, truth, datum=Datum("free"), reject="none")
     found = compare_adjusters(adjustment, adjust_with_covariance)
     own = found.adjustment.covariance
     assert found.backend_points is not None

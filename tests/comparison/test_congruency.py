@@ -54,7 +54,7 @@ def epoch(seed: int, datum: str, shift: FloatArray | None = None, *, bar: float 
     if datum == "control":
         given = moved.points[[int(name) - 1 for name in CONTROL]] + 0.001 * rng.standard_normal((6, 3))
         network = network.with_control(CONTROL, given, 0.001)
-    a = adjust(network, moved, datum=kind, sigma_px=0.1, reject="none")
+    a = adjust(network, moved, datum=kind, reject="none")
     return stored_of(f"{datum} {seed}", a)
 
 
@@ -233,7 +233,7 @@ def measured(name: str, *, shift: np.ndarray | None = None, model: str = "opencv
     seen = network.image_points
     xy = seen.xy + reprojection(network, moved) + 0.1 * rng.standard_normal(seen.xy.shape)
     network = replace(network, image_points=replace(seen, xy=xy))
-    a = adjust(network, moved, datum=Datum("free"), sigma_px=0.1, reject="none")
+    a = adjust(network, moved, datum=Datum("free"), reject="none")
     sigma = []
     for camera, Q in zip(a.estimate.cameras, a.covariance.interior, strict=True):
         s = np.full(len(camera.names), np.nan)
@@ -385,7 +385,7 @@ def test_colmap_model_is_compared_with_tables(epochs: tuple[Solution, Solution],
 
 def test_baseline_is_compared_at_the_targets(epochs: tuple[Solution, Solution]) -> None:
     network, truth = make_network(seed_of("baseline"), model="opencv", images=8, noise_px=0.1)
-    a = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    a = adjust(network, truth, datum=Datum("free"), reject="none")
     # a baseline that oriented six of eight photographs, in a frame of its own, and a camera wrong by 1 px
     kept = [0, 2, 3, 4, 6, 7]
     theirs = TURN.apply_estimate(a.estimate)

@@ -176,7 +176,9 @@ def test_shared_parameters_come_first_and_count_all_photographs() -> None:
     same = tuple(
         replace(one.with_parameters(truth.cameras[0].parameters), shared=group) for one in truth.cameras
     )
-    a = sfm.adjust(network, replace(truth, cameras=same), reject="none", max_iterations=3)
+    a = sfm.adjust(
+        network, replace(truth, cameras=same), reject="none", options=sfm.AdjustmentOptions(max_iterations=3)
+    )
     listed = interior_parameters(a)
     common = [one for one in listed if one.owner == "lens"]
     assert [(one.name, one.photographs) for one in common] == [("c", 6)]

@@ -9,7 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement import checks
 from sfm.judgement.checks import Sigma0
 from sfm.model.network import ExteriorObservations, InteriorObservations, ScaleBars
@@ -84,7 +84,9 @@ def test_observations_are_counted_by_kind() -> None:
     variance = np.tile(np.diag([1.0, 1.0, 1.0, np.inf, np.inf, 1.0]), (2, 1, 1))
     exterior = ExteriorObservations(np.arange(2), truth.position[:2], np.zeros((2, 3)), variance)
     network = network.with_given(exterior, given, bars)
-    a = adjust(network, truth, datum=Datum("control"), reject="none", max_iterations=3)
+    a = adjust(
+        network, truth, datum=Datum("control"), reject="none", options=AdjustmentOptions(max_iterations=3)
+    )
     found = checks.count_observations(a)
     assert found.image == 2 * len(network.image_points) and found.control == 12
     assert (found.exterior, found.interior, found.scale_bars, found.further) == (8, 1, 1, 0)

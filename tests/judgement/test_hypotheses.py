@@ -10,7 +10,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.solutions import reprojection
 from sfm.judgement.hypotheses import hypotheses, score
 from sfm.judgement.hypotheses import refit as refitting
@@ -45,7 +45,7 @@ from tests.synthetic import make_network, observed_anew, seed_of
 
 def solved(network: Network, start: Estimate, reject: str = "tau") -> Adjustment:
     alpha = 1 - 0.95 ** (1 / (2 * len(network.image_points)))
-    return adjust(network, start, datum=Datum("free"), reject=reject, alpha=alpha)
+    return adjust(network, start, datum=Datum("free"), reject=reject, options=AdjustmentOptions(alpha=alpha))
 
 
 @pytest.fixture(scope="module")

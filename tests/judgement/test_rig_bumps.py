@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.bumps import (
     Bump,
     _difference,
@@ -92,12 +92,12 @@ def test_scores_are_those_of_an_adjustment_with_a_pose_of_its_own() -> None:
     """The fall of v'Pv where the photograph leaves its rig is chi-square of the test."""
     network, truth = scene(3, 2)
     moved = bumped(network, truth, 5, np.array([1e-3, 0.0, 0.0]))
-    a = adjust(moved, truth, reject="none", tolerance=1e-9)
+    a = adjust(moved, truth, reject="none", options=AdjustmentOptions(tolerance=1e-9))
     (found,) = find_bumps(a)
     assert moved.moment is not None
     free = replace(moved, moment=np.where(np.arange(16) == 5, 99, moved.moment))
     start = replace(a.estimate, cameras=a.estimate.cameras)
-    b = adjust(free, start, reject="none", tolerance=1e-9)
+    b = adjust(free, start, reject="none", options=AdjustmentOptions(tolerance=1e-9))
     fall = a.vPv - b.vPv
     assert (found.sigmas * a.sigma0) ** 2 == pytest.approx(fall, rel=0.01)
 

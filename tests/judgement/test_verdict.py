@@ -144,8 +144,8 @@ def test_the_usual_probability_of_a_false_alarm_is_that_stated(made: tuple[Netwo
     """Left out it was 0.1 % of each coordinate, and 0.05 of all only where the user wrote 0.05."""
     plain, stated = sfm.adjust(*made), sfm.adjust(*made, false_alarm=FALSE_ALARM)
     assert plain.test_alpha == stated.test_alpha < 2e-4
-    assert sfm.adjust(*made, alpha=1e-3).test_alpha == 1e-3
-    judged = sfm.adjust(*made, alpha=1e-3, false_alarm=0.01)
+    assert sfm.adjust(*made, options=sfm.AdjustmentOptions(alpha=1e-3)).test_alpha == 1e-3
+    judged = sfm.adjust(*made, false_alarm=0.01, options=sfm.AdjustmentOptions(alpha=1e-3))
     assert (judged.test_alpha, judged.false_alarm) == (1e-3, 0.01)
 
 

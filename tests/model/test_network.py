@@ -174,14 +174,14 @@ def test_what_no_adjustment_can_use_is_named(k: int) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"sigma_px": 0.0}, "sigma_px = 0.0, expected a number more than 0"),
-        ({"sigma_px": float("nan")}, "sigma_px = nan"),
-        ({"alpha": 2.0}, "alpha = 2.0, expected a number between 0 and 1"),
+        ({"options": sfm.AdjustmentOptions(sigma_px=0.0)}, "sigma_px = 0.0, expected a number more than 0"),
+        ({"options": sfm.AdjustmentOptions(sigma_px=float("nan"))}, "sigma_px = nan"),
+        ({"options": sfm.AdjustmentOptions(alpha=2.0)}, "alpha = 2.0, expected a number between 0 and 1"),
         (
-            {"image_sigma_factor": np.ones(3)},
+            {"options": sfm.AdjustmentOptions(image_sigma_factor=np.ones(3))},
             r"image_sigma_factor of shape \(3,\), expected",
         ),
-        ({"image_sigma_factor": 0.0}, "image_sigma_factor of shape"),
+        ({"options": sfm.AdjustmentOptions(image_sigma_factor=0.0)}, "image_sigma_factor of shape"),
         ({"datum": "middle"}, "datum: kind 'middle', expected one of"),
     ],
 )

@@ -12,7 +12,7 @@ from sfm.adjustment.quality import consistency
 from sfm.adjustment.quality.consistency import consistency_of
 from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -25,7 +25,7 @@ from tests.synthetic import make_network, seed_of
 
 def _solved(network: Network, truth: Estimate, reject: str) -> Adjustment:
     alpha = 1 - (1 - 0.05) ** (1 / (2 * len(network.image_points)))
-    return adjust(network, truth, reject=reject, alpha=alpha)
+    return adjust(network, truth, reject=reject, options=AdjustmentOptions(alpha=alpha))
 
 
 def test_photographs_of_other_noise_are_reported() -> None:

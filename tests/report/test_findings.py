@@ -21,7 +21,7 @@ import sfm.judgement.verdict as verdict
 import sfm.report.findings as findings_module
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.consistency import Consistency, Uneven, consistency_of
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.cli.console import print_result
 from sfm.judgement.bundle_statistics import Given
 from sfm.judgement.cameras import edges_of, larger_than_the_others, sharpness_remarks
@@ -205,7 +205,9 @@ def _blame(networks: int) -> Counter[str]:
     count: Counter[str] = Counter()
     for k in range(networks):
         network, truth, wrong = _with_wrong_rays(f"three rays {k}")
-        a = adjust(network, truth, alpha=1 - 0.95 ** (0.5 / len(network.image_points)))
+        a = adjust(
+            network, truth, options=AdjustmentOptions(alpha=1 - 0.95 ** (0.5 / len(network.image_points)))
+        )
         told = {one.point for one in consistency_of(a).doubtful}
         for j, row in wrong.items():
             out = np.flatnonzero(a.rejected & (network.image_points.point == j))
@@ -222,9 +224,11 @@ def test_given_coordinates_are_not_doubtful() -> None:
     """Before, points of a plate were, whose rays show a wrong camera."""
     network, truth, _ = _with_wrong_rays("three rays 0")
     alpha = 1 - 0.95 ** (0.5 / len(network.image_points))
-    assert consistency_of(adjust(network, truth, alpha=alpha)).doubtful
+    assert consistency_of(adjust(network, truth, options=AdjustmentOptions(alpha=alpha))).doubtful
     given = network.with_control(network.points, truth.points)
-    assert not consistency_of(adjust(given, truth, datum="control", alpha=alpha)).doubtful
+    assert not consistency_of(
+        adjust(given, truth, datum="control", options=AdjustmentOptions(alpha=alpha))
+    ).doubtful
 
 
 def test_a_point_whose_wrong_ray_was_not_the_one_rejected_is_doubtful() -> None:

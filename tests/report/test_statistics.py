@@ -23,7 +23,7 @@ from sfm.adjustment.quality.statistics import (
 )
 from sfm.adjustment.quality.variance_components import by_kind
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.judgement.bundle_statistics import given_of, statistics_of
 from sfm.judgement.calibrated_cameras import families, interior_parameters
@@ -312,7 +312,9 @@ def test_a_sigma_that_is_far_too_large_is_reported_with_what_it_would_be(
     assert one.number("stated") == pytest.approx(guess * NOISE_PX)
     assert one.number("found") == pytest.approx(ratio * guess * NOISE_PX)
     # the same where the image points were weighted by their own component before
-    b = adjust(stated, truth, datum=Datum("free"), reject="none", image_sigma_factor=ratio)
+    b = adjust(
+        stated, truth, datum=Datum("free"), reject="none", options=AdjustmentOptions(image_sigma_factor=ratio)
+    )
     assert b.sigma0 == pytest.approx(1)
     again = findings_of(result_of(b)).verdict
     assert [one.text for one in again.remarks] == [one.text for one in verdict.remarks]

@@ -12,7 +12,7 @@ import pytest
 import sfm
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import scale_estimate
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import camera_from_values
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Estimate
@@ -129,7 +129,9 @@ def test_a_long_lens_converges(free: tuple[str, ...]) -> None:
     start = replace(a.estimate, cameras=truth.cameras)
     found = nearer_start(a.network, start, reverse_depth(scale_estimate(start, 1.3)), datum)
     assert found is not None and found.cameras == truth.cameras
-    again = adjust(a.network, found, datum=datum, reject="none", method="gauss-newton")
+    again = adjust(
+        a.network, found, datum=datum, reject="none", options=AdjustmentOptions(method="gauss-newton")
+    )
     assert again.sigma0_px == pytest.approx(a.sigma0_px, rel=1e-6)
 
 

@@ -220,7 +220,7 @@ def test_photographs_whose_errors_correlate(rho: float) -> None:
     noise[sixth] = rho * noise[third] + np.sqrt(1 - rho**2) * noise[sixth]
     both = replace(network, image_points=replace(seen, xy=xy + noise))
     start = replace(truth, position=position, rotation=rotation)
-    found = find_copies(adjust(both, start, sigma_px=0.1))
+    found = find_copies(adjust(both, start))
     if rho == 0.5:
         assert found == {}
     else:

@@ -93,7 +93,7 @@ def results(folder: Path) -> tuple[Path, Path]:
         seen = network.image_points
         noise = np.random.default_rng(seed).normal(0, 0.1, seen.xy.shape)
         network = replace(network, image_points=replace(seen, xy=seen.xy + noise))
-        a = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+        a = adjust(network, truth, datum=Datum("free"), reject="none")
         joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(8))
         found = Solution(
             *("r", network, a.estimate, a.covariance.points, None, None, a.redundancy, "m", joint, "free")

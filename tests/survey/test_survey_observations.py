@@ -160,7 +160,7 @@ def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
     rng = seed_of(f"scatter {datum}")
     for _ in range(25):
         drawn, true = simulate_network(network, truth, rng)
-        a = adjust(drawn, true, reject="none", datum=Datum(datum), sigma_px=0.1)
+        a = adjust(drawn, true, reject="none", datum=Datum(datum))
         assert a.converged and a.defect == a.expected_defect == 0
         kinds = by_kind(a)
         assert set(kinds.names[1:]) >= {kind.name for kind in TABLES.values()} | {"mounts", "scale bars"}
@@ -184,7 +184,7 @@ def test_all_kinds_at_once_have_the_scatter_that_is_stated(datum: str) -> None:
 
 def test_without_errors_every_kind_has_the_values_of_the_truth() -> None:
     network, truth = simulate_network(*network_of_all())
-    a = adjust(network, truth, reject="none", datum="control", sigma_px=0.1)
+    a = adjust(network, truth, reject="none", datum="control")
     assert a.vPv == pytest.approx(0.0, abs=1e-10)
 
 
@@ -628,9 +628,7 @@ def test_a_tip_that_no_photograph_shows_has_the_covariance_that_is_stated() -> N
         (frame,) = (kind for kind in drawn.observations if isinstance(kind, RigidFrames))
         wrong = replace(frame, hidden_value=frame.hidden_value + 1e-4 * rng.standard_normal((1, 3)))
         others = tuple(kind for kind in drawn.observations if kind is not frame)
-        a = adjust(
-            replace(drawn, observations=(*others, wrong)), true, reject="none", datum="free", sigma_px=0.1
-        )
+        a = adjust(replace(drawn, observations=(*others, wrong)), true, reject="none", datum="free")
         (found,) = a.group_parameters
         assert found.names == ("tip X", "tip Y", "tip Z")
         error = found.value - tip

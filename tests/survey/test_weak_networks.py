@@ -9,7 +9,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import other_solutions
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import camera_from_values, project
 from sfm.model.remarks.remark import remark
 from sfm.pipeline import run_survey
@@ -151,7 +151,13 @@ def test_a_narrow_relief_can_be_turned_inside_out() -> None:
     xy = np.concatenate([project(camera, position[i], rotation[i], xyz[[j]]) for i, j in rows])
     noisy = replace(network, image_points=replace(seen, xy=xy + 0.3 * rng.standard_normal(xy.shape)))
     estimate = replace(truth, cameras=(camera,), position=position, rotation=rotation, points=xyz)
-    a = adjust(noisy, estimate, datum=Datum("free"), sigma_px=0.3, reject="none", max_iterations=500)
+    a = adjust(
+        noisy,
+        estimate,
+        datum=Datum("free"),
+        reject="none",
+        options=AdjustmentOptions(sigma_px=0.3, max_iterations=500),
+    )
     (other,) = other_solutions(a)
     assert other.reflected and other.moved > 3
 

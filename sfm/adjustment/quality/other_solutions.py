@@ -24,7 +24,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.engine.iterate import TOLERANCE
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.distributions import f_isf
@@ -178,12 +178,14 @@ class _Search:
                     self.network,
                     replace(start, cameras=cameras),
                     datum=self.datum,
-                    image_sigma_factor=self.factor,
                     reject="none",
-                    method=method,
-                    max_iterations=MAX_ITERATIONS,
-                    tolerance=tolerance,
                     covariance=False,
+                    options=AdjustmentOptions(
+                        image_sigma_factor=self.factor,
+                        method=method,
+                        max_iterations=MAX_ITERATIONS,
+                        tolerance=tolerance,
+                    ),
                 )
             except GeometryError:
                 continue

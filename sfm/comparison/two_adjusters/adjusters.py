@@ -27,7 +27,7 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.camera_conversion import Conversion, convert_camera, corresponding_free
 from sfm.comparison.solutions import ROUNDING_PX, Comparison, compare
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
@@ -208,7 +208,11 @@ def compare_adjusters(
 
 def _adjusted(network: Network, start: Estimate, sigma_px: float) -> Adjustment:
     return adjust(
-        network, start, datum=Datum("free"), sigma_px=sigma_px, reject="none", max_iterations=MAX_ITERATIONS
+        network,
+        start,
+        datum=Datum("free"),
+        reject="none",
+        options=AdjustmentOptions(sigma_px=sigma_px, max_iterations=MAX_ITERATIONS),
     )
 
 
@@ -324,7 +328,13 @@ def better_fit(survey: Adjustment, network: Network, compared: Adjustment) -> Be
     more = tuple(names)
     if not more or not compared.converged:
         return None
-    adjusted = partial(adjust, network, datum=Datum("free"), sigma_px=survey.sigma_px, reject="none")
+    adjusted = partial(
+        adjust,
+        network,
+        datum=Datum("free"),
+        reject="none",
+        options=AdjustmentOptions(sigma_px=survey.sigma_px),
+    )
     freer = adjusted(replace(compared.estimate, cameras=own_cameras), covariance=False)
     freed = freer.redundancy - compared.redundancy
     if not freer.converged or freed <= 0 or compared.redundancy <= 0:

@@ -21,7 +21,7 @@ import numpy as np
 from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     alternatives_of,
@@ -517,10 +517,10 @@ def adjust_image_points(
             part,
             start,
             datum=Datum(datum),
-            image_sigma_factor=factor[rows],
             reject="tau",
             false_alarm=false_alarm,
             rejected=rejected[rows],
+            options=AdjustmentOptions(image_sigma_factor=factor[rows]),
         )
     except (GeometryError, np.linalg.LinAlgError):
         return None

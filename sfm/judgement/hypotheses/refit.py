@@ -23,7 +23,7 @@ from scipy.special import chndtrinc
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.alternatives import (
     MIN_GROUP,
     cameras_of_photographs,
@@ -153,12 +153,14 @@ def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjust
             network,
             start.estimate,
             datum=Datum("control" if plain.datum == "control" else "free"),
-            image_sigma_factor=plain.image_sigma_factor,
             reject="tau",
-            alpha=plain.test_alpha,
             false_alarm=plain.false_alarm,
             rejected=start.rejected,
-            max_iterations=MAX_ITERATIONS,
+            options=AdjustmentOptions(
+                image_sigma_factor=plain.image_sigma_factor,
+                alpha=plain.test_alpha,
+                max_iterations=MAX_ITERATIONS,
+            ),
         )
     except GeometryError:
         return None

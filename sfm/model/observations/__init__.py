@@ -23,7 +23,7 @@ residuals, redundancy numbers, tests and variance component follow:
     >>> levelled = Slopes(np.array(start), np.array(end), np.zeros((3, 1)), np.full((3, 1), 1e-3))
     >>> network = first.network.with_observations(levelled)
     >>> found = sfm.adjust(network, first.estimate)
-    >>> [f"{kind.name}: {len(kind)}" for kind in found.network.observations]
+    >>> [f"{kind.name}: {len(kind)}" for kind in found.network.further]
     ['slopes: 3']
     >>> float(found.observed[-1].redundancy_numbers.max()) < 1  # the last kind of the network
     True

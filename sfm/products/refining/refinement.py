@@ -16,7 +16,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import with_neighbours
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.given.free_network import FreeNetwork
 from sfm.judgement.given.groups import GivenSettings
 from sfm.judgement.given.judge import judge_given
@@ -425,8 +425,7 @@ def adjust_finally(
             datum=datum,
             reject=reject,
             false_alarm=false_alarm,
-            image_sigma_factor=factor,
-            max_iterations=MAX_ITERATIONS,
+            options=AdjustmentOptions(image_sigma_factor=factor, max_iterations=MAX_ITERATIONS),
         )
 
     if not (len(part.scale_bars) or datum.kind == "control"):
@@ -437,7 +436,7 @@ def adjust_finally(
         reject="tau",
         false_alarm=false_alarm,
         covariance=False,
-        max_iterations=MANY_ITERATIONS,
+        options=AdjustmentOptions(max_iterations=MANY_ITERATIONS),
     )
     given = judge_given(part, FreeNetwork(free), GivenSettings(datum, unit, false_alarm=false_alarm))
     part, datum = given.network, given.datum

@@ -23,7 +23,7 @@ import numpy as np
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.variance_components import IMAGE_POINTS, estimate_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.model_choice import Choice, choose
 from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
@@ -285,14 +285,16 @@ def _adjust_with_snooping(
         network,
         estimate,
         datum=on_points(task, network, estimate),
-        sigma_px=task.survey.adjust.sigma_px,
-        image_sigma_factor=task.factor if factor is None else factor,
         reject=task.survey.reject,
         false_alarm=task.survey.adjust.false_alarm,
         rejected=rejected,
-        method=method,
-        max_iterations=max_iterations,
         covariance=covariance,
+        options=AdjustmentOptions(
+            sigma_px=task.survey.adjust.sigma_px,
+            image_sigma_factor=task.factor if factor is None else factor,
+            method=method,
+            max_iterations=max_iterations,
+        ),
     )
 
 
@@ -447,10 +449,8 @@ def _adjust_with_cameras_held(network: Network, start: Estimate, datum: Datum) -
                 values,
                 datum=datum,
                 reject="none",
-                method=method,
-                max_iterations=steps,
-                tolerance=START_TOLERANCE,
                 covariance=False,
+                options=AdjustmentOptions(method=method, max_iterations=steps, tolerance=START_TOLERANCE),
             )
         except GeometryError:
             return None

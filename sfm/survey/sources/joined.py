@@ -17,7 +17,7 @@ import numpy as np
 from sfm.adjustment.quality.correlations import design_effect_of_neighbours
 from sfm.adjustment.quality.variance_components import estimate_components
 from sfm.adjustment.result import Adjustment
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.errors import GeometryError
@@ -403,10 +403,9 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
             adjustment = adjust(
                 part,
                 start,
-                sigma_px=settings.sigma_px,
-                image_sigma_factor=factor,
                 false_alarm=settings.false_alarm,
                 reject="huber",
+                options=AdjustmentOptions(sigma_px=settings.sigma_px, image_sigma_factor=factor),
             )
             start = adjustment.estimate
             return adjustment

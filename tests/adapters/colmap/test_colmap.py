@@ -227,7 +227,7 @@ def test_photographs_have_rigs_and_frames_of_their_own(tmp_path: Path) -> None:
 
 def test_colmaps_covariance_of_points_is_conditional() -> None:
     network, truth = scene()
-    adjustment = adjust(network, truth, datum=Datum("free"), sigma_px=0.1, reject="none")
+    adjustment = adjust(network, truth, datum=Datum("free"), reject="none")
     found = covariance_with_colmap(network, adjustment.estimate)
     assert found is not None
     variance = (adjustment.sigma0 * adjustment.sigma_px) ** 2
@@ -237,7 +237,7 @@ def test_colmaps_covariance_of_points_is_conditional() -> None:
     # Held cameras against cameras with an orientation to be determined, in a datum on four of the points
     carrying = np.zeros(len(network.points), dtype=bool)
     carrying[:4] = True
-    local = adjust(network, truth, datum=Datum("free", carrying), sigma_px=0.1, reject="none")
+    local = adjust(network, truth, datum=Datum("free", carrying), reject="none")
     ratio = np.trace(local.covariance.points[4:], axis1=1, axis2=2) / np.trace(limiting[4:], axis1=1, axis2=2)
     assert ratio.min() > 1.1
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adapters.colmap.adjuster import adjust_with_colmap
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.camera_conversion import convert_camera
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
@@ -21,7 +21,7 @@ def test_rigs_have_the_same_optimum(cameras: int, held: bool) -> None:
     converted = tuple(convert_camera(camera, "full_opencv").camera for camera in truth.cameras)
     free = truth.mounts.free & (not held)
     start = replace(truth, cameras=converted, mounts=replace(truth.mounts, free=free))
-    ours = adjust(network, start, reject="none", tolerance=1e-9)
+    ours = adjust(network, start, reject="none", options=AdjustmentOptions(tolerance=1e-9))
     theirs = adjust_with_colmap(network, start)
     assert theirs.converged and theirs.rms_px == pytest.approx(ours.rms_px, abs=1e-11)
     a, b = ours.estimate.mounts, theirs.estimate.mounts

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from sfm.adjustment.datum import Datum
-from sfm.adjustment.solve import adjust
+from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.conventions import FloatArray
 from sfm.model.distortion.models import Role
 from sfm.model.estimate import Estimate
@@ -72,7 +72,7 @@ def epoch(
             for k, value in zip(rows.tolist(), calibration.tolist(), strict=True)
         )
     kind = Datum(datum, points=["1", "2", "3"] if datum == "minimal" else None)
-    a = adjust(network, now, datum=kind, sigma_px=NOISE_PX, reject="none")
+    a = adjust(network, now, datum=kind, reject="none", options=AdjustmentOptions(sigma_px=NOISE_PX))
     name = f"epoch {seed}"
     return Epoch(
         name,

@@ -44,7 +44,7 @@ def epoch(
     rotation[1::2] = rotation[::2] @ turned[1]
     truth = replace(truth, rotation=rotation)
     drawn, truth = simulate_network(network.with_given(further=observations), truth, seed_of(name))
-    a = adjust(drawn, truth, reject="none", datum=Datum("free"), sigma_px=0.1)
+    a = adjust(drawn, truth, reject="none", datum=Datum("free"))
     return Epoch(name, stored_of(name, a), sigma0=a.sigma0, sigma0_px=a.sigma0_px)
 
 

@@ -125,7 +125,7 @@ def adjusted_as_one(given: tuple[Epoch, Epoch], found: Differences) -> tuple[Flo
             np.array([sigma for _, _, _, sigma in rows]),
         )
     )
-    a = adjust(network, estimate, datum="control", sigma_px=0.1, reject="none")
+    a = adjust(network, estimate, datum="control", reject="none")
     assert a.converged
     joint = marginal_of(a).joint(np.zeros(0, dtype=np.int64), np.arange(2 * POINTS)) / a.sigma0**2
     x = a.estimate.points
