@@ -32,7 +32,11 @@ ARRAYS: tuple[tuple[Any, str, Any, str], ...] = (
 """annotation, accepted kinds of values (numpy's letters), resulting dtype, name in messages"""
 SEQUENCES = (list, tuple, Sequence)
 DIGITS = frozenset("0123456789")
-NUMBERS: Mapping[Any, tuple[type, str]] = {float: (Real, "a number"), int: (Integral, "a whole number")}
+NUMBERS: Mapping[Any, tuple[tuple[type, ...], str]] = {  # what is one, and its name in messages
+    float: ((Real,), "a number"),
+    int: ((Integral,), "a whole number"),
+    bool: ((bool, np.bool_), "True or False"),
+}
 
 
 def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -178,8 +182,6 @@ def _fits(value: object, hint: Any) -> bool:
         return value is None
     if hint in NUMBERS:
         return isinstance(value, NUMBERS[hint][0])
-    if hint is bool:
-        return isinstance(value, bool | np.bool_)
     origin, inner = typing.get_origin(hint) or hint, typing.get_args(hint)
     if not isinstance(origin, type) or _is_function(origin):
         return origin is typing.Any or callable(value)
@@ -259,4 +261,4 @@ def _type_name(hint: Any) -> str:
         sentence = (origin.__doc__ or name).partition(".")[0].replace("`", "")
         return sentence[:1].lower() + sentence[1:]
     elements = f" of {_type_name(inner[0])}" if name in ("list", "tuple", "Sequence") and inner else ""
-    return {"str": "text", "bool": "True or False"}.get(name, name) + elements
+    return {"str": "text"}.get(name, name) + elements

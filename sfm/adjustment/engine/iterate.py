@@ -165,15 +165,11 @@ def iterate(
                     _refuse(problem, state)
                 state = first  # the damped steps have led to equations that cannot be solved
                 continue
-            start, tried = before
-            is_full_step = share == 1.0
-            better = _line_search(problem, start, weight, tried, share / 2, shortest)
-            if is_full_step and better is not None and better[1] < BENT_STEP_SHARE:
-                better = _along_valley(problem, start, weight, tried, better[1]) or better
-            if better is None:  # no share of the last step leads to equations that can be solved
-                state, move = start, _solve(problem, start, weight)
+            shorter = _shorter_step(problem, before, weight, share, shortest)
+            if shorter is None:
+                state, move = before[0], _solve(problem, before[0], weight)
                 break
-            (state, share), limit = better, np.inf
+            (state, share), limit = shorter, np.inf
             continue
         start_vPv = move.equations.vPv if start_vPv is None else start_vPv
         if move.within(tolerance) or taken >= max_iterations:
@@ -316,6 +312,25 @@ def total(problem: Problem, state: State, weight: FloatArray) -> float:
     """
     p = problem
     return sum_of_squares(p.layout.observations, state, weight) + vPv_of(p.observed, state)
+
+
+def _shorter_step(
+    problem: Problem, before: tuple[State, Move], weight: FloatArray, share: float, shortest: float
+) -> tuple[State, float] | None:
+    """Return the state after less of the step before, and the share; None if no share can be taken.
+
+    Args:
+        problem: constants of the adjustment.
+        before: start of the step, and the step.
+        weight: factor on the weight of each image point, shape (k,).
+        share: share of the step that led to equations that cannot be solved, or to a larger sum of squares.
+        shortest: last share to try.
+    """
+    start, move = before
+    better = _line_search(problem, start, weight, move, share / 2, shortest)
+    if share == 1.0 and better is not None and better[1] < BENT_STEP_SHARE:
+        better = _along_valley(problem, start, weight, move, better[1]) or better
+    return better
 
 
 def _line_search(

@@ -209,14 +209,7 @@ def unknowns_of(
         counts[a] += len(of_mount)
         free_index[a, : counts[a]] = np.concatenate([free_ones, MAX_PARAMETERS + of_mount])
         free_column[a, : counts[a]] = np.concatenate([column, mount_column[a, of_mount]])
-    coupled = [np.zeros(0, dtype=np.int64)]  # points that observations couple with other unknowns
-    for kind in network.observations:
-        blocks = kind.blocks()
-        if len(kind) and len(blocks) > 1:
-            of_points = [block.at for block in blocks if block.of == POINT]
-            on = np.logical_and.reduce([point_on[index] for index in of_points])
-            coupled += [index[on] for index in of_points]
-    kept = np.unique(np.concatenate(coupled))
+    kept = _coupled_points(network, point_on)
 
     order, rays_from = by_point(k.image, k.point, pose_of, n)
     covariance = k.covariance
@@ -436,6 +429,18 @@ def _hold_undetermined(
     pose_free[~pose_on] = False
     point_free[~point_on] = False
     return active, seen[pose_of], rays, tuple(held), defect
+
+
+def _coupled_points(network: Network, point_on: BoolArray) -> IntArray:
+    """Return the points that take part and that observations couple with other unknowns, (s,)."""
+    coupled = [np.zeros(0, dtype=np.int64)]
+    for kind in network.observations:
+        blocks = kind.blocks()
+        if len(kind) and len(blocks) > 1:
+            of_points = [block.at for block in blocks if block.of == POINT]
+            on = np.logical_and.reduce([point_on[index] for index in of_points])
+            coupled += [index[on] for index in of_points]
+    return np.unique(np.concatenate(coupled))
 
 
 def _rigs_of(network: Network, estimate: Estimate) -> tuple[IntArray, int, Mounts, BoolArray]:
