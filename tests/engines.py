@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sfm.cli.commands.batching import InProcess
+from sfm.cli.commands.batch import InProcess
 from sfm.judgement.survey_result import SurveyResult
 from sfm.products.batch.job import Comparers, SurveyRow
 from sfm.runtime.executor import Send

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sfm
-from sfm.cli.commands.batching import InProcess
+from sfm.cli.commands.batch import InProcess
 from sfm.model.errors import BackendError, KolinearError, MissingLibraryError
 from sfm.model.remarks.remark import Remark
 from sfm.runtime import warmed

@@ -16,7 +16,7 @@ from sfm.runtime.faults import FAULT
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey_file import BESIDE, SurveyFile, read_survey_file
 from sfm.targets.codes.plates import PlateFamily, refuse_unusable_plate
-from tests.places import ROOT
+from tests.places import ROOT, load_page_code
 from tests.written import WRITTEN
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -67,10 +67,8 @@ def test_survey_files_of_the_examples_are_read_and_show_every_key(tmp_path: Path
         assert keys_of(section) - shown[key] <= {"sensor_mm"}, key
 
 
-def test_commands_of_the_readme_exist() -> None:
-    commands = {command.callback.__name__ for command in app.registered_commands if command.callback}
-    commands |= {group.typer_instance.info.name for group in app.registered_groups if group.typer_instance}
-    assert set(re.findall(r"^kolinear ([a-z]+) ", README, re.M)) == commands
+def test_the_readme_lists_the_commands() -> None:
+    assert load_page_code("command_list").with_list(README) == README, "python docs/command_list.py README.md"
 
 
 def shown_commands() -> list[str]:

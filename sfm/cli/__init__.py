@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sfm.cli.commands.starting import INTERRUPTED, INTERRUPTED_TEXT, guard_streams, loading, stopped_once
+from sfm.cli.process import INTERRUPTED, INTERRUPTED_TEXT, guard_streams, loading, stopped_once
 from sfm.model.errors import KolinearError
 from sfm.runtime.installation import ignore_current_folder, load_adapters, refuse_mixed_installation
 from sfm.runtime.progress import share_freed_memory

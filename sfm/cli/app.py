@@ -1,28 +1,77 @@
-"""The typer application with all commands of kolinear. Each command imports its libraries when it runs."""
+"""The command line: a row of each command, and the typer application made of them.
+
+A command is a function in a module of its own in `sfm.cli.commands`, and imports its libraries when it runs.
+The list of commands in README.md (`python docs/command_list.py README.md`), the reference and the tests of
+exit codes follow from the rows.
+"""
 
 from __future__ import annotations
 
 import platform
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from sfm.cli.commands import batching, inspecting, measuring, planning, solvers, starting, surveying
+from sfm.cli.commands.accept import accept
+from sfm.cli.commands.adjust import adjust
+from sfm.cli.commands.batch import batch
+from sfm.cli.commands.compare import compare
+from sfm.cli.commands.convert import convert
+from sfm.cli.commands.doctor import doctor
+from sfm.cli.commands.epochs import epochs
+from sfm.cli.commands.init import init
+from sfm.cli.commands.match import match
+from sfm.cli.commands.measure import measure
+from sfm.cli.commands.plan_more import plan_more
+from sfm.cli.commands.plan_network import plan_network
+from sfm.cli.commands.plan_simulate import plan_simulate
+from sfm.cli.commands.plan_target_size import plan_target_size
+from sfm.cli.commands.refine import refine
+from sfm.cli.commands.resect import resect
+from sfm.cli.commands.run import run
+from sfm.cli.commands.targets import targets
+from sfm.cli.commands.view import view
+
+
+class Command(NamedTuple):
+    """A command."""
+
+    words: str  # that follow `kolinear`: the name, or the names of a group and of a command in it
+    function: Callable[..., None]  # that typer calls with the options; its docstring is the help
+    usage: str  # arguments in the list of commands
+    purpose: str  # in the list of commands
+
+
+COMMANDS = (
+    Command("run", run, "PHOTOS|SURVEY.toml", "photographs -> report"),
+    Command("init", init, "PHOTOS", "draft the survey file of a folder of photographs"),
+    Command("adjust", adjust, "SURVEY.toml", "measured image points -> report"),
+    Command("batch", batch, "SURVEYS...", "many surveys, on this computer or a cluster"),
+    Command("targets", targets, "--out sheet.pdf", "coded targets or tags to print"),
+    Command("plan network", plan_network, "OBJECT --camera CAMERA", "what planned photographs will give"),
+    Command("plan simulate", plan_simulate, "PLAN", "render a plan, run it and compare"),
+    Command("plan more", plan_more, "RESULT", "photographs to add to a survey"),
+    Command("plan target-size", plan_target_size, "--distance D ...", "how large targets must be"),
+    Command("resect", resect, "POINTS.csv --c MM", "one photograph on known points"),
+    Command("match", match, "LEFT RIGHT", "conjugate points of two photographs"),
+    Command("compare", compare, "A B", "two results: differences and their significance"),
+    Command("epochs", epochs, "FIRST SECOND", "what moved between surveys of one object"),
+    Command("measure", measure, "RESULT", "shapes, distances, alignment, tolerances"),
+    Command("accept", accept, "RESULT LENGTHS.csv", "calibrated lengths, VDI/VDE 2634 part 1"),
+    Command("view", view, "FOLDER", "a result or a COLMAP model as one page to explore"),
+    Command("refine", refine, "MODEL --images DIR", "re-measure the key points of a COLMAP model, adjust"),
+    Command("convert", convert, "IN OUT", "carry a survey between programs"),
+    Command("doctor", doctor, "", "versions, folders, and whether this installation measures"),
+)
+PURPOSE = "Close-range photogrammetry: targets, orientation, bundle adjustment and comparison with COLMAP."
+GROUPS = {"plan": "Plan a survey before the photographs are taken."}
 
 USAGE_ERROR: Any = (
     typer.BadParameter.__base__
 )  # base of typer's errors of arguments; typer does not export it
-
-app = typer.Typer(
-    name="kolinear",
-    help="Close-range photogrammetry: targets, orientation, bundle adjustment and comparison with COLMAP.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
 
 
 def _show_version(wanted: bool) -> None:
@@ -32,37 +81,38 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def _commands(
-    version: Annotated[
-        bool,
-        typer.Option("--version", is_eager=True, callback=_show_version, help="Print the version and exit."),
-    ] = False,
-) -> None:
-    """Take the options before a command."""
+def _application() -> typer.Typer:
+    """Return the application with all commands."""
+    made = typer.Typer(
+        name="kolinear",
+        help=PURPOSE,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+
+    @made.callback()
+    def _kolinear(
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version", is_eager=True, callback=_show_version, help="Print the version and exit."
+            ),
+        ] = False,
+    ) -> None:
+        """Take the options before a command."""
+
+    groups = {name: typer.Typer(name=name, help=purpose) for name, purpose in GROUPS.items()}
+    for command in COMMANDS:
+        group, _, name = command.words.rpartition(" ")
+        (groups[group] if group else made).command(name)(command.function)
+    for made_group in groups.values():
+        made.add_typer(made_group)
+    return made
 
 
-for _command in (
-    surveying.run,
-    surveying.init,
-    surveying.adjust,
-    batching.batch,
-    measuring.resect,
-    measuring.match,
-    measuring.targets,
-    inspecting.measure,
-    inspecting.accept,
-    solvers.compare,
-    solvers.epochs,
-    solvers.convert,
-    solvers.refine,
-    starting.doctor,
-    inspecting.view,
-):
-    app.command()(_command)
-planning.plan.command("simulate")(planning.simulate_command)
-planning.plan.command("more")(planning.more_command)
-app.add_typer(planning.plan)
+app = _application()
 
 
 @cache

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from sfm.cli.commands.starting import FAILED
+from sfm.cli.process import FAILED
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.model.remarks.remark import Severity

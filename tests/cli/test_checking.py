@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sfm.cli import warm_up
-from sfm.cli.commands.starting import compile_first
+from sfm.cli.process import compile_first
 from sfm.runtime import warmed
 from sfm.targets.detect import find_targets
 from tests.commands import kolinear

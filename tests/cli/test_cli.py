@@ -18,8 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sfm import cli
-from sfm.cli import app
-from sfm.cli.commands import starting
+from sfm.cli import app, process
 from sfm.products.rendering.render import write_photographs
 from sfm.products.rendering.scene_file import read_scene
 from sfm.report.output import write_result
@@ -103,7 +102,7 @@ codes = [0, 11, 0, 0]
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiling is not reported, whether or not this is the first run after a change."""
-    monkeypatch.setattr(starting, "_announce_compiling", lambda: None)
+    monkeypatch.setattr(process, "_announce_compiling", lambda: None)
 
 
 @pytest.fixture(scope="module")
@@ -307,7 +306,7 @@ def test_compiling_is_reported_when_it_happens_and_only_then(tmp_path: Path) -> 
     (tmp_path / "kernel.py").write_text(text, encoding="utf-8")
     code = (
         "import importlib.util, sys\n"
-        "from sfm.cli.commands.starting import loading, stopped_once\n"
+        "from sfm.cli.process import loading, stopped_once\n"
         "spec = importlib.util.spec_from_file_location('sfm.kernel', 'kernel.py')\n"
         "kernel = sys.modules['sfm.kernel'] = importlib.util.module_from_spec(spec)\n"
         "with stopped_once():\n"
@@ -408,19 +407,19 @@ def test_nothing_that_takes_time_is_imported_for_the_help() -> None:
 
 @pytest.mark.parametrize("seconds", [0.15, pytest.param(0.4, marks=SLOW), 0.8, pytest.param(1.2, marks=SLOW)])
 def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path, seconds: float) -> None:
-    process = subprocess.Popen(
+    running = subprocess.Popen(
         [sys.executable, "-c", "print(1, flush=True); from sfm.cli import main; main()", "batch", tmp_path],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout is not None
-    process.stdout.readline()
+    assert running.stdout is not None
+    running.stdout.readline()
     time.sleep(seconds)
-    process.send_signal(signal.SIGINT)
-    process.send_signal(signal.SIGINT)  # as timeout does
-    errors = process.communicate(timeout=60)[1]
-    if process.returncode != 2:  # on a fast computer it has found by now that there are no surveys
-        assert process.returncode == 130, errors
-        assert errors == f"{starting.INTERRUPTED_TEXT}\n"
+    running.send_signal(signal.SIGINT)
+    running.send_signal(signal.SIGINT)  # as timeout does
+    errors = running.communicate(timeout=60)[1]
+    if running.returncode != 2:  # on a fast computer it has found by now that there are no surveys
+        assert running.returncode == 130, errors
+        assert errors == f"{process.INTERRUPTED_TEXT}\n"

@@ -13,9 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from adapters.formats.registry import ENDINGS, FORMATS
+from sfm.cli import survey_runs as drafting
 from sfm.cli.app import app
-from sfm.cli.commands import surveying as drafting
-from sfm.cli.commands.starting import stopped_once
+from sfm.cli.process import stopped_once
 from sfm.model.conventions import METRES
 from sfm.model.errors import KolinearError, OutputError, SurveyFileError
 from sfm.products.drafting.draft import Draft, draft_survey
@@ -27,7 +27,7 @@ from tests.surveys import write_observed_survey
 
 FOUR_LINES = """
 import sys
-from sfm.cli.commands.starting import guard_streams
+from sfm.cli.process import guard_streams
 guard_streams()
 for k in range(2):
     print(2 * k)
@@ -55,7 +55,7 @@ def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pyte
         asked.append(pitch)
         return Draft("plate", "[survey]\n", (), (), ())
 
-    monkeypatch.setattr(drafting, "_draft_folder", drafted)
+    monkeypatch.setattr(drafting, "draft_folder", drafted)
     out = tmp_path / "out" / "plate"
     with stopped_once():  # as every command
         file, _ = drafting.drafted_beside(tmp_path, out, 12.5)
@@ -69,7 +69,7 @@ def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where the run failed and left no result, and after all was moved together."""
-    monkeypatch.setattr(drafting, "_draft_folder", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
+    monkeypatch.setattr(drafting, "draft_folder", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
     first, second = tmp_path / "all" / 'b "1"' / "plate", tmp_path / "all" / "c" / "plate"
     for folder in (first, second):
         folder.mkdir(parents=True)

@@ -16,8 +16,8 @@ import pytest
 
 from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
-from sfm.cli.commands.inspecting import view
-from sfm.cli.commands.matching import match_command
+from sfm.cli.commands.view import view
+from sfm.cli.single_photograph_inputs import match_command
 from sfm.model.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import LINE, MAX_PICTURES

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from sfm.cli.commands.matching import read_tasks
-from sfm.cli.commands.measuring import resect as resect_command
+from sfm.cli.commands.resect import resect as resect_command
+from sfm.cli.single_photograph_inputs import read_tasks
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.report.single_photographs import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS

@@ -19,7 +19,7 @@ from adapters.colmap.refined_model import open_model
 from datasets.textured import render
 from sfm.adjustment.quality import correlations as error_correlation
 from sfm.adjustment.result import ErrorCorrelation
-from sfm.cli.commands.solvers import refine
+from sfm.cli.commands.refine import refine
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.model.camera import camera_from_values, project, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray

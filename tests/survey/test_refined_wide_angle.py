@@ -12,7 +12,7 @@ import pytest
 
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.reconstruction import colmap_parameters
-from sfm.cli.commands.solvers import refine
+from sfm.cli.commands.refine import refine
 from sfm.model.camera import Camera, project, tangents_from_pixel
 from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.estimate import Estimate

@@ -9,8 +9,9 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import fields, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from adapters.formats.result_tables import write_tables
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.cli import app
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.matching.tracks.interest import natural_points
@@ -122,6 +124,18 @@ def scene(folder: Path) -> Path:
     return path
 
 
+def lengths(folder: Path) -> Path:
+    path = folder / "lengths.csv"
+    path.write_text("line,from,to,length,sigma\n1,1,2,1,0.001\n", encoding="utf-8")
+    return path
+
+
+def plan(folder: Path) -> Path:
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        assert commands.kolinear("plan", "network", "plate:1000,700", *PLANNED, "--out", folder / "plan") == 0
+    return folder / "plan"
+
+
 PLANNED = (
     "--camera",
     "full-frame-24",
@@ -175,9 +189,16 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("epochs", *results(f)),
         ("out", "out/epochs", "out/.epochs.lock"),
     ),
-    "plan": (
+    "plan network": (
         lambda f: ("plan", "network", "plate:1000,700", *PLANNED),
         ("out", "out/plan", "out/.plan.lock"),
+    ),
+    "plan simulate": (lambda f: ("plan", "simulate", plan(f)), ("out", "out/simulation")),
+    "plan more": (lambda f: ("plan", "more", results(f)[0]), ("out", "out/more")),
+    "measure": (lambda f: ("measure", results(f)[0]), ("out", "out/measurement")),
+    "accept": (
+        lambda f: ("accept", results(f)[0], lengths(f), "--limit-a", 1),
+        ("out", "out/acceptance"),
     ),
     "refine": (lambda f: ("refine", model(f), "--images", f, "--out", "new/a"), ("new", "new/a")),
     "render": (
@@ -199,6 +220,18 @@ COMMANDS: dict[str, Command] = {
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
 }
+
+
+def test_every_command_that_writes_is_here() -> None:
+    """Each command of the app with an option --out."""
+    root = app.commands()
+    for row in app.COMMANDS:
+        command: Any = root
+        for word in row.words.split():
+            command = command.commands[word]
+        writes = any("--out" in parameter.opts for parameter in command.params)
+        listed = any(name.startswith(row.words) for name in COMMANDS)
+        assert listed or not writes, row.words
 
 
 @pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])

@@ -13,7 +13,7 @@ from adapters.colmap.camera_models import read_model, write_model
 from adapters.colmap.reconstruction import AXES
 from adapters.formats.registry import read_content, write_content
 from sfm.adjustment.solve import adjust
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.comparison.camera_conversion import convert_cameras
 from sfm.model.errors import SurveyFileError
 from tests.rigs import make_rig

@@ -13,7 +13,7 @@ from adapters.formats.content import KINDS, Content, losses
 from adapters.formats.registry import FORMATS, format_named, read_content, write_content
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.model.errors import SurveyFileError
 from sfm.model.network import (
     ExteriorObservations,

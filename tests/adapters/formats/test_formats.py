@@ -31,7 +31,7 @@ from adapters.formats.registry import (
     write_any,
 )
 from adapters.formats.sba_text import read_sba_text, write_sba_text
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.comparison.camera_conversion import convert_camera, convert_cameras, undistort
 from sfm.comparison.significance import compare_results
 from sfm.comparison.solutions import reprojection

@@ -14,7 +14,7 @@ from adapters.formats.photomodeler import read_export, read_photomodeler, write_
 from adapters.formats.registry import format_named, write_any
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.model.camera import camera_from_values, project, tangents_from_pixel
 from sfm.model.conventions import angles_from_rotation
 from sfm.model.errors import OutputError, SurveyFileError

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from adapters.formats.content import Content
 from adapters.formats.registry import write_content
 from adapters.formats.rig_files import rectify
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.comparison.camera_conversion import convert_cameras
 from sfm.model.camera import project
 from sfm.model.conventions import rotation_from_vector

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from adapters.formats.registry import read_any, read_comparable, write_any
 from adapters.formats.sba_text import read_sba_text, sba_files
 from sfm.adjustment.solve import adjust
-from sfm.cli.commands.solvers import convert
+from sfm.cli.commands.convert import convert
 from sfm.comparison.camera_conversion import convert_camera
 from sfm.comparison.significance import compare_results
 from sfm.model.camera import project

@@ -1,4 +1,4 @@
-"""Commands for one survey: run, adjust and init."""
+"""Runs of one survey and drafts of its file: what run, adjust, init and epochs share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.commands.starting import FAILED, compile_first, loading
+from sfm.cli.process import FAILED, compile_first, loading
 from sfm.model.errors import KolinearError, OutputError
 from sfm.runtime.faults import working_on
 
@@ -109,100 +109,17 @@ Weighted = Annotated[
 ]
 
 
-def run(
-    survey_file: SurveyOrPhotographs,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            "--images",
-            metavar="DIR",
-            help="Folder of the photographs, instead of the folder that the survey file states.",
-        ),
-    ] = None,
-    pitch: Pitch = None,
-    camera: Calibration = None,
-    camera_weighted: Weighted = False,
-    out: Out = None,
-    overwrite: Overwrite = False,
-    jobs: Jobs = None,
-    pictures_mb: PicturesMb = 15.0,
-    allow_outside: AllowOutside = False,
-    verbose: Verbose = False,
-) -> None:
-    """Run a survey from its photographs to the report.
-
-    If a folder is given, its survey.toml is run. If it has none, a survey file is drafted from the
-    photographs, written beside the result and run; edit it there and run it again with --images PHOTOS.
-
-    Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
-    reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
-    """
-    if survey_file.is_dir():
-        if images is not None:
-            raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
-        if (survey_file / SURVEY_FILE).is_file():
-            survey_file = survey_file / SURVEY_FILE
-            print(f"Running {survey_file}", file=sys.stderr)
-        else:
-            images = survey_file
-            survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite)
-            pitch = None
-    if survey_file.is_file():
-        refuse_pitch(pitch, survey_file)
-    options = _RunOptions(
-        images=images,
-        out=out,
-        jobs=jobs,
-        allow_outside=allow_outside,
-        verbose=verbose,
-        from_photographs=True,
-        camera=camera,
-        weighted=camera_weighted,
-        overwrite=overwrite,
-        pictures_mb=pictures_mb,
-    )
-    _run_survey(survey_file, options)
-
-
-def adjust(
-    survey_file: SurveyFile,
-    camera: Calibration = None,
-    camera_weighted: Weighted = False,
-    out: Out = None,
-    overwrite: Overwrite = False,
-    allow_outside: AllowOutside = False,
-    verbose: Verbose = False,
-) -> None:
-    """Run a survey from measured image points to the report.
-
-    [observations] in the survey file states the image points, which replace photographs.
-
-    Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
-    reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
-    """
-    options = _RunOptions(
-        out=out,
-        allow_outside=allow_outside,
-        verbose=verbose,
-        from_photographs=False,
-        camera=camera,
-        weighted=camera_weighted,
-        overwrite=overwrite,
-    )
-    _run_survey(survey_file, options)
-
-
 def run_file(survey_file: Path) -> Path:
     """Run a survey file, with photographs or without, and return its result folder, out/NAME.
 
     Args:
         survey_file: the survey file.
     """
-    return _run_survey(survey_file, _RunOptions(pictures_mb=15.0))
+    return run_survey_file(survey_file, RunOptions(pictures_mb=15.0))
 
 
 @dataclass(frozen=True)
-class _RunOptions:
+class RunOptions:
     """How a survey is run, and where its result is written."""
 
     images: Path | None = None  # folder of the photographs; None: that of the survey file
@@ -217,7 +134,7 @@ class _RunOptions:
     pictures_mb: float = 0.0  # largest size of the pictures in the report, 10^6 bytes
 
 
-def _run_survey(survey_file: Path, options: _RunOptions) -> Path:
+def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     """Run a survey, write and print its result, and return the result folder."""
     begun = time.perf_counter()
     with loading():
@@ -344,35 +261,6 @@ def _lock_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-def init(
-    photographs: Annotated[
-        Path, typer.Argument(metavar="PHOTOS", help="Folder that contains the photographs directly.")
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="FILE.toml",
-            help="File to write; an existing file is not replaced.  [default: PHOTOS/survey.toml]",
-        ),
-    ] = None,
-    pitch: Pitch = None,
-) -> None:
-    """Draft a survey file from a folder of photographs.
-
-    Cameras are recognised by the metadata of the photographs, and targets by measuring a few photographs. A
-    comment states the source of each value. Use kolinear run to measure and adjust the survey.
-    """
-    from sfm.files.whole_files import refuse_existing
-
-    file = photographs / "survey.toml" if out is None else out
-    refuse_existing(file)
-    draft = _draft_folder(photographs, pitch)
-    _write_draft(draft, photographs, file)
-    beside = file.parent.resolve() == photographs.resolve()
-    print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
-
-
 def drafted_beside(
     photographs: Path, out: Path | None, pitch: float | None, *, overwrite: bool = False
 ) -> tuple[Path, Path]:
@@ -412,7 +300,7 @@ def drafted_beside(
         refuse_pitch(pitch, file)
         print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
         return file, out
-    _write_draft(_draft_folder(photographs, pitch), photographs, file)
+    write_draft(draft_folder(photographs, pitch), photographs, file)
     return file, out
 
 
@@ -445,7 +333,13 @@ def refuse_pitch(pitch: float | None, file: Path) -> None:
         )
 
 
-def _draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
+def draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
+    """Return the draft of the survey file of a folder of photographs; measures some of them.
+
+    Args:
+        photographs: the folder.
+        pitch: pitch of a board or plate, mm; None to assume it.
+    """
     with loading():
         from sfm.products.drafting.draft import draft_survey
         from sfm.products.public_functions import one_blas_thread, sensor_widths
@@ -465,8 +359,17 @@ def _draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
     return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
-def _write_draft(draft: Draft, photographs: Path, file: Path) -> None:
-    """Write a drafted survey file with the folder of its photographs, and report findings on stderr."""
+def write_draft(draft: Draft, photographs: Path, file: Path) -> None:
+    """Write a drafted survey file with the folder of its photographs, and report findings on stderr.
+
+    Args:
+        draft: the draft.
+        photographs: folder of the photographs.
+        file: the file to write.
+
+    Raises:
+        OutputError: a name in the draft cannot be encoded.
+    """
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.model.remarks.verdict import lines_of

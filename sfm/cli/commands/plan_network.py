@@ -1,15 +1,13 @@
-"""Commands that plan a survey: target size, network, simulation, and photographs to add."""
+"""The command `plan network`: the precision that planned photographs will give."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.commands.planning_inputs import (
+from sfm.cli.planning_inputs import (
     PlannedSetup,
     bars_of,
     camera_of,
@@ -18,9 +16,8 @@ from sfm.cli.commands.planning_inputs import (
     stations_of,
     survey_plan,
 )
-from sfm.cli.commands.starting import loading
-from sfm.model.errors import GeometryError, SurveyFileError
-from sfm.products.planning import MIN_PIXELS
+from sfm.cli.process import loading
+from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
@@ -28,92 +25,9 @@ if TYPE_CHECKING:
     from sfm.products.planning.visibility import DepthOfField
 
 MAX_WEAK = 5  # weak points listed on the terminal
-plan = typer.Typer(name="plan", help="Plan a survey before the photographs are taken.")
 
 
-@plan.callback()
-def _plans() -> None:
-    """Plan a survey before the photographs are taken."""
-
-
-@plan.command("target-size")
-def target_size_command(
-    distance: Annotated[
-        float,
-        typer.Option(
-            "--distance", metavar="D", help="Largest distance from the camera, in the unit of --unit."
-        ),
-    ],
-    c: Annotated[float, typer.Option("--c-mm", metavar="MM", help="Principal distance (focal length), mm.")],
-    width: Annotated[float, typer.Option("--sensor-width-mm", metavar="MM", help="Width of the sensor, mm.")],
-    columns: Annotated[int, typer.Option("--width-px", metavar="N", help="Width of the photographs, px.")],
-    pixels: Annotated[
-        float, typer.Option("--pixels", metavar="P", help="Smallest number of pixels across a target.")
-    ] = MIN_PIXELS,
-    tilt: Annotated[
-        float,
-        typer.Option("--tilt-deg", metavar="DEG", help="Largest tilt of a target from its ray, degrees."),
-    ] = 0.0,
-    family: Annotated[
-        str, typer.Option("--family", help="Code family: ring12, ring14, ring20 or arcs.")
-    ] = "ring14",
-    unit: Annotated[
-        str, typer.Option("--unit", help="Unit of the distance: km, m, dm, cm, mm, um, nm, in or ft.")
-    ] = "mm",
-    diagram: Annotated[
-        Path | None,
-        typer.Option(
-            "--diagram",
-            metavar="FILE.svg",
-            help="Write a diagram of the diameter against the distance, up to --distance.",
-        ),
-    ] = None,
-) -> None:
-    """Compute how large targets must be for a camera and a distance.
-
-    diameter = pixels x sensor width x distance / (c x photograph width x cosine of the tilt)
-    """
-    with loading():
-        from sfm.files.whole_files import refuse_existing, whole_file
-        from sfm.model.conventions import METRES
-        from sfm.products.planning.visibility import compute_target_size
-        from sfm.targets.codes.plates import code_family
-        from sfm.targets.codes.rings import CodeFamily
-
-    if diagram is not None:
-        if diagram.suffix.lower() != ".svg":
-            raise SurveyFileError(f"--diagram {diagram}: expected a file .svg")
-        refuse_existing(diagram)
-    if unit not in METRES:
-        raise SurveyFileError(f"--unit {unit}: expected one of {', '.join(METRES)}")
-    if METRES[unit] * distance <= c / 1000:
-        raise SurveyFileError(
-            f"--distance {distance:g} {unit}: not larger than the principal distance of {c:g} mm; expected "
-            "the distance of the object; --unit sets its unit"
-        )
-    codes = code_family(family)
-    if not isinstance(codes, CodeFamily):
-        raise SurveyFileError(f"--family {family}: expected a family of rings, such as ring14")
-    size = compute_target_size(
-        p=pixels, w_mm=width, d=distance, c_mm=c, n=columns, tilt_deg=tilt, ring_per_dot=codes.outer
-    )
-    print(f"diameter of the dot   {size.diameter:.4g} {unit}, {pixels:g} px across at {tilt:g} deg tilt")
-    print(f"ring of the code      {size.ring:.4g} {unit} outer diameter ({codes.name})")
-    print(f"a pixel at the object {size.pixel:.4g} {unit}")
-    if diagram is not None:
-        from sfm.products.planning.page import DIAGRAM_PIXELS, design_diagram
-
-        drawn = design_diagram(
-            lines=sorted({*DIAGRAM_PIXELS, pixels}),
-            w_mm=width, d=distance, c_mm=c, n=columns, unit=unit, tilt_deg=tilt,
-        )  # fmt: skip
-        with whole_file(diagram) as part:
-            part.write_bytes(drawn)
-        print(f"diagram               {diagram}")
-
-
-@plan.command("network")
-def network_command(
+def plan_network(
     planned: Annotated[
         str,
         typer.Argument(
@@ -352,109 +266,3 @@ def _depth_of_field(
     confusion = 2 * pixel if confusion_um is None else confusion_um / 1000
     in_mm = depth_of_field(Lens(f_number, focus * to_mm, confusion), camera.c_px * pixel)
     return DepthOfField(in_mm.near / to_mm, in_mm.far / to_mm, focus)
-
-
-def simulate_command(
-    folder: Annotated[Path, typer.Argument(metavar="PLAN", help="Folder written by `plan network`.")],
-    codes: Annotated[str, typer.Option("--family", help="Code family of the targets.")] = "ring14",
-    image_points: Annotated[
-        bool, typer.Option("--image-points", help="Simulate image points instead of photographs.")
-    ] = False,
-    seed: Annotated[int, typer.Option("--seed", metavar="S", min=0, help="Seed of the noise.")] = 0,
-    out: Annotated[
-        Path,
-        typer.Option("--out", metavar="DIR", help="Folder for the photographs, survey file and result."),
-    ] = Path("out/simulation"),
-) -> None:
-    """Render the photographs of a plan, run the survey, and compare it with the prediction.
-
-    The points become targets; the rig, scale bars and observations have errors as planned. Predicted standard
-    deviations are compared with the achieved ones and with the true errors.
-    """
-    with loading():
-        from sfm.files.open_folders import locked, refuse_foreign_folder
-        from sfm.files.whole_files import remove_leftovers, whole_folder
-        from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-        from sfm.products.public_functions import run_survey
-
-    refuse_foreign_folder(out)
-    with working_on(str(folder)):
-        planned = read_plan(folder)
-        family = None if image_points else codes
-        with locked(out.parent / f".{out.name}.lock", out):
-            remove_leftovers(out)
-            with whole_folder(out, "the simulation", replaceable=True) as part:
-                survey = write_simulation(planned, part, codes=family, seed=seed)
-                result = run_survey(survey, compare_with="none", progress=True)
-                result.write(part / "result")
-                (part / ".result.lock").unlink(missing_ok=True)
-                achieved = compare_with_plan(planned, family, result, seed=seed)
-                text = json.dumps(asdict(achieved), indent=2, allow_nan=False)
-                (part / "simulation.json").write_text(f"{text}\n", encoding="utf-8")
-    print(f"{achieved.points} of {achieved.planned} planned points measured")
-    print(f"sigma of points: {achieved.ratio:.3f} times the predicted (median)")
-    print(f"true errors: {achieved.error_ratio_squared**0.5:.3f} times the predicted, RMS")
-    print(
-        f"sigma of an image coordinate: {achieved.sigma_px:.4f} px, predicted {achieved.predicted_px:.4f} px"
-    )
-    if achieved.mount_ratio_squared is not None:
-        rms = achieved.mount_ratio_squared**0.5
-        print(f"true errors of mounts: {rms:.3f} times their standard deviations, RMS")
-    print(f"Report: {out / 'result' / 'report.html'}")
-
-
-def more_command(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
-    count: Annotated[
-        int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new photographs.")
-    ] = 3,
-    incidence: Annotated[
-        float,
-        typer.Option(
-            "--max-incidence-deg",
-            metavar="DEG",
-            help="Largest angle between a new ray and the mean ray of a point, degrees.",
-        ),
-    ] = 60.0,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")
-    ] = Path("out/more"),
-) -> None:
-    """Propose further photographs that improve the weakest points.
-
-    The proposed stations are about as far from the object as those of the survey. Obstacles that hide points
-    from there are not known.
-    """
-    with loading():
-        import numpy as np
-
-        from adapters.formats.control_tables import read_given
-        from adapters.formats.result_tables import read_result
-        from sfm.cli.console import exit_by, print_verdict
-        from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.products.planning.plan import further_photographs
-        from sfm.report.pages import page_of, write_declared
-        from sfm.runtime.progress import StageClock
-        from sfm.runtime.progress_bar import drawn_progress
-
-    refuse_foreign_folder(out)
-    with working_on(str(result)), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
-        stored = read_result(result)
-        given = read_given(result, stored.network)
-        seen = stored.network.image_points
-        stated = float(np.median(np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2) / 2)))
-        sigma = given.sigma0_px or stated
-        if not sigma > 0:
-            raise GeometryError("the standard deviation of its image points is not known")
-        network = replace(
-            stored.network, image_points=replace(seen, covariance=seen.covariance * (sigma / stated) ** 2)
-        ).with_given(given.bars)
-        further = further_photographs(
-            network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
-        )
-    page = page_of(further, result=stored)
-    path = write_declared(page, out)
-    print_verdict(page.verdict)
-    print(page.text)
-    print(f"Report: {path}")
-    exit_by(page.verdict)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from threadpoolctl import threadpool_limits
 
-from sfm.cli.commands.starting import FAILED, compile_first, loading
-from sfm.cli.commands.surveying import AllowOutside, PicturesMb, Verbose
+from sfm.cli.process import FAILED, compile_first, loading
+from sfm.cli.survey_runs import AllowOutside, PicturesMb, Verbose
 from sfm.model.errors import KolinearError, MissingLibraryError, one_line
 from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 from sfm.runtime.faults import FAULT

@@ -1,0 +1,72 @@
+"""The command `compare`: two results of one object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.process import loading
+from sfm.model.display import counted
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    pass
+
+
+def compare(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare with A.")],
+    align: Annotated[
+        str, typer.Option("--align", help="Align B to A by points, cameras, control or none.")
+    ] = "points",
+    control: Annotated[
+        str, typer.Option("--control", metavar="P,Q,R", help="Names of the points for --align control.")
+    ] = "",
+    a_format: Annotated[
+        str | None, typer.Option("--from-a", metavar="F", help="Format of A.  [default: by its content]")
+    ] = None,
+    b_format: Annotated[
+        str | None, typer.Option("--from-b", metavar="F", help="Format of B.  [default: by its content]")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
+    ] = Path("out/comparison"),
+) -> None:
+    """Compare two results.
+
+    Reports differences, their standard deviations, and which differences are significant.
+    """
+    with loading():
+        from adapters.formats.registry import read_comparable
+        from sfm.cli.console import exit_by, print_verdict
+        from sfm.comparison.findings import verdict_of_comparison
+        from sfm.comparison.significance import compare_results
+        from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.report.differences import describe_pairing, describe_scale, largest_difference
+        from sfm.report.pages import write_page
+
+    refuse_foreign_folder(out)
+    with working_on(str(a)):
+        first = read_comparable(a, a_format)
+    with working_on(str(b)):
+        second = read_comparable(b, b_format)
+    if first.name == second.name:
+        first, second = replace(first, name=str(a)), replace(second, name=str(b))
+    names = tuple(name.strip() for name in control.split(",") if name.strip())
+    comparison = compare_results(first, second, align=align, control=names)
+    place = {name: j for j, name in enumerate(first.network.points)}
+    xyz = first.estimate.points[[place[name] for name in comparison.points]]
+    page = write_page(comparison, out, xyz=xyz)
+    print(
+        f"{describe_pairing(comparison)}, {counted(len(comparison.images), 'common photograph')}; "
+        f"{describe_scale(comparison)}"
+    )
+    verdict = verdict_of_comparison(comparison)
+    print_verdict(verdict)
+    if comparison.points:
+        print(f"largest difference of a point: {largest_difference(comparison)}")
+    print(f"Report: {page}")
+    exit_by(verdict)

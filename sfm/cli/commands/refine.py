@@ -1,0 +1,137 @@
+"""The command `refine`, which measures the key points of a COLMAP model again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.process import FAILED, compile_first, loading
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    pass
+
+
+def refine(
+    model: Annotated[Path, typer.Argument(metavar="COLMAP_MODEL", help="Folder of cameras, images, points.")],
+    images: Annotated[Path, typer.Option("--images", metavar="DIR", help="Folder of its photographs.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="New folder for the refined model.  [default: beside the model]"
+        ),
+    ] = None,
+    window: Annotated[
+        int | None,
+        typer.Option(
+            "--window",
+            metavar="N",
+            help="Width of the windows, odd, 3 to 101 px.  [default: 15 or 11, whichever measures better]",
+        ),
+    ] = None,
+    min_correlation: Annotated[
+        float,
+        typer.Option(
+            "--min-correlation",
+            metavar="R",
+            help="Smallest correlation coefficient r between a window and its template, 0 to 1.",
+        ),
+    ] = 0.7,
+    fix: Annotated[
+        str,
+        typer.Option(
+            "--fix", metavar="NAMES", help="Interior parameters to hold fixed, such as f,fx,fy,cx,cy,k1."
+        ),
+    ] = "",
+    masks: Annotated[
+        Path | None,
+        typer.Option(
+            "--masks", metavar="DIR", help="Folder of masks, NAME.png for photograph NAME; black is ignored."
+        ),
+    ] = None,
+    survey: Annotated[
+        Path | None,
+        typer.Option(
+            "--survey",
+            metavar="FILE",
+            help="Survey file with coded targets, control and scale bars to add to the model.",
+        ),
+    ] = None,
+) -> None:
+    """Remeasure the key points of a COLMAP model.
+
+    Key points are measured by least squares matching, then the model is adjusted again. The new model keeps
+    identifiers, colours, camera models, rigs and points with two rays. Its folder has a page,
+    refinement.html, and the standard deviations of points, photographs and cameras (sigma_*.csv).
+
+    The principal point is also estimated if a camera took four or more photographs; hold it fixed with
+    --fix cx,cy. With a survey file, the coded targets that it describes are measured and adjusted with the
+    key points; its control and scale bars define the frame and scale of the model.
+    """
+    with loading():
+        from adapters.colmap.camera_models import write_scene
+        from adapters.colmap.refined_model import (
+            interior_rows,
+            key_points_of,
+            open_model,
+            place_model,
+            update_model,
+        )
+        from sfm.files.whole_files import refuse_unwritable, whole_folder
+        from sfm.products.refining.oriented_windows import measure_model_targets
+        from sfm.products.refining.page import Numbers, describe_key_points
+        from sfm.products.refining.refinement import RefineSettings, refine_model, refinement_text
+        from sfm.report.pages import page_of, texts_of
+        from sfm.runtime.progress_bar import drawn_progress
+        from sfm.survey.inputs.settings import AdjustSettings
+        from sfm.survey.inputs.survey import read_survey
+
+    out = model.resolve().with_name(f"{model.resolve().name}_refined") if out is None else out
+    refuse_unwritable(out)
+    with working_on(str(model)):
+        opened = open_model(model)
+        given = None if survey is None else read_survey(survey)
+    compile_first()
+    with working_on(str(model)), drawn_progress() as progress:
+        targets = None
+        if given is not None:
+            targets = measure_model_targets(given, opened.network, opened.estimate, images, progress=progress)
+            opened, targets = place_model(opened, targets.placement), targets.placed()
+        refinement = refine_model(
+            opened.network,
+            opened.estimate,
+            images,
+            RefineSettings(
+                window,
+                min_correlation,
+                fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
+                masks_dir=masks,
+                false_alarm=(AdjustSettings() if given is None else given.adjust).false_alarm,
+            ),
+            targets=targets,
+            progress=progress,
+        )
+    a = refinement.adjustment
+    interior = interior_rows(opened, refinement.start, refinement.estimate, a.covariance.interior)
+    update_model(
+        opened,
+        refinement.estimate,
+        xy=refinement.xy,
+        measured=refinement.accepted,
+        images=refinement.images,
+        points=refinement.points_anew,
+    )
+    numbers = Numbers(opened.image_ids, opened.point_ids, interior, *key_points_of(opened))
+    print(refinement_text(refinement), end="")
+    page = page_of(refinement, numbers=numbers, title=model.resolve().name)
+    with whole_folder(out) as folder:
+        write_scene(folder, opened.scene)
+        for name, text in texts_of(page).items():
+            (folder / name).write_text(text, encoding="utf-8")
+    print(describe_key_points(refinement, numbers))
+    print(f"Model: {out}")
+    print(f"Report: {out / 'refinement.html'}")
+    if not refinement.dependable:
+        raise SystemExit(FAILED)

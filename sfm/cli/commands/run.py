@@ -1,0 +1,86 @@
+"""The command `run`: from photographs to the report."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.model.errors import KolinearError
+
+if TYPE_CHECKING:
+    pass
+from sfm.cli.survey_runs import (
+    SURVEY_FILE,
+    AllowOutside,
+    Calibration,
+    Jobs,
+    Out,
+    Overwrite,
+    PicturesMb,
+    Pitch,
+    RunOptions,
+    SurveyOrPhotographs,
+    Verbose,
+    Weighted,
+    drafted_beside,
+    refuse_pitch,
+    run_survey_file,
+)
+
+
+def run(
+    survey_file: SurveyOrPhotographs,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Folder of the photographs, instead of the folder that the survey file states.",
+        ),
+    ] = None,
+    pitch: Pitch = None,
+    camera: Calibration = None,
+    camera_weighted: Weighted = False,
+    out: Out = None,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+    pictures_mb: PicturesMb = 15.0,
+    allow_outside: AllowOutside = False,
+    verbose: Verbose = False,
+) -> None:
+    """Run a survey from its photographs to the report.
+
+    If a folder is given, its survey.toml is run. If it has none, a survey file is drafted from the
+    photographs, written beside the result and run; edit it there and run it again with --images PHOTOS.
+
+    Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
+    reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
+    """
+    if survey_file.is_dir():
+        if images is not None:
+            raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
+        if (survey_file / SURVEY_FILE).is_file():
+            survey_file = survey_file / SURVEY_FILE
+            print(f"Running {survey_file}", file=sys.stderr)
+        else:
+            images = survey_file
+            survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite)
+            pitch = None
+    if survey_file.is_file():
+        refuse_pitch(pitch, survey_file)
+    options = RunOptions(
+        images=images,
+        out=out,
+        jobs=jobs,
+        allow_outside=allow_outside,
+        verbose=verbose,
+        from_photographs=True,
+        camera=camera,
+        weighted=camera_weighted,
+        overwrite=overwrite,
+        pictures_mb=pictures_mb,
+    )
+    run_survey_file(survey_file, options)
