@@ -83,6 +83,12 @@ class AdjustmentOptions:
         tolerance: |A dx| / |v| at which the iteration has converged.
         redundancy_numbers: whether to compute redundancy numbers and standardised residuals, if there is a
             covariance.
+
+    Example:
+        >>> import sfm
+        >>> few = sfm.AdjustmentOptions(max_iterations=0)
+        >>> sfm.adjust(result.network, result.estimate, options=few).iterations
+        0
     """
 
     sigma_px: float = 0.1

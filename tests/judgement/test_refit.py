@@ -175,7 +175,7 @@ def test_another_network_is_adjusted_as_the_plain_one(a: Adjustment, monkeypatch
         plain = replace(a, datum=datum, test_alpha=1e-4, false_alarm=0.02)
         readjusted(plain, a.network, replace(a, rejected=rejected))
         assert given["datum"].kind == datum
-        assert (given["alpha"], given["false_alarm"], given["reject"]) == (1e-4, 0.02, "tau")
+        assert (given["options"].alpha, given["false_alarm"], given["reject"]) == (1e-4, 0.02, "tau")
         np.testing.assert_array_equal(given["rejected"], rejected)
 
 

@@ -60,6 +60,13 @@ class Reference:
         return GivenModel(v, 1e-6 * np.eye(m), np.diag(sigma**2), A, np.arange(m), 300), of
 
 
+class WithoutRows:
+    """A network that has none of the rows."""
+
+    def with_given(self, further: Any) -> WithoutRows:
+        return self
+
+
 @pytest.fixture
 def right(monkeypatch: pytest.MonkeyPatch) -> list[Rows]:
     """What is judged before the tables; nothing at first."""
@@ -69,7 +76,7 @@ def right(monkeypatch: pytest.MonkeyPatch) -> list[Rows]:
 
 
 def judge() -> _Judge:
-    network: Any = SimpleNamespace()
+    network: Any = WithoutRows()
     reference: Any = Reference()
     return _Judge(network, reference, lambda _: None, LEVEL)  # type: ignore[arg-type, return-value]
 
@@ -81,13 +88,8 @@ def table(number: int, name: str, *v: float, mended: str = "", by: float = 0.0) 
 
 @pytest.fixture(autouse=True)
 def of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows in place of a kind of observations; the network has none of them."""
+    """Rows in place of a kind of observations."""
     monkeypatch.setattr(tables, "TableKind", Rows)
-    monkeypatch.setattr(
-        tables,
-        "replace",
-        lambda one, **parts: one if "observations" in parts else replace(one, **parts),
-    )
 
 
 def test_rows_that_fit_contradict_nothing(right: list[Rows]) -> None:
@@ -100,7 +102,7 @@ def test_rows_that_fit_contradict_nothing(right: list[Rows]) -> None:
 
 
 def _given() -> tuple[Any, Any, Any, float]:
-    return SimpleNamespace(), Reference(), lambda _: None, LEVEL
+    return WithoutRows(), Reference(), lambda _: None, LEVEL
 
 
 def test_single_rows_are_left_out(right: list[Rows]) -> None:

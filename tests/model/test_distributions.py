@@ -88,7 +88,7 @@ def test_the_tests_of_a_survey_have_its_levels() -> None:
         "survey/diagnosis/photograph_cameras.py": "a number of trials",
         "products/planning/": "a plan",
         "comparison/": "two results",
-        "cli/commands/solvers.py": "several results",
+        "cli/commands/epochs.py": "several results",
         "products/epochs/": "several results",
         "products/geometry/": "a shape",
     }

@@ -87,11 +87,7 @@ def other_solutions(
     base = search.adjusted(a.estimate)
     if base is None or base.redundancy < 1 or not base.vPv > 0:
         return ()
-    # With little redundancy v'Pv hardly tests the stated weights, and any other solution would pass. So the
-    # stated weights count like STATED_FREEDOM observations.
-    freedom = base.redundancy + STATED_FREEDOM
-    variance = (base.vPv + STATED_FREEDOM) / freedom
-    limit = 1 + float(variance * f_isf(a.levels.question, 1, freedom)) / base.vPv
+    limit = 1 + _allowed(base, a.levels.question) / base.vPv
     result = _Place(a)
     others: list[OtherSolution] = []
     tried = search.candidates(a.estimate, starts, base.vPv, limit, follow_c=bool(had_to_be_held))
@@ -118,6 +114,17 @@ def other_solutions(
         if ended is not None and ended.converged:
             others[0] = replace(others[0], estimate=ended.estimate, converges=True)
     return tuple(others)
+
+
+def _allowed(base: Adjustment, level: float) -> float:
+    """Return the largest excess of v'Pv of another solution.
+
+    With little redundancy v'Pv hardly tests the stated weights, and any other solution would pass. So the
+    stated weights count like STATED_FREEDOM observations.
+    """
+    freedom = base.redundancy + STATED_FREEDOM
+    variance = (base.vPv + STATED_FREEDOM) / freedom
+    return float(variance * f_isf(level, 1, freedom))
 
 
 def _weak(a: Adjustment) -> bool:

@@ -197,9 +197,9 @@ def _judged(task: Task) -> JudgedGiven:
         used = []
     network = network.with_given(scales.bars)
     for group in groups:
-        of = "control" if group.of == "control" else "exterior"
-        judged = group.as_judged(getattr(network, of), rescale=task.settings.rescale, used=group in used)
-        network = replace(network, **{of: judged})
+        given = network.control if group.of == "control" else network.exterior
+        judged = group.as_judged(given, rescale=task.settings.rescale, used=group in used)
+        network = network.with_given(judged)
     if len(used) < len(groups) and not (len(network.control) or len(network.exterior)):
         datum = Datum("free")
     remarks = tuple(said for group in groups for said in _remarks_on(task, group)) + scales.remarks
