@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm.files.csv_tables import read_table
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import MatchSettings
-from sfm.matching.correlation import MIN_CORRELATION
 from sfm.model.camera import camera_from_values, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray, pixel_from_image
 from sfm.model.errors import PhotographError, SurveyFileError
@@ -42,12 +40,10 @@ def match_command(
     *,
     point: str | None = None,
     points: Path | None = None,
-    template_px: int = 21,
-    min_correlation: float = MIN_CORRELATION,
+    settings: MatchSettings | None = None,
     as_json: bool = False,
     out: Path | None = None,
     picture: Path | None = None,
-    **how: Any,
 ) -> tuple[str, bool]:
     """Match points of two photograph files.
 
@@ -56,12 +52,10 @@ def match_command(
         right_path: photograph in which the points are searched for.
         point: "COL,ROW" in the left photograph, px; give either this or `points`.
         points: table of points, see `read_points_to_match`.
-        template_px: width of the template, px.
-        min_correlation: smallest correlation coefficient of a match.
+        settings: how they are matched.
         as_json: whether to return JSON instead of the table.
         out: file .csv or .json for the table, which is then not printed.
         picture: PNG file for the template, the matched patch and their difference.
-        how: further settings, see `sfm.matching.conjugate_patches.MatchSettings`.
 
     Returns:
         The text to print, and whether any point was matched.
@@ -72,8 +66,9 @@ def match_command(
     """
     if (point is None) == (points is None):
         raise SurveyFileError("match: give either --point COL,ROW or --points FILE")
-    if not 0.0 <= min_correlation <= 1.0:
-        raise SurveyFileError(f"match: --min-correlation {min_correlation:g}, expected 0 to 1")
+    settings = settings or MatchSettings()
+    if not 0.0 <= settings.min_correlation <= 1.0:
+        raise SurveyFileError(f"match: --min-correlation {settings.min_correlation:g}, expected 0 to 1")
     inputs = (left_path, right_path, *(() if points is None else (points,)))
     refuse_outputs(out, picture, inputs, as_json)
     if points is not None:
@@ -82,16 +77,10 @@ def match_command(
         names, xy, start = ("1",), _parse_point(str(point)), None
     left, right = _photograph("LEFT", left_path), _photograph("RIGHT", right_path)
     with whole_outputs(out, picture) as (table_file, picture_part):
-        matches = match_points(
-            left,
-            right,
-            xy,
-            MatchSettings(template_px=template_px, min_correlation=min_correlation, **how),
-            xy_right=start,
-        )
+        matches = match_points(left, right, xy, settings, xy_right=start)
         as_json = as_json or (out is not None and out.suffix.lower() == ".json")
         if picture_part is not None:
-            drawing = draw_patches(names, left, right, matches, template_px)
+            drawing = draw_patches(names, left, right, matches, settings.template_px)
             picture_part.write_bytes(picture_file(drawing))
         if table_file is not None:
             text = matches_json(names, matches) if as_json else matches_table(names, matches).csv

@@ -18,6 +18,7 @@ from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
 from sfm.cli.commands.view import view
 from sfm.cli.single_photograph_inputs import match_command
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.model.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.report.figures.overlays import LINE, MAX_PICTURES
@@ -126,7 +127,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_one_point_on_the_terminal(photographs: tuple[Path, Path]) -> None:
-    text, matched = match_command(*photographs, point="100,80", search_px=61)
+    text, matched = match_command(*photographs, point="100,80", settings=MatchSettings(search_px=61))
     assert matched
     header, line = text.splitlines()
     assert "sigma px" in header
@@ -137,13 +138,17 @@ def test_one_point_on_the_terminal(photographs: tuple[Path, Path]) -> None:
 @pytest.mark.parametrize("method", ["ncc", "lsm", "lsm8", "shift"])
 def test_json(photographs: tuple[Path, Path], method: str) -> None:
     found = json.loads(
-        match_command(*photographs, point="100,80", method=method, search_px=61, as_json=True)[0]
+        match_command(
+            *photographs, point="100,80", as_json=True, settings=MatchSettings(method=method, search_px=61)
+        )[0]
     )
     assert found["method"] == method
     entry = found["points"][0]
     assert entry["x_right_px"] == pytest.approx(100 + SHIFT[0], abs=0.25)
     assert entry["r"] > 0.9 and entry["reason"] == "" and entry["sx_px"] > 0
-    lost = json.loads(match_command(*photographs, point="2,2", method=method, as_json=True)[0])["points"][0]
+    lost = json.loads(
+        match_command(*photographs, point="2,2", as_json=True, settings=MatchSettings(method=method))[0]
+    )["points"][0]
     assert (
         lost["x_right_px"] is None
         and lost["covariance_px2"] is None
@@ -157,19 +162,25 @@ def test_tables_and_picture(photographs: tuple[Path, Path], tmp_path: Path) -> N
         "point,x_px,y_px,x_right_px,y_right_px\na,60,60,64,58\nb,100.5,80,104,78\n", encoding="utf-8"
     )
     out, picture = tmp_path / "out.csv", tmp_path / "patches.png"
-    line, _ = match_command(*photographs, points=table, search_px=41, out=out, picture=picture)
+    line, _ = match_command(
+        *photographs, points=table, out=out, picture=picture, settings=MatchSettings(search_px=41)
+    )
     assert line.startswith("2 of 2 points matched")
     rows = rows_of(out)
     assert [row["point"] for row in rows] == ["a", "b"]
     assert float(rows[1]["x_right_px"]) == pytest.approx(100.5 + SHIFT[0], abs=0.05)
-    as_json = json.loads(match_command(*photographs, points=table, search_px=41, as_json=True)[0])["points"]
+    as_json = json.loads(
+        match_command(*photographs, points=table, as_json=True, settings=MatchSettings(search_px=41))[0]
+    )["points"]
     assert [float(row["x_right_px"]) for row in rows] == [one["x_right_px"] for one in as_json]  # all digits
     drawn = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
     assert drawn.shape == (2 * (21 * 8 + LINE), 3 * 21 * 8 + 8)
     difference = drawn[LINE : LINE + 21 * 8, -21 * 8 :].astype(float)
     assert abs(difference.mean() - 128) < 10  # grey: the patches are the same but for noise
     # earlier outputs may be replaced, by a run of another kind of table or of other points, too
-    match_command(*photographs, point="100,80", search_px=61, out=out, picture=picture)
+    match_command(
+        *photographs, point="100,80", out=out, picture=picture, settings=MatchSettings(search_px=61)
+    )
     assert len(out.read_text(encoding="utf-8").splitlines()) == 2
     assert not list(tmp_path.glob(".*"))
 
@@ -229,11 +240,11 @@ def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -
     with pytest.raises(SurveyFileError, match="expected COL,ROW such as"):
         match_command(*photographs, point="12")
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
-        match_command(*photographs, point="80,80", template_px=20)
+        match_command(*photographs, point="80,80", settings=MatchSettings(template_px=20))
     with pytest.raises(GeometryError, match="method 'sift', expected one of"):
-        match_command(*photographs, point="80,80", method="sift")
+        match_command(*photographs, point="80,80", settings=MatchSettings(method="sift"))
     with pytest.raises(GeometryError, match="expected one of bilinear, bicubic, six_tap"):
-        match_command(*photographs, point="80,80", interpolation="nearest")
+        match_command(*photographs, point="80,80", settings=MatchSettings(interpolation="nearest"))
     with pytest.raises(PhotographError, match=r"LEFT \.: is a folder"):
         match_command(Path(), photographs[1], point="80,80")
     blocked = tmp_path / "blocked"

@@ -98,7 +98,7 @@ def match(
     """
     with loading():
         from sfm.cli.single_photograph_inputs import match_command
-        from sfm.matching.conjugate_patches import BACK_PX
+        from sfm.matching.conjugate_patches import BACK_PX, MatchSettings
 
     with working_on(f"{left} and {right}"):
         text, matched = match_command(
@@ -106,14 +106,16 @@ def match(
             right,
             point=point,
             points=points,
-            method=method,
-            template_px=template,
-            search_px=search,
-            equalise=equalise,
-            interpolation=interpolation,
-            min_correlation=min_correlation,
-            back_px=BACK_PX if back else None,
-            wide=wide,
+            settings=MatchSettings(
+                method=method,
+                template_px=template,
+                search_px=search,
+                equalise=equalise,
+                interpolation=interpolation,
+                min_correlation=min_correlation,
+                back_px=BACK_PX if back else None,
+                wide=wide,
+            ),
             as_json=as_json,
             out=out,
             picture=picture,
