@@ -33,9 +33,9 @@ from sfm.products.public_functions import read_result as read_result
 from sfm.products.public_functions import run_survey as run_survey
 from sfm.products.public_functions import write_result as write_result
 from sfm.survey.inputs.exterior_table import ObservedExterior as ObservedExterior
-from sfm.survey.inputs.given import KnownPoints as KnownPoints
-from sfm.survey.inputs.given import Observations as Observations
-from sfm.survey.inputs.given import ScaleBar as ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints as KnownPoints
+from sfm.survey.inputs.given_values import Observations as Observations
+from sfm.survey.inputs.given_values import ScaleBar as ScaleBar
 from sfm.survey.inputs.survey import CameraSetup as CameraSetup
 from sfm.survey.inputs.survey import Survey as Survey
 from sfm.survey.inputs.survey import read_survey as read_survey

@@ -18,7 +18,7 @@ from sfm.model.remarks.catalogue import given_values
 from sfm.model.remarks.remark import Remark
 from sfm.products.rendering.render import render_photographs
 from sfm.products.rendering.scene import CircularTargets, Faces, Marks, Optics, Scene, coded_ring, join_marks
-from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
+from sfm.survey.inputs.given_values import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.targets.codes.plates import code_family
 from sfm.targets.codes.rings import CodeFamily

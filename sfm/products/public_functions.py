@@ -27,7 +27,7 @@ from sfm.model.remarks.remark import Remark, remark
 from sfm.model.solution import Solution, solution_of
 from sfm.pipeline import run_survey as run_stages
 from sfm.products.inspection.features_file import read_features_file
-from sfm.products.inspection.measure import Measurement, measure_result
+from sfm.products.inspection.measurement import Measurement, measure_result
 from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
 from sfm.runtime.threads import cores

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.significance import InteriorDifference, ResultComparison
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted

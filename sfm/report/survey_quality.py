@@ -14,7 +14,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.distributions import POWER
 from sfm.report.findings import Findings
-from sfm.report.given import given_parts
+from sfm.report.given_residuals import given_parts
 from sfm.report.page import (
     Column,
     FoldedParts,

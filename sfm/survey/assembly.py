@@ -22,7 +22,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import Remark, remark
 from sfm.runtime.progress import StageClock
-from sfm.survey.adjusting.solution import SolvedSurvey
+from sfm.survey.adjusting.solved_survey import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.inputs.measurements import PhotographList, remarks_on_contradicting
 from sfm.survey.inputs.settings import Section

@@ -23,7 +23,7 @@ from sfm.model.observations.rigid_frames import RigidFrames
 from sfm.model.observations.tables import TABLES
 from sfm.model.remarks.remark import Remark, remark
 from sfm.survey.inputs.exterior_table import MIN_COS_PHI
-from sfm.survey.inputs.given import AXES, ScaleBar, refuse_tiny_sigmas
+from sfm.survey.inputs.given_values import AXES, ScaleBar, refuse_tiny_sigmas
 
 DISTANCE = "distance"
 

@@ -17,7 +17,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ScaleBars
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.diagnosis.codes_found import missing_plates, sides_not_found, small_codes
-from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import MAX_LENGTH_PER_SIGMA, TargetSettings
 from sfm.survey.inputs.start import network_of, scale_bars

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm.adjustment.solve import AdjustmentOptions, adjust
-from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.significance import compare_results
 from sfm.model.conventions import FloatArray, IntArray, rotation_from_vector
 from sfm.model.estimate import Estimate

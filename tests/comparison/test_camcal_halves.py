@@ -14,11 +14,11 @@ import pytest
 import sfm
 from adapters.formats.registry import format_named, read_comparable, write_any
 from sfm.comparison.camera_conversion import convert_cameras, undistort
-from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.significance import compare_results
 from sfm.model.remarks.remark import kinds_of
 from sfm.pipeline import run_survey
-from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 from tests.places import DATASETS, SHARED

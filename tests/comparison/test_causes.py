@@ -11,7 +11,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison import causes
 from sfm.comparison.causes import PointPairs, Row, find_cause, find_pattern, is_unrelated
-from sfm.comparison.findings import remarks_of_cause, verdict_of_comparison
+from sfm.comparison.comparison_remarks import remarks_of_cause, verdict_of_comparison
 from sfm.comparison.pairing import ROUNDING
 from sfm.comparison.significance import compare_results
 from sfm.model.conventions import UNITS, rotation_from_vector

@@ -15,8 +15,8 @@ from adapters.colmap.mapper import MapperBaseline
 from adapters.formats.result_tables import read_result, write_tables
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.congruency import congruency, motions
-from sfm.comparison.findings import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.solutions import compare_baseline, reprojection
 from sfm.comparison.stable_points import tests_in_datum as single_tests_in_datum

@@ -28,7 +28,7 @@ from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.exterior_table import read_observed_exterior
-from sfm.survey.inputs.given import (
+from sfm.survey.inputs.given_values import (
     read_control,
     read_exterior,
     read_image_points,

@@ -20,7 +20,7 @@ from PIL import Image
 from sfm.model.errors import KolinearError, PhotographError
 from sfm.photographs.exif import BOMB_PX_PER_BYTE, read_metadata
 from sfm.photographs.reading import read_photograph
-from sfm.survey.inputs.given import read_image_points
+from sfm.survey.inputs.given_values import read_image_points
 from sfm.survey.inputs.survey import read_survey
 from tests.fuzz.cases import Seed, make_seeds, mutated, run_case
 

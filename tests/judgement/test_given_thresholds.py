@@ -24,7 +24,7 @@ from sfm.model.network import Network, ScaleBars
 from sfm.model.remarks.remark import Remark, kinds_of, of_kind
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from tests.findings import findings_of
 from tests.survey import mistyped
 from tests.survey.mistyped import SIGMA, scene

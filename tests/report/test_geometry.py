@@ -21,7 +21,7 @@ from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary
-from sfm.survey.inputs.given import read_exterior, read_points
+from sfm.survey.inputs.given_values import read_exterior, read_points
 from tests.findings import findings_of
 from tests.places import SHARED
 from tests.synthetic import SIZE_PX, make_network, seed_of

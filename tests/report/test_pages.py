@@ -19,7 +19,7 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
-from sfm.comparison.findings import verdict_of_comparison
+from sfm.comparison.comparison_remarks import verdict_of_comparison
 from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.files.whole_files import remove_leftovers

@@ -20,7 +20,7 @@ from sfm.pipeline import run_survey
 from sfm.report.findings import Findings
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, seed_of

@@ -57,7 +57,7 @@ from sfm.report.phrases import (
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import summary, write_summary
-from sfm.survey.inputs.given import read_exterior, read_image_points, read_points
+from sfm.survey.inputs.given_values import read_exterior, read_image_points, read_points
 from sfm.targets.outlines import LIKELIEST_FIRST, Flag
 from tests.browser import Tab
 from tests.findings import findings_of

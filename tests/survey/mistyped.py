@@ -24,7 +24,7 @@ from sfm.model.remarks.remark import kinds_of
 from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import SIZE_PX, make_network, seed_of

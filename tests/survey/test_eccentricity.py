@@ -15,7 +15,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import of_kind
 from sfm.model.similarity import fit_similarity
-from sfm.survey.inputs.given import read_diameters
+from sfm.survey.inputs.given_values import read_diameters
 from sfm.survey.inputs.measurements import MeasuredPhotographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.targets.detect import Targets

@@ -22,7 +22,7 @@ from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary
-from sfm.survey.inputs.given import (
+from sfm.survey.inputs.given_values import (
     KnownPoints,
     ScaleBar,
     StartOrientations,

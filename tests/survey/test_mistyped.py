@@ -8,7 +8,7 @@ import pytest
 from sfm.model.remarks.remark import kinds_of
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from tests.survey.mistyped import CASES, NEVER_FOUND, SIGMA, given_of, mistyped, right, scene, study
 from tests.surveys import remarks_on_given, survey_of
 from tests.synthetic import seed_of

@@ -12,7 +12,7 @@ import pytest
 from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
-from sfm.survey.inputs.given import KnownPoints, Observations, StartOrientations
+from sfm.survey.inputs.given_values import KnownPoints, Observations, StartOrientations
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.photograph_names import NamedPhotographs, name_photographs
 from sfm.survey.inputs.settings import PointSettings

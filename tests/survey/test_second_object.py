@@ -22,7 +22,7 @@ from sfm.products.rendering.render import render_photographs
 from sfm.products.rendering.scene import CircularTargets, Faces, Optics, Scene, coded_ring, join_marks
 from sfm.survey.diagnosis.contradicting_codes import find_contested_codes
 from sfm.survey.diagnosis.lost_photographs import MOTION_POINTS, find_second_motion, find_second_objects
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from sfm.survey.inputs.measurements import Naming
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore

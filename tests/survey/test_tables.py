@@ -20,7 +20,7 @@ from sfm.model.remarks.remark import of_kind
 from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
 from sfm.report.tables.csv_files import write_tables as write_result_tables
-from sfm.survey.inputs.given import read_control, read_exterior, read_image_points
+from sfm.survey.inputs.given_values import read_control, read_exterior, read_image_points
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.sources.given import measure_given

@@ -14,9 +14,9 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import of_kind, remark
 from sfm.model.similarity import fit_similarity
-from sfm.survey.adjusting import solution
+from sfm.survey.adjusting import solved_survey
 from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
-from sfm.survey.adjusting.solution import SolvedSurvey
+from sfm.survey.adjusting.solved_survey import SolvedSurvey
 from sfm.survey.inputs.sources import MARKS, TEXTURE
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from sfm.survey.sources.source import Correspondences
@@ -97,10 +97,10 @@ def test_windows_show_another_place_where_targets_moved(monkeypatch: pytest.Monk
         for name in ("7", "17")
     ]
     monkeypatch.setattr(
-        solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
+        solved_survey, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved[0],))
     )
     twice = remark("two_places", point="9", distance=0.1, sigmas=9.0, photographs=["image 3"])
-    monkeypatch.setattr(solution, "explain_rejections", lambda *_, **__: (moved[1], twice))
+    monkeypatch.setattr(solved_survey, "explain_rejections", lambda *_, **__: (moved[1], twice))
     survey = survey_of(network, truth)
     matched = Correspondences(network, truth, np.full(POINTS, 2))
     of_targets = solve_survey(survey, matched).remarks
@@ -127,7 +127,9 @@ def test_a_named_point_among_windows_is_one(
     network = replace(network, image_points=seen, sources=(TEXTURE, MARKS))
     names = [network.points[j] for j in group]
     moved = remark("points_moved", points=names, distance=0.1, shift=9.0, wrong=1.0, **{"from": "image 5"})
-    monkeypatch.setattr(solution, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved,)))
+    monkeypatch.setattr(
+        solved_survey, "judge_alternatives", lambda *_, **__: JudgedAssumptions(causes=(moved,))
+    )
     found = solve_survey(survey_of(network, truth), Correspondences(network, truth, np.full(POINTS, 2)))
     assert [one.kind for one in found.remarks if one.kind in ("windows_elsewhere", "points_moved")] == [kind]
 

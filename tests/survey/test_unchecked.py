@@ -22,7 +22,7 @@ from sfm.model.similarity import Similarity
 from sfm.pipeline import run_survey
 from sfm.survey.inputs.checks.copies import same_photographs
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from tests.findings import findings_of
 from tests.given_figures import Figure
 from tests.surveys import remarks_on_given, survey_of

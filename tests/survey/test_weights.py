@@ -16,7 +16,7 @@ from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
 from sfm.report.phrases import describe_sigma0, describe_weights
 from sfm.report.survey_report import text_report
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.surveys import survey_of, write_observed_survey

@@ -12,7 +12,7 @@ from sfm.model.network import Network
 from sfm.model.remarks.remark import Remark
 from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from sfm.survey.observation_tables import ObservationTable
 from tests.findings import findings_of
 from tests.surveys import remarks_on_given, survey_of

@@ -42,7 +42,7 @@ def compare(
     with loading():
         from adapters.formats.registry import read_comparable
         from sfm.cli.console import exit_by, print_verdict
-        from sfm.comparison.findings import verdict_of_comparison
+        from sfm.comparison.comparison_remarks import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.report.differences import describe_pairing, describe_scale, largest_difference

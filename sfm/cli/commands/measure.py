@@ -15,7 +15,7 @@ from sfm.runtime.faults import working_on
 if TYPE_CHECKING:
     pass
 if TYPE_CHECKING:
-    from sfm.products.inspection.measure import Measurement
+    from sfm.products.inspection.measurement import Measurement
 
 MAX_PRINTED = 40  # distances, angles and heights on the terminal; quantities.csv lists all
 
@@ -49,7 +49,7 @@ def measure(
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.products.inspection.features_file import read_features_file
-        from sfm.products.inspection.measure import measure_result
+        from sfm.products.inspection.measurement import measure_result
         from sfm.products.inspection.page import describe_measured, parameter_rows, quantity_table
         from sfm.report.pages import write_page
         from sfm.report.phrases import with_sigma

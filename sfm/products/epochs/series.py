@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from sfm.comparison.findings import remarks_of_cause
+from sfm.comparison.comparison_remarks import remarks_of_cause
 from sfm.comparison.stable_points import critical_value, in_datum
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import BoolArray, FloatArray

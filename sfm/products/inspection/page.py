@@ -20,7 +20,7 @@ from sfm.products.geometry.alignment import Alignment
 from sfm.products.geometry.shapes.fit import ShapeFit
 from sfm.products.geometry.tolerance import DECISIONS, IN, OUT, Deviations
 from sfm.products.inspection.acceptance import Acceptance
-from sfm.products.inspection.measure import Measurement
+from sfm.products.inspection.measurement import Measurement
 from sfm.report.figures.plots import (
     BLUE,
     GREEN,

@@ -16,7 +16,7 @@ from sfm.model.remarks.verdict import judge
 from sfm.products.refining.oriented_windows import PREFIX
 from sfm.products.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
 from sfm.products.refining.windows import MIN_RAYS
-from sfm.report.given import given_parts
+from sfm.report.given_residuals import given_parts
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes, columns, file_columns
 from sfm.report.phrases import general, significant
 

@@ -21,7 +21,7 @@ from sfm.model.conventions import IntArray
 from sfm.model.estimate import Mounts
 from sfm.model.remarks.remark import Quantity, of_kind, remark
 from sfm.runtime.progress import report_step
-from sfm.survey.adjusting.solution import (
+from sfm.survey.adjusting.solved_survey import (
     SolvedSurvey,
     SurveyModel,
     log_likelihood_of_all,

@@ -30,7 +30,7 @@ from sfm.files.plain_text import Content, Name, Pixel, Side, read_json
 from sfm.model.camera import Camera
 from sfm.model.distortion.models import MODELS
 from sfm.model.errors import GeometryError, SurveyFileError
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from sfm.survey.inputs.settings import CameraSettings, PlateSettings, TargetSettings
 from sfm.targets.codes.plates import (
     GRIDS,

@@ -27,7 +27,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import InteriorObservations, Network
 from sfm.model.observations.pose import MountObservations
 from sfm.photographs.exif import Metadata
-from sfm.survey.inputs.given import StartCameras
+from sfm.survey.inputs.given_values import StartCameras
 from sfm.survey.inputs.settings import CameraSettings
 
 MIN_EIGENVALUE = 1e-12  # a matrix with a smaller eigenvalue is not a correlation matrix

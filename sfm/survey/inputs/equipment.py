@@ -30,7 +30,7 @@ from sfm.judgement.survey_result import PlacedEquipment
 from sfm.model.conventions import METRES, FloatArray
 from sfm.model.display import listed
 from sfm.model.errors import SurveyFileError
-from sfm.survey.inputs.given import ScaleBar
+from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.settings import (
     EquipmentSettings,
     Length,

@@ -17,7 +17,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.display import listed
 from sfm.model.errors import SurveyFileError
 from sfm.model.observations.pose import MountObservations
-from sfm.survey.inputs.given import (
+from sfm.survey.inputs.given_values import (
     ANGLES,
     AXES,
     SIGMAS_OF_ANGLES,

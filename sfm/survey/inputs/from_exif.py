@@ -16,7 +16,7 @@ from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import LocalSystem, SatellitePosition, local_coordinates, read_metadata
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import AXES
+from sfm.survey.inputs.given_values import AXES
 from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.survey import Survey

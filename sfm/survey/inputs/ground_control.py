@@ -28,7 +28,7 @@ from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
 from sfm.photographs.exif import SatellitePosition, local_coordinates
 from sfm.photographs.reading import SUFFIXES
-from sfm.survey.inputs.given import AXES, KnownPoints, Observations, known_points, read_control
+from sfm.survey.inputs.given_values import AXES, KnownPoints, Observations, known_points, read_control
 from sfm.survey.inputs.settings import ControlSettings
 
 ZONE = "(0?[1-9]|[1-5][0-9]|60)"

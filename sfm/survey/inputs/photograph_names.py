@@ -26,7 +26,7 @@ from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.exif import read_metadata
 from sfm.survey.inputs.cameras import cameras_of_image
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import Observations, StartOrientations
+from sfm.survey.inputs.given_values import Observations, StartOrientations
 from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import tables_of

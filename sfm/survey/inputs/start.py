@@ -14,7 +14,7 @@ from sfm.model.network import ExteriorObservations, ImagePoints, Network, Object
 from sfm.model.observations.pose import MountObservations
 from sfm.survey.inputs.cameras import refuse_unknown_cameras
 from sfm.survey.inputs.exterior_table import ObservedExterior
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from sfm.survey.inputs.sources import reads_photographs, tables_of
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import with_tables

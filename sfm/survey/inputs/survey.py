@@ -32,7 +32,7 @@ from sfm.survey.inputs.calibration import (
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.equipment import GivenEquipment, given_by, read_equipment
 from sfm.survey.inputs.exterior_table import ObservedExterior, mount_observations, read_observed_exterior
-from sfm.survey.inputs.given import (
+from sfm.survey.inputs.given_values import (
     Diameters,
     KnownPoints,
     Observations,

@@ -23,7 +23,7 @@ from sfm.model.remarks.remark import Remark, remark
 from sfm.photographs.masks import Masks
 from sfm.survey.inputs.cameras import camera_of_image, refuse_ungrouped, start_cameras
 from sfm.survey.inputs.checks.copies import same_photographs
-from sfm.survey.inputs.given import Observations
+from sfm.survey.inputs.given_values import Observations
 from sfm.survey.inputs.measurements import (
     NO_PHOTOGRAPHS,
     Measurements,

@@ -40,7 +40,7 @@ from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, Orientation
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
-from sfm.survey.inputs.given import Observations
+from sfm.survey.inputs.given_values import Observations
 from sfm.survey.inputs.measurements import NO_PHOTOGRAPHS, Measurements, PhotographList
 from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import GIVEN, MARKS

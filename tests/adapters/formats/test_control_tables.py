@@ -17,7 +17,7 @@ from sfm.model.errors import SurveyFileError
 from sfm.model.network import ImagePoints, Network
 from sfm.pipeline import run_survey
 from sfm.report.tables.csv_files import write_tables
-from sfm.survey.inputs.given import KnownPoints
+from sfm.survey.inputs.given_values import KnownPoints
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.surveys import survey_of

@@ -19,7 +19,7 @@ from sfm.model.errors import KolinearError
 from sfm.model.remarks.remark import kinds_of
 from sfm.model.solution import Solution
 from sfm.products.inspection.features_file import FeaturesFile, HeldSettings, read_features_file
-from sfm.products.inspection.measure import Measurement, measure_result
+from sfm.products.inspection.measurement import Measurement, measure_result
 from sfm.products.inspection.page import describe_measured
 from sfm.report.pages import write_page
 from tests.places import ROOT

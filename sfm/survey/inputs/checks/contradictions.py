@@ -18,7 +18,7 @@ from sfm.survey.inputs.calibration import (
     refuse_contradicting_plates,
     refuse_free_points_without_turn,
 )
-from sfm.survey.inputs.given import KnownPoints, ScaleBar
+from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from sfm.survey.inputs.settings import (
     LARGEST,
     MAX_GLOBS,
