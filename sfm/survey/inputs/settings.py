@@ -35,7 +35,6 @@ _NEEDED = {
     "greater_than": "more than {gt:g}",
     "greater_than_equal": "at least {ge:g}",
     "less_than_equal": "at most {le:g}",
-    "too_short": "at least {min_length}",
 }
 
 
@@ -386,6 +385,8 @@ def first_error(path: Path | str, text: str, error: ValidationError, section: ty
     elif kind == "too_long":
         most = counted(context["max_length"], "value")
         needed = most if context["max_length"] <= FEW else f"at most {most}"
+    elif kind == "too_short":
+        needed = f"at least {context['min_length']}"
     elif kind in _NEEDED:
         needed = _NEEDED[kind].format(**context)
     else:
