@@ -18,6 +18,7 @@ from sfm.model.network import empty_estimate as empty_estimate
 from sfm.model.similarity import Similarity as Similarity
 from sfm.model.similarity import fit_similarity as fit_similarity
 from sfm.model.solution import Solution as Solution
+from sfm.orientation.incremental.sequence import OrientSettings as OrientSettings
 from sfm.orientation.incremental.sequence import orient as orient
 from sfm.photographs.reading import read_photograph as read_photograph
 from sfm.products import epochs as epochs

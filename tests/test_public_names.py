@@ -64,7 +64,7 @@ PUBLIC = {
         "network_from_colmap",
         "project",
     ),
-    *("orient", "read_photograph", "read_result", "read_survey", "run_survey", "write_result"),
+    *("OrientSettings", "orient", "read_photograph", "read_result", "read_survey", "run_survey", "write_result"),
 }
 
 

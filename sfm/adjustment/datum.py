@@ -223,7 +223,7 @@ def _motions_of(
         open_motions = Vt[rank:].T
     else:
         open_motions = np.eye(7)
-    of_scale = [kind_observed.kind.name for kind_observed in observed if kind_observed.kind.needs_scale]
+    of_scale = [observed_kind.kind.name for observed_kind in observed if observed_kind.kind.needs_scale]
     if of_scale and np.abs(open_motions[6]).max(initial=0.0) > SCALE_OPEN:
         raise GeometryError(
             f"{of_scale[0]}: nothing gives the network a scale, in which their standard deviations are; "
@@ -364,21 +364,21 @@ def _seen_by_datum(
         poses[~layout.pose_free & pose_on[:, None]],
         fixed_mounts,
     ]
-    for kind_observed in observed:
-        point = kind_observed.point
+    for observed_kind in observed:
+        point = observed_kind.point
         if point is not None:
-            J = kind_observed.kind.linearise(state).J[0]
+            J = observed_kind.kind.linearise(state).J[0]
             moved = J @ points[point]
         else:
-            columns, J, _ = reduced_rows(kind_observed, layout, state)
-            met = kind_observed.kind.met(state)
+            columns, J, _ = reduced_rows(observed_kind, layout, state)
+            met = observed_kind.kind.met(state)
             at = H
             if met is not state.points:
                 at, kept = H.copy(), np.zeros((len(layout.kept), 3, 7))
                 _fill_motions(met[layout.kept], *_extent(state, cloud), kept)
                 at[layout.kept_start :] = kept.reshape(-1, 7)
             moved = J @ at[columns]
-        rows.append(moved[np.diagonal(kind_observed.weight, axis1=1, axis2=2) > 0])
+        rows.append(moved[np.diagonal(observed_kind.weight, axis1=1, axis2=2) > 0])
     return np.concatenate([row.reshape(-1, 7) for row in rows])
 
 

@@ -47,7 +47,7 @@ from sfm.adjustment.quality.statistics import (
     standardised_residuals,
 )
 from sfm.adjustment.result import Adjustment, Covariance
-from sfm.model.arguments import checked_arguments
+from sfm.model.arguments import checked_arguments, checked_fields
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.display import counted
 from sfm.model.distortion.models import MODELS, Role
@@ -67,7 +67,8 @@ MAX_LINEAR = 0.1
 SLOPES = {"huber": huber_slopes, "tukey": tukey_slopes}  # derivatives of psi of the M-estimators
 
 
-@dataclass(frozen=True)
+@checked_fields
+@dataclass(frozen=True, eq=False)
 class AdjustmentOptions:
     """Options of an adjustment that hardly any network needs.
 
@@ -110,7 +111,7 @@ def adjust(
     false_alarm: float = FALSE_ALARM,
     rejected: BoolArray | None = None,
     covariance: bool = True,
-    options: AdjustmentOptions | None = None,
+    options: AdjustmentOptions = AdjustmentOptions(),
 ) -> Adjustment:
     """Return the least-squares adjustment of a network.
 
@@ -130,7 +131,7 @@ def adjust(
             (k,). They return if they pass the test. The other options of `reject` start with all image
             points.
         covariance: whether to compute covariance and redundancy numbers; they are NaN otherwise.
-        options: further options; those of `AdjustmentOptions` by default.
+        options: further options.
 
     Raises:
         GeometryError: nothing to adjust, an unknown option, or datum points that cannot carry the datum.
@@ -143,7 +144,6 @@ def adjust(
         True
     """
     datum = Datum(datum) if isinstance(datum, str) else datum
-    options = options or AdjustmentOptions()
     method, sigma_px, alpha = options.method, options.sigma_px, options.alpha
     check_network(network, estimate)
     check_number("sigma_px", sigma_px, 0.0)
@@ -385,7 +385,7 @@ def _result(
         weights=np.take(weight, back, axis=0),
         inflation=factor,
         observed=tuple(
-            residuals_of_observed(of_kind, layout, optimum, Q) for of_kind in run.problem.observed
+            residuals_of_observed(observed_kind, layout, optimum, Q) for observed_kind in run.problem.observed
         ),
         datum_points=run.problem.datum.points,
         remarks=(*run.remarks, *_small_weight_remarks(layout, weight, network)),

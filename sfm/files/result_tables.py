@@ -251,7 +251,7 @@ def write_solution(
             for row in zip(camera.names, camera.parameters, sigma, camera.units, strict=True)
         ),
     )
-    names_of_points = (
+    names_of_rows = (
         [network.images[i] for i in seen.image],
         [network.points[j] for j in seen.point],
     )
@@ -259,7 +259,7 @@ def write_solution(
     sources = None if seen.source is None else [network.sources[k].name for k in seen.source.tolist()]
     IMAGE_POINTS.write(
         folder,
-        names_of_points,
+        names_of_rows,
         seen.xy,
         known(seen.stated_sigma),
         known(np.where(between == 0, np.nan, between)),  # 0 is an empty cell

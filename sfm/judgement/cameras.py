@@ -57,7 +57,7 @@ def _poorly_determined(result: SurveyResult) -> tuple[Remark, ...]:
             share, partners = sigma / abs(c), strong.get(f"{name} of camera {owner}")
             of_c = remark("c_hardly_determined", parameter=name, camera=owner, share=share, partners=partners)
             of_owner.setdefault(owner, unless_note(of_c))
-    return tuple(determined for remarks in of_owner.values() for determined in remarks)
+    return tuple(of_c for remarks in of_owner.values() for of_c in remarks)
 
 
 def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:

@@ -232,12 +232,12 @@ def match_turned(
             contain a similar patch. The template must then be unique in the left photograph within OWN_PX.
     """
     best, rival, second = _starts(left, right, xy_left, xy_right, by)
-    direct, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
-    swap = other.good & ~(direct.good & (direct.correlation >= other.correlation))
-    r = np.where(swap, other.correlation, direct.correlation)
+    first, other = (match_warped(left, right, xy_left, start, by) for start in (best, rival))
+    swap = other.good & ~(first.good & (first.correlation >= other.correlation))
+    r = np.where(swap, other.correlation, first.correlation)
     lesser, is_other = (
-        np.where(swap, direct.correlation, other.correlation),
-        np.where(swap, direct.good, other.good),
+        np.where(swap, first.correlation, other.correlation),
+        np.where(swap, first.good, other.good),
     )
     second = np.where(is_other, np.fmax(lesser, second), second)
     if not given:
@@ -246,11 +246,11 @@ def match_turned(
         )
         second = np.fmax(second, to_left.second)
     pixels = independent_pixels(grey_of(left), xy_left, by.template_px)
-    doubt = direct.good | other.good
+    doubt = first.good | other.good
     doubt &= ambiguous(r, second, pixels)
-    reason = np.where(swap, np.array(other.reason, dtype=object), np.array(direct.reason, dtype=object))
+    reason = np.where(swap, np.array(other.reason, dtype=object), np.array(first.reason, dtype=object))
     reason[doubt] = in_words(NccFlag, NccFlag.AMBIGUOUS)
-    chosen = direct.with_rows(np.flatnonzero(swap), other.rows(swap))
+    chosen = first.with_rows(np.flatnonzero(swap), other.rows(swap))
     return replace(chosen, second=second, reason=tuple(reason.tolist()))
 
 

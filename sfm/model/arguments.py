@@ -98,7 +98,7 @@ def checked_fields(cls: type[R]) -> type[R]:
     """Return a dataclass whose fields are checked against their annotations when it is made.
 
     Args:
-        cls: dataclass of settings, without arrays.
+        cls: dataclass of settings; arrays stay as they are given.
 
     Raises:
         GeometryError: the class is called with a value of another type.

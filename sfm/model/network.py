@@ -203,6 +203,19 @@ class Network:
         named[self.image_points.point[lasting]] = True
         return named
 
+    def __post_init__(self) -> None:
+        """Order the observations: the sets of `SETS`, then the others.
+
+        Raises:
+            GeometryError: there are two sets of one kind.
+        """
+        sets = [[given for given in self.observations if isinstance(given, kind)] for kind in SETS]
+        for of_kind in sets:
+            if len(of_kind) > 1:
+                raise GeometryError(f"{of_kind[0].name}: {len(of_kind)} sets, expected one")
+        ordered = (*(of_kind[0] for of_kind in sets if of_kind), *self.further)
+        object.__setattr__(self, "observations", ordered)
+
     def of_kind(self, kind: type[K]) -> K:
         """Return the set of observations of a kind, which is empty if there is none."""
         return next((given for given in self.observations if isinstance(given, kind)), kind())
@@ -341,11 +354,21 @@ class Network:
         Args:
             sets: control, exterior or interior observations, or scale bars; an empty set removes them.
             further: observations of all other kinds, in place of the present ones; unchanged if None.
+
+        Raises:
+            GeometryError: one of the sets is of another kind, or two are of one kind.
         """
-        given = {type(kind): kind for kind in (*self.observations, *sets) if isinstance(kind, SETS)}
-        present = [given[kind] for kind in SETS if len(given.get(kind, ()))]
+        for given in sets:
+            if not isinstance(given, SETS):
+                name = getattr(given, "name", type(given).__name__)
+                raise GeometryError(f"{name}: not with_given, expected further or with_observations")
+        kept = [
+            present
+            for present in self.observations
+            if isinstance(present, SETS) and not any(isinstance(present, _kind_of(given)) for given in sets)
+        ]
         rest = self.further if further is None else tuple(further)
-        return replace(self, observations=(*present, *rest))
+        return replace(self, observations=(*kept, *(given for given in sets if len(given)), *rest))
 
     def with_observations(self, *kinds: Kind) -> Network:
         """Return the network with further observations, of kinds of `sfm.model.observations` or one's own.
@@ -444,6 +467,11 @@ class Network:
         )
         counts = [counted(count, what) for count, what in parts if count]
         return f"<Network: {', '.join(counts)}>"
+
+
+def _kind_of(given: Kind) -> type[Kind]:
+    """Return the kind of `SETS` that a set of observations is of."""
+    return next(kind for kind in SETS if isinstance(given, kind))
 
 
 def without_given(network: Network) -> Network:

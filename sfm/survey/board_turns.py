@@ -143,9 +143,10 @@ def _pairings(measured: Measurements, first: int, second: int) -> list[list[Pair
     ways = [[(numbers[0][k], numbers[1][k]) for k in sorted(numbers[0].keys() & numbers[1].keys())]]
     if len(names[0]) == len(names[1]):
         ways.append(list(zip(*names, strict=True)))
+    # without pairs whose photographs are not both measured
     return [
         [Pair(row[left], row[right]) for left, right in way if left in row and right in row] for way in ways
-    ]  # without pairs whose photographs are not both measured
+    ]
 
 
 def _common_rig(

@@ -197,7 +197,7 @@ def find_targets(
         noise=noise,
         scale=scale,
     )
-    reading = READINGS.get(type(family), _Reading())
+    reading = next((row for kind, row in READINGS.items() if isinstance(family, kind)), _Reading())
     reading.before(family, dots)
     duplicate, off_centre = find_duplicates(fit, outlines.sign, reason, code >= 0)
     reason[duplicate] = Flag.DUPLICATE

@@ -17,7 +17,7 @@ import pytest
 from adapters.formats.registry import write_any
 from adapters.formats.result_tables import read_result
 from sfm.cli.commands.view import view
-from sfm.cli.single_photograph_inputs import match_command
+from sfm.cli.matched_photographs import match_photographs
 from sfm.matching.conjugate_patches import MatchSettings
 from sfm.model.errors import GeometryError, OutputError, PhotographError, SurveyFileError
 from sfm.pipeline import run_survey
@@ -127,7 +127,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_one_point_on_the_terminal(photographs: tuple[Path, Path]) -> None:
-    text, matched = match_command(*photographs, point="100,80", settings=MatchSettings(search_px=61))
+    text, matched = match_photographs(*photographs, point="100,80", settings=MatchSettings(search_px=61))
     assert matched
     header, line = text.splitlines()
     assert "sigma px" in header
@@ -138,7 +138,7 @@ def test_one_point_on_the_terminal(photographs: tuple[Path, Path]) -> None:
 @pytest.mark.parametrize("method", ["ncc", "lsm", "lsm8", "shift"])
 def test_json(photographs: tuple[Path, Path], method: str) -> None:
     found = json.loads(
-        match_command(
+        match_photographs(
             *photographs, point="100,80", as_json=True, settings=MatchSettings(method=method, search_px=61)
         )[0]
     )
@@ -147,7 +147,7 @@ def test_json(photographs: tuple[Path, Path], method: str) -> None:
     assert entry["x_right_px"] == pytest.approx(100 + SHIFT[0], abs=0.25)
     assert entry["r"] > 0.9 and entry["reason"] == "" and entry["sx_px"] > 0
     lost = json.loads(
-        match_command(*photographs, point="2,2", as_json=True, settings=MatchSettings(method=method))[0]
+        match_photographs(*photographs, point="2,2", as_json=True, settings=MatchSettings(method=method))[0]
     )["points"][0]
     assert (
         lost["x_right_px"] is None
@@ -162,7 +162,7 @@ def test_tables_and_picture(photographs: tuple[Path, Path], tmp_path: Path) -> N
         "point,x_px,y_px,x_right_px,y_right_px\na,60,60,64,58\nb,100.5,80,104,78\n", encoding="utf-8"
     )
     out, picture = tmp_path / "out.csv", tmp_path / "patches.png"
-    line, _ = match_command(
+    line, _ = match_photographs(
         *photographs, points=table, out=out, picture=picture, settings=MatchSettings(search_px=41)
     )
     assert line.startswith("2 of 2 points matched")
@@ -170,7 +170,7 @@ def test_tables_and_picture(photographs: tuple[Path, Path], tmp_path: Path) -> N
     assert [row["point"] for row in rows] == ["a", "b"]
     assert float(rows[1]["x_right_px"]) == pytest.approx(100.5 + SHIFT[0], abs=0.05)
     as_json = json.loads(
-        match_command(*photographs, points=table, as_json=True, settings=MatchSettings(search_px=41))[0]
+        match_photographs(*photographs, points=table, as_json=True, settings=MatchSettings(search_px=41))[0]
     )["points"]
     assert [float(row["x_right_px"]) for row in rows] == [one["x_right_px"] for one in as_json]  # all digits
     drawn = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
@@ -178,7 +178,7 @@ def test_tables_and_picture(photographs: tuple[Path, Path], tmp_path: Path) -> N
     difference = drawn[LINE : LINE + 21 * 8, -21 * 8 :].astype(float)
     assert abs(difference.mean() - 128) < 10  # grey: the patches are the same but for noise
     # earlier outputs may be replaced, by a run of another kind of table or of other points, too
-    match_command(
+    match_photographs(
         *photographs, point="100,80", out=out, picture=picture, settings=MatchSettings(search_px=61)
     )
     assert len(out.read_text(encoding="utf-8").splitlines()) == 2
@@ -209,16 +209,16 @@ def test_nothing_but_earlier_outputs_is_written_over(
     for path, why in taken:
         both = {"out": tmp_path / "t.json", "picture": tmp_path / "p.png", option: path}
         with pytest.raises(OutputError, match=why):
-            match_command(left, right, points=points, **both)
+            match_photographs(left, right, points=points, **both)
         assert {p: p.read_bytes() for p in before} == before and link.is_symlink()
         assert not (tmp_path / "t.json").exists() and not (tmp_path / "p.png").exists()
     with pytest.raises(OutputError, match=r"needed \.json"):
-        match_command(left, right, points=points, out=tmp_path / "t.csv", as_json=True)
+        match_photographs(left, right, points=points, out=tmp_path / "t.csv", as_json=True)
 
 
 def test_no_match_is_written_with_its_reason(photographs: tuple[Path, Path], tmp_path: Path) -> None:
     out, picture = tmp_path / "t.json", tmp_path / "p.png"
-    line, matched = match_command(*photographs, point="2,2", out=out, picture=picture)
+    line, matched = match_photographs(*photographs, point="2,2", out=out, picture=picture)
     assert not matched and line.startswith("0 of 1 points matched")
     assert "outside" in json.loads(out.read_text(encoding="utf-8"))["points"][0]["reason"]
     assert cv2.imread(str(picture)) is not None
@@ -228,7 +228,7 @@ def test_picture_tells_how_many_it_leaves_out(photographs: tuple[Path, Path], tm
     table, picture = tmp_path / "points.csv", tmp_path / "p.png"
     rows = "".join(f"{k},{60 + k},80\n" for k in range(MAX_PICTURES + 1))
     table.write_text(f"point,x_px,y_px\n{rows}", encoding="utf-8")
-    match_command(*photographs, points=table, picture=picture)
+    match_photographs(*photographs, points=table, picture=picture)
     drawn = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
     assert len(drawn) == MAX_PICTURES * (21 * 8 + LINE) + LINE
     assert (drawn[-LINE:] < 100).any()  # the remark
@@ -236,21 +236,21 @@ def test_picture_tells_how_many_it_leaves_out(photographs: tuple[Path, Path], tm
 
 def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(SurveyFileError, match="either --point COL,ROW or --points FILE"):
-        match_command(*photographs)
+        match_photographs(*photographs)
     with pytest.raises(SurveyFileError, match="expected COL,ROW such as"):
-        match_command(*photographs, point="12")
+        match_photographs(*photographs, point="12")
     with pytest.raises(GeometryError, match="window of 20 px, needed an odd number"):
-        match_command(*photographs, point="80,80", settings=MatchSettings(template_px=20))
+        match_photographs(*photographs, point="80,80", settings=MatchSettings(template_px=20))
     with pytest.raises(GeometryError, match="method 'sift', expected one of"):
-        match_command(*photographs, point="80,80", settings=MatchSettings(method="sift"))
+        match_photographs(*photographs, point="80,80", settings=MatchSettings(method="sift"))
     with pytest.raises(GeometryError, match="expected one of bilinear, bicubic, six_tap"):
-        match_command(*photographs, point="80,80", settings=MatchSettings(interpolation="nearest"))
+        match_photographs(*photographs, point="80,80", settings=MatchSettings(interpolation="nearest"))
     with pytest.raises(PhotographError, match=r"LEFT \.: is a folder"):
-        match_command(Path(), photographs[1], point="80,80")
+        match_photographs(Path(), photographs[1], point="80,80")
     blocked = tmp_path / "blocked"
     blocked.touch()
     with pytest.raises(OutputError, match="cannot be written"):
-        match_command(*photographs, point="80,80", out=blocked / "o.csv")
+        match_photographs(*photographs, point="80,80", out=blocked / "o.csv")
     table = tmp_path / "points.csv"
     for text, why in (
         ("id,x\n1,2\n", "unknown column 'id', needed point,x_px,y_px"),
@@ -262,4 +262,4 @@ def test_bad_input_is_one_line(photographs: tuple[Path, Path], tmp_path: Path) -
     ):
         table.write_text(text, encoding="utf-8")
         with pytest.raises(SurveyFileError, match=why):
-            match_command(*photographs, points=table)
+            match_photographs(*photographs, points=table)

@@ -307,3 +307,35 @@ def test_rows_are_summed_by_their_index(shape: tuple[int, ...]) -> None:
     np.add.at(expected, index, values)
     np.testing.assert_array_equal(sum_rows(index, values, 9), expected)
     assert not sum_rows(index[:0], values[:0], 4).any()
+
+
+def test_a_network_has_one_set_of_each_kind_of_given_values_before_all_others() -> None:
+    network, truth = make_network(seed_of("check"), images=5, points=20)
+    control = ObjectPoints(np.arange(3), truth.points[:3], np.zeros((3, 3, 3)))
+    bars = ScaleBars(np.array([0]), np.array([1]), np.array([1.5]), np.array([1e-3]))
+    levels = HeightDifferences(np.array([0]), np.array([1]), np.array([[0.1]]), np.array([[1e-3]]))
+    mixed = replace(network, observations=(levels, bars, control))
+    assert [kind.name for kind in mixed.observations] == [
+        "control points",
+        "scale bars",
+        "height differences",
+    ]
+    assert mixed.control is control and mixed.scale_bars is bars and mixed.further == (levels,)
+    without = mixed.with_given(ObjectPoints())
+    assert not len(without.control) and without.scale_bars is bars and without.further == (levels,)
+    assert mixed.with_given(control.select(np.arange(2)), further=()).observations[1:] == (bars,)
+    for observations in ((control, control), (bars, levels, bars)):
+        with pytest.raises(GeometryError, match="2 sets, expected one"):
+            replace(network, observations=observations)
+    with pytest.raises(GeometryError, match="height differences: not with_given, expected further"):
+        network.with_given(levels)
+
+
+def test_a_set_of_a_derived_kind_is_the_set_of_its_kind() -> None:
+    class Surveyed(ObjectPoints):
+        """Control with a name of its own."""
+
+    network, truth = make_network(seed_of("check"), images=5, points=20)
+    control = ObjectPoints(np.arange(3), truth.points[:3], np.zeros((3, 3, 3)))
+    surveyed = Surveyed(np.arange(2), truth.points[:2], np.zeros((2, 3, 3)))
+    assert network.with_given(control).with_given(surveyed).observations == (surveyed,)

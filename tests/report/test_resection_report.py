@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.cli.commands.resect import resect as resect_command
-from sfm.cli.single_photograph_inputs import read_tasks
+from sfm.cli.resection_inputs import read_tasks
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.report.single_photographs import comparison_table, resection_json, resection_text
 from sfm.textbook.resection import METHODS

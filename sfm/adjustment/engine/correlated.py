@@ -149,14 +149,14 @@ def influence_of(optimum: Optimum, layout: Unknowns, weight: FloatArray) -> Infl
     B = motions.constraints.reshape(3 * n, d)
     of_datum = (motions.on_reduced - through @ B) @ motions.inverse.T
     Q = linear.cofactor()
-    identity = np.eye(layout.reduced + d)
-    identity[: layout.reduced, : layout.reduced] = Q
-    identity[: layout.reduced, layout.reduced :] = Q @ of_datum
+    unknowns = np.eye(layout.reduced + d)
+    unknowns[: layout.reduced, : layout.reduced] = Q
+    unknowns[: layout.reduced, layout.reduced :] = Q @ of_datum
     return Influence(
         linear,
         through,
         motions.constraints @ motions.inverse.T,
-        identity,
+        unknowns,
         motions.reduced,
         motions.points.reshape(3 * n, d),
     )

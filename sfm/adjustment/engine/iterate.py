@@ -247,16 +247,16 @@ def _solve(
         return None
     try:
         if last is not None:
-            step = _step(p, equations, last, motions)
-            if step.within(tolerance):
-                return step
+            tried = _step(p, equations, last, motions)
+            if tried.within(tolerance):
+                return tried
         for coarse in (True, False) if single else (False,):
             factored = p.solver.factor(equations, motions, damped=damping > 0, coarse=coarse)
             if factored is None:
                 continue
-            step = _step(p, equations, factored, motions)
-            if not (coarse and step.within(SINGLE_TOLERANCE)):
-                return step
+            tried = _step(p, equations, factored, motions)
+            if not (coarse and tried.within(SINGLE_TOLERANCE)):
+                return tried
     except DivergedError:
         return None
     return None

@@ -129,30 +129,30 @@ def _parameter_columns(layout: Unknowns, index: IntArray) -> IntArray:
 
 def count_of(observed: tuple[ObservedKind, ...]) -> int:
     """Return the number of scalar observations other than image points."""
-    return sum(of_kind.count for of_kind in observed)
+    return sum(observed_kind.count for observed_kind in observed)
 
 
 def vPv_of(observed: tuple[ObservedKind, ...], state: State) -> float:
     """Return v'Pv of the observations other than image points."""
-    return sum(of_kind.vPv(state) for of_kind in observed)
+    return sum(observed_kind.vPv(state) for observed_kind in observed)
 
 
-def reduced_rows(observed: ObservedKind, layout: Unknowns, state: State) -> Reduced:
+def reduced_rows(observed_kind: ObservedKind, layout: Unknowns, state: State) -> Reduced:
     """Return the derivatives of observations of a kind by the reduced unknowns, including kept points.
 
     Args:
-        observed: observations of one kind.
+        observed_kind: observations of one kind.
         layout: order of the unknowns.
         state: values of all unknowns.
     """
-    linear = observed.kind.linearise(state)
+    linear = observed_kind.kind.linearise(state)
     columns, parts = [], []
-    for block, J in zip(observed.kind.blocks(), linear.J, strict=True):
+    for block, J in zip(observed_kind.kind.blocks(), linear.J, strict=True):
         at, by = _of_block(block, layout, state)
         columns.append(at)
         parts.append(J @ by)
     reduced = Reduced(np.hstack(columns), np.concatenate(parts, axis=2), linear.difference)
-    return reduced if len(observed.weight) == len(observed.kind) else _together(reduced)
+    return reduced if len(observed_kind.weight) == len(observed_kind.kind) else _together(reduced)
 
 
 def _together(reduced: Reduced) -> Reduced:
@@ -233,22 +233,24 @@ def terms_of(
         gp: right-hand side of each object point, to add to, (n, 3).
     """
     rows, vPv = [], 0.0
-    for of_kind in observed:
-        point = of_kind.point
+    for observed_kind in observed:
+        point = observed_kind.point
         if point is not None:
-            linear = of_kind.kind.linearise(state)
+            linear = observed_kind.kind.linearise(state)
             l, J = linear.difference, linear.J[0]
-            JP = np.swapaxes(J, 1, 2) @ of_kind.weight
+            JP = np.swapaxes(J, 1, 2) @ observed_kind.weight
             np.add.at(V, point, JP @ J)
             np.add.at(gp, point, np.einsum("nud,nd->nu", JP, l))
         else:
-            reduced = reduced_rows(of_kind, layout, state)
+            reduced = reduced_rows(observed_kind, layout, state)
             l = reduced.l
-            rows.append((reduced, np.swapaxes(reduced.J, 1, 2) @ of_kind.weight))
-        vPv += float(np.einsum("na,nab,nb->", l, of_kind.weight, l))
+            rows.append((reduced, np.swapaxes(reduced.J, 1, 2) @ observed_kind.weight))
+        vPv += float(np.einsum("na,nab,nb->", l, observed_kind.weight, l))
     return Terms(tuple(rows), vPv)
 
 
 def couples_poses(observed: tuple[ObservedKind, ...]) -> bool:
     """Return whether any observations depend on two photographs each, which requires a full matrix."""
-    return any(sum(block.of == PHOTOGRAPH for block in of_kind.kind.blocks()) > 1 for of_kind in observed)
+    return any(
+        sum(block.of == PHOTOGRAPH for block in observed_kind.kind.blocks()) > 1 for observed_kind in observed
+    )

@@ -424,32 +424,32 @@ def standardised_of_given(
 
 
 def residuals_of_observed(
-    observed: ObservedKind, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
+    observed_kind: ObservedKind, layout: Unknowns, optimum: Optimum, cofactors: Cofactors | None
 ) -> ObservedResiduals:
     """Return the residuals of observations of a kind, with their redundancy numbers and tests.
 
     Args:
-        observed: observations of one kind.
+        observed_kind: observations of one kind.
         layout: order of the unknowns.
         optimum: undamped normal equations and their factor.
         cofactors: cofactors at the optimum; without them redundancy numbers and tests are NaN.
     """
-    linear = observed.kind.linearise(optimum.state)
+    linear = observed_kind.kind.linearise(optimum.state)
     shape = linear.difference.shape
-    l = linear.difference.reshape(observed.weight.shape[:2])
-    vPv = float(np.einsum("na,nab,nb->", l, observed.weight, l))
+    l = linear.difference.reshape(observed_kind.weight.shape[:2])
+    vPv = float(np.einsum("na,nab,nb->", l, observed_kind.weight, l))
     r, w, redundancy = np.full(shape, np.nan), np.full(shape, np.nan), float("nan")
     if cofactors is not None:
-        if observed.point is not None:
-            Q = linear.J[0] @ cofactors.points[observed.point] @ np.swapaxes(linear.J[0], 1, 2)
+        if observed_kind.point is not None:
+            Q = linear.J[0] @ cofactors.points[observed_kind.point] @ np.swapaxes(linear.J[0], 1, 2)
         else:
-            Q = _cofactors_of(reduced_rows(observed, layout, optimum.state), optimum, cofactors)
+            Q = _cofactors_of(reduced_rows(observed_kind, layout, optimum.state), optimum, cofactors)
         if linear.taken is not None:
             Q = Q + linear.taken
-        w, r = (part.reshape(shape) for part in standardised_of_given(l, observed.weight, Q))
-        redundancy = float(observed.components.sum() - np.einsum("nab,nba->", observed.weight, Q))
+        w, r = (part.reshape(shape) for part in standardised_of_given(l, observed_kind.weight, Q))
+        redundancy = float(observed_kind.components.sum() - np.einsum("nab,nba->", observed_kind.weight, Q))
     return ObservedResiduals(
-        observed.index, observed.rows, linear.difference, r, w, observed.count, vPv, redundancy
+        observed_kind.index, observed_kind.rows, linear.difference, r, w, observed_kind.count, vPv, redundancy
     )
 
 

@@ -122,10 +122,10 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     groups = np.zeros(len(a.rejected), dtype=np.int64)
     image = _components(a, network.image_points.covariance, groups, (IMAGE_POINTS,), few=FEW_OF_A_KIND)
     squares: dict[str, FloatArray] = {}
-    for of_kind in a.observed:
-        name = network.observations[of_kind.index].name
+    for observed_kind in a.observed:
+        name = network.observations[observed_kind.index].name
         squares[name] = squares.get(name, np.zeros(3)) + np.array(
-            [of_kind.vPv, of_kind.redundancy, of_kind.count]
+            [observed_kind.vPv, observed_kind.redundancy, observed_kind.count]
         )
     vPv, redundancies, count = np.array(list(squares.values())).reshape(-1, 3).T
     return VarianceComponents(
@@ -238,12 +238,15 @@ def estimate_common_part(
     return factor, max(common, MIN_SIGMA_PX)
 
 
-def _solve_nonnegative(S: FloatArray, solution: FloatArray) -> FloatArray:
-    """Return the solution of two normal equations, (2,), with 0 instead of a negative value."""
-    squares = np.linalg.solve(S, solution)
-    for on, other in ((0, 1), (1, 0)):
-        if squares[on] < 0:
-            squares[on], squares[other] = 0.0, solution[other] / S[other, other]
+def _solve_nonnegative(S: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution of two normal equations, (2,), with 0 instead of a negative value.
+
+    right: right-hand side of the equations, (2,).
+    """
+    squares = np.linalg.solve(S, right)
+    for row, other in ((0, 1), (1, 0)):
+        if squares[row] < 0:
+            squares[row], squares[other] = 0.0, right[other] / S[other, other]
     return np.asarray(squares)
 
 
@@ -270,7 +273,7 @@ def _cycle_start(tried: list[FloatArray], rejected: list[BoolArray], factor: Flo
     All rounds start from the same values, so the same factors lead to the same adjustments again.
     """
     for at in reversed(range(len(tried))):
-        others = any(not np.array_equal(rejected[at], earlier) for earlier in rejected[at + 1 :])
+        others = any(not np.array_equal(rejected[at], later) for later in rejected[at + 1 :])
         if others and np.abs(factor / tried[at] - 1).max() <= LAST_CHANGE:
             return at
     return None

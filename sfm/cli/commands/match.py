@@ -97,11 +97,11 @@ def match(
     --out and --picture replace only files that this command wrote. Exit code 1 if no point was matched.
     """
     with loading():
-        from sfm.cli.single_photograph_inputs import match_command
+        from sfm.cli.matched_photographs import match_photographs
         from sfm.matching.conjugate_patches import BACK_PX, MatchSettings
 
     with working_on(f"{left} and {right}"):
-        text, matched = match_command(
+        text, matched = match_photographs(
             left,
             right,
             point=point,

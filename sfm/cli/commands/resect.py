@@ -58,7 +58,7 @@ def resect(
     Uses one method, or all methods for a comparison.
     """
     with loading():
-        from sfm.cli.single_photograph_inputs import read_tasks
+        from sfm.cli.resection_inputs import read_tasks
         from sfm.report.single_photographs import (
             comparison_json,
             comparison_table,

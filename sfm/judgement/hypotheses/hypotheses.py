@@ -541,7 +541,7 @@ def best_explanation(plain: Adjustment) -> Cause | None:
         return None
 
 
-def _sample(network: Network, of_network: Estimate) -> tuple[Network, Estimate, BoolArray]:
+def _sample(network: Network, values: Estimate) -> tuple[Network, Estimate, BoolArray]:
     """Return a network of about MAX_IMAGE_POINTS image points, its estimate, and which these are.
 
     Points with many rays are preferred, and each photograph gets its share.
@@ -558,5 +558,5 @@ def _sample(network: Network, of_network: Estimate) -> tuple[Network, Estimate, 
                 np.add.at(count, images[j], 1)
     rows = points[seen.point]
     every = np.ones(m, dtype=bool)
-    part, estimate = reduce_network(network, of_network, every, points, np.ones_like(rows))
+    part, estimate = reduce_network(network, values, every, points, np.ones_like(rows))
     return part, estimate, rows

@@ -134,11 +134,11 @@ class OffsetDistances(Group):
         Planned distances are not measured yet, and their zeros do not mean that the constant cancels the
         lengths.
         """
-        exact = self
+        planned = self
         if not self.value.any():
             start, end = values.points[self.point[self.ends]].swapaxes(0, 1)
-            exact = replace(self, value=np.linalg.norm(end - start, axis=1)[:, None])
-        return super(OffsetDistances, exact).simulated(values, rng)
+            planned = replace(self, value=np.linalg.norm(end - start, axis=1)[:, None])
+        return super(OffsetDistances, planned).simulated(values, rng)
 
     def row_points(self, network: Names) -> list[tuple[str, ...]]:
         """Return the names of both points of each distance, (r,)."""

@@ -53,7 +53,7 @@ class Verdict:
     @property
     def summary(self) -> str:
         """Headline and numbers of remarks."""
-        counts = Counter(said.severity for said in self.remarks)
+        counts = Counter(remark.severity for remark in self.remarks)
         listed = ", ".join(counted(counts[severity], severity) for severity in SEVERITIES if counts[severity])
         return f"{self.headline} {listed}".rstrip()
 
@@ -65,7 +65,7 @@ class Verdict:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict for JSON."""
-        remarks = [said.as_dict() for said in self.remarks]
+        remarks = [remark.as_dict() for remark in self.remarks]
         tests = [test.as_dict() for test in self.tests]
         return {"headline": self.headline, "verdict": self.level, "remarks": remarks, "tests": tests}
 
@@ -84,26 +84,24 @@ def judge(remarks: Iterable[Remark], headlines: Mapping[Level, str]) -> Verdict:
         remarks: all remarks on the result, in reading order within a severity, and all tests.
         headlines: headline of each level for this kind of result.
     """
-    said = tuple(remarks)
-    tests = tuple(candidate for candidate in said if candidate.test is not None)
-    every = tuple(candidate for candidate in said if candidate.test is None)
+    given = tuple(remarks)
+    tests = tuple(remark for remark in given if remark.test is not None)
+    every = tuple(remark for remark in given if remark.test is None)
     every = tuple(
-        replace(candidate, at_least=_worst_explained(candidate, every))
-        for candidate in every
-        if not any(_explains(cause, candidate) for cause in every)
+        replace(remark, at_least=_worst_explained(remark, every))
+        for remark in every
+        if not any(_explains(cause, remark) for cause in every)
     )
-    order = tuple(
-        candidate for severity in SEVERITIES for candidate in every if candidate.severity == severity
-    )
+    order = tuple(remark for severity in SEVERITIES for remark in every if remark.severity == severity)
     level: Level = EFFECT[order[0].severity] if order else "good"
     return Verdict(level, headlines[level], order, tests)
 
 
-def _explains(cause: Remark, said: Remark) -> bool:
+def _explains(cause: Remark, remark: Remark) -> bool:
     """Return whether `cause` explains a remark; a note with a grade explains only other notes."""
     graded = not isinstance(cause.row.severity, str)
-    serious = cause.severity != "note" or said.severity == "note"
-    return said.kind in cause.row.explains and (serious or not graded)
+    serious = cause.severity != "note" or remark.severity == "note"
+    return remark.kind in cause.row.explains and (serious or not graded)
 
 
 def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
@@ -116,13 +114,13 @@ def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
     """Return the printed lines: the first remarks of each kind and severity, and the number of the others."""
     groups: dict[tuple[Severity, str], list[Remark]] = {}
-    for said in remarks:
-        groups.setdefault((said.severity, said.kind), []).append(said)
+    for remark in remarks:
+        groups.setdefault((remark.severity, remark.kind), []).append(remark)
     lines = []
     for (severity, _), same in groups.items():
         lines += [
-            Line(severity, listed.text, "" if k else listed.remedy, bool(listed.row.explains))
-            for k, listed in enumerate(same[:MAX_LISTED])
+            Line(severity, remark.text, "" if k else remark.remedy, bool(remark.row.explains))
+            for k, remark in enumerate(same[:MAX_LISTED])
         ]
         if len(same) > MAX_LISTED:
             lines.append(Line(severity, f"{len(same) - MAX_LISTED} more like these."))

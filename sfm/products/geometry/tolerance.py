@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sfm.model.arguments import check_indices, checked_arguments
+from sfm.model.arguments import check_indices, checked_arguments, checked_fields
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.errors import GeometryError
 from sfm.products.geometry.alignment import Nominal
@@ -29,6 +29,7 @@ DECISIONS = (IN, UNDECIDED, OUT, UNKNOWN)
 COVERAGE = 2.0  # k of the expanded uncertainty, for about 95 %
 
 
+@checked_fields
 @dataclass(frozen=True)
 class Tolerance:
     """Limits of deviations, and the certainty with which they must be kept."""
@@ -77,10 +78,14 @@ def deviations_from_points(
         chosen: indices of the points to judge; all with a nominal point if not given.
 
     Raises:
-        GeometryError: no nominal point was measured.
+        GeometryError: no nominal point was measured, or the tolerance has a lower limit.
 
     Source: ISO 14253-1:2017 for the decisions; law of propagation of covariances.
     """
+    if tolerance.lower > -np.inf:
+        raise GeometryError(
+            f"tolerance {tolerance.name}: lower = {tolerance.lower:g}, distances have no lower limit"
+        )
     if chosen is not None:
         check_indices("deviations_from_points: chosen", chosen, len(points.names))
     wanted = set(points.names if chosen is None else [points.names[j] for j in chosen])
@@ -174,7 +179,6 @@ def _judged(
     value: FloatArray,
     sigma: FloatArray,
     vector: FloatArray,
-    missing: tuple[str, ...] = (),
 ) -> Deviations:
     """Return deviations with the decision on each."""
     lower, upper, coverage = tolerance.lower, tolerance.upper, tolerance.coverage
@@ -190,7 +194,6 @@ def _judged(
         upper,
         coverage,
         decision,
-        missing,
     )
 
 

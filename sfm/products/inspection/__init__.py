@@ -1,4 +1,4 @@
 """Measurements in a finished result, as a features file requests them, and acceptance tests of the system.
 
-`measure.measure_result` is `kolinear measure`, `acceptance.accept_result` is `kolinear accept`.
+`measurement.measure_result` is `kolinear measure`, `acceptance.accept_result` is `kolinear accept`.
 """

@@ -383,18 +383,19 @@ class _Work:
         return Quantity(name, what, kind, float(function.value[0]), sigma, tuple(remarks))
 
     def tolerance(self, settings: ToleranceSettings) -> Deviations:
-        lower = -settings.upper if settings.lower is None else settings.lower
         coverage = settings.coverage or self.features.measure.coverage
         chosen = (
             None if settings.points is None else self.chosen(settings.points, f"tolerance {settings.name}")
         )
+        if settings.nominal is not None:
+            distance = Tolerance(settings.name, upper=settings.upper, coverage=coverage)
+            nominal = self.tables[settings.nominal]
+            return deviations_from_points(self.points, nominal, distance, chosen=chosen)
+        lower = -settings.upper if settings.lower is None else settings.lower
         tolerance = Tolerance(settings.name, lower, settings.upper, coverage)
         if settings.shape is not None:
             fit = self.shape_named(settings.shape, f"tolerance {settings.name}")
             return deviations_from_shape(self.points, fit, tolerance)
-        if settings.nominal is not None:
-            nominal = self.tables[settings.nominal]
-            return deviations_from_points(self.points, nominal, tolerance, chosen=chosen)
         assert settings.mesh is not None and chosen is not None
         if self.read_mesh is None:
             raise GeometryError(f"tolerance {settings.name}: nothing here reads the mesh {settings.mesh}")

@@ -377,12 +377,10 @@ def simulate_network(
         xy += np.einsum("kab,kb->ka", root, rng.standard_normal(xy.shape))
     values = values_of(truth)
     return (
-        replace(network, image_points=replace(seen, xy=xy)).with_given(
-            network.control.simulated(values, rng),
-            network.exterior.simulated(values, rng),
-            network.interior.simulated(values, rng),
-            network.scale_bars.simulated(values, rng),
-            further=tuple(kind.simulated(values, rng) for kind in network.further),
+        replace(
+            network,
+            image_points=replace(seen, xy=xy),
+            observations=tuple(kind.simulated(values, rng) for kind in network.observations),
         ),
         truth,
     )

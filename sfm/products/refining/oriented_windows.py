@@ -380,7 +380,7 @@ def _object_frame(
     scale = object_scale(targets, Estimate((), np.zeros((0, 3)), np.zeros((0, 3, 3)), points))
     if not scale > 0:
         if given or survey.scale_bars:
-            missing = "; ".join(lost_names.text.rstrip(".") for lost_names in remarks)
+            missing = "; ".join(lost.text.rstrip(".") for lost in remarks)
             raise GeometryError(f"nothing gives the model its scale; {missing}")
         return Similarity(1.0, np.eye(3), np.zeros(3)), (remark("scale_undefined", unit=survey.unit),)
     return Similarity(scale, np.eye(3), np.zeros(3)), tuple(remarks)

@@ -61,6 +61,7 @@ from sfm.survey.adjusting.solution_remarks import (
 from sfm.survey.free_parameters import choose_free_parameters
 from sfm.survey.inputs.calibration import is_plate_control, plate_control, plate_family
 from sfm.survey.inputs.cameras import split_cameras
+from sfm.survey.inputs.settings import CameraSettings
 from sfm.survey.inputs.start import given_values, with_given_mounts
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import (
@@ -251,21 +252,14 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
     chosen = choose_free_parameters(
         survey, network.with_given(ScaleBars(), further=()), estimate, datum=datum
     )
-    cameras = list(chosen.cameras)
-    for a, settings in enumerate(cameras):
-        parameters = MODELS[settings.model].parameters
-        focal = tuple(parameter.name for parameter in parameters if parameter.role is Role.FOCAL)
-        if settings.name in varying and set(focal) <= set(settings.free):
-            cameras[a] = settings.model_copy(update={"per_photograph": focal})
-    survey, estimate = replace(survey, cameras=tuple(cameras)), chosen.estimate
+    cameras = tuple(
+        _with_c_per_photograph(settings) if settings.name in varying else settings
+        for settings in chosen.cameras
+    )
+    survey, estimate = replace(survey, cameras=cameras), chosen.estimate
     network, estimate = split_cameras(survey.cameras, network, estimate, survey.start_cameras)
     network, estimate = split_blocks(survey, network, estimate)
-    # image points of a source that gives a photograph enough determine it
-    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
-    for k, source in enumerate(network.sources):
-        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
-        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
-    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, needed)
+    least = np.where(given_values(survey, network).oriented, GIVEN_IMAGE_POINTS, _needed(network))
     of_its_own = least
     if network.moment is not None:  # the other photographs of a moment determine its pose
         shared = np.bincount(network.moment, weights=estimate.oriented)[network.moment] > 1
@@ -277,6 +271,24 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         frame,
         (*unused, *chosen.remarks),
     )
+
+
+def _needed(network: Network) -> IntArray:
+    """Return how many image points each photograph needs: those of a source that gives it enough, (m,)."""
+    needed = np.full(len(network.images), max(source.fewest for source in network.sources))
+    for k, source in enumerate(network.sources):
+        count = np.bincount(network.image_points.image[network.source == k], minlength=len(needed))
+        needed = np.where(count >= source.fewest, np.minimum(needed, source.fewest), needed)
+    return needed
+
+
+def _with_c_per_photograph(settings: CameraSettings) -> CameraSettings:
+    """Return the settings with c per photograph, if it is adjusted."""
+    parameters = MODELS[settings.model].parameters
+    focal = tuple(parameter.name for parameter in parameters if parameter.role is Role.FOCAL)
+    if not set(focal) <= set(settings.free):
+        return settings
+    return settings.model_copy(update={"per_photograph": focal})
 
 
 def _free_network(start: _Prepared) -> StableAdjustment | None:
@@ -336,21 +348,26 @@ def _with_confirmed_values(
         checks_scale=bool(np.isfinite(scale_sigma(others, start.estimate))),
         false_alarm=survey.adjust.false_alarm,
     )
-    reference = None
-    if free is not None and not free.held:  # with a camera held at its start value it has a wrong shape
-        adjustment, of_survey = free.adjustment, start.task.network
-        given_any = len(of_survey.control) or len(of_survey.scale_bars) or len(of_survey.exterior)
-        if of_survey.has_common_errors and (given_any or of_survey.observations):
-            adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
-        reference = FreeNetwork(adjustment)
     place = None if free is None else partial(_placing, start, free)
-    given = judge_given(network, reference, settings, mounts=mounts, place=place)
+    given = judge_given(network, _reference(start, free), settings, mounts=mounts, place=place)
     needed = task.needed.copy()
     if given.datum.kind == "control":
         needed[given.network.control.complete.point] = 1
     else:
         task = task.in_free_datum
     return replace(task, network=given.network, needed=needed), given
+
+
+def _reference(start: _Prepared, free: StableAdjustment | None) -> FreeNetwork | None:
+    """Return the free network that judges given values; None without one that can."""
+    # a camera that had to be held at its start value gives the network a wrong shape
+    if free is None or free.held:
+        return None
+    adjustment, network = free.adjustment, start.task.network
+    given_any = len(network.control) or len(network.scale_bars) or len(network.exterior)
+    if network.has_common_errors and (given_any or network.further):
+        adjustment = replace(adjustment, error_correlation=estimate_error_correlation(adjustment))
+    return FreeNetwork(adjustment)
 
 
 def _placing(start: _Prepared, free: StableAdjustment, part: Network) -> Similarity:

@@ -222,8 +222,7 @@ def name_cut_board(grey: AnyArray, rows: int, columns: int) -> tuple[FloatArray,
         numberings = [
             (turn, number)
             for turn, number in numberings
-            for column in [number % columns]
-            if float(x @ (column - column.mean())) > 0  # columns run to the right
+            if float(x @ (number % columns - (number % columns).mean())) > 0  # columns run to the right
         ]
     return (lattice.xy, numberings[0][1]) if len(numberings) == 1 else none
 

@@ -74,15 +74,7 @@ def checkerboard_of_parts(
     uncut = Counter((min(size), max(size)) for size, is_cut in seen if not any(is_cut))
     for (rows, columns), times in uncut.most_common():
         plate = PlateFamily("checkerboard", rows, columns)
-        sides = (rows, columns), (columns, rows)
-        showing = sum(
-            size[0] * size[1] >= max(plate.count / 2, MIN_CROSSINGS)
-            and any(
-                all(n == m or (cut and n < m) for n, m, cut in zip(size, of_board, is_cut, strict=True))
-                for of_board in sides
-            )
-            for size, is_cut in seen
-        )  # parts with at least half of the crossings, fewer only where the border cuts
+        showing = sum(_is_part(*part, plate) for part in seen)
         if showing > 1 and plate.count >= MIN_CROSSINGS and _named(photographs, plate, times):
             return plate
     return None
@@ -109,6 +101,19 @@ def part_of_checkerboard(grey: AnyArray) -> Part | None:
     place = np.stack(np.divmod(np.arange(len(xy)), size[1]), axis=1)
     ends = board_ends(xy, place, small.shape)
     return size, (not all(ends[0]), not all(ends[1]))
+
+
+def _is_part(size: tuple[int, int], is_cut: tuple[bool, bool], plate: PlateFamily) -> bool:
+    """Return whether crossings of this size, cut in these directions, are at least half of a board."""
+    if size[0] * size[1] < max(plate.count / 2, MIN_CROSSINGS):
+        return False
+    return any(
+        all(
+            n == of_board or (cut and n < of_board)
+            for n, of_board, cut in zip(size, sides, is_cut, strict=True)
+        )
+        for sides in ((plate.rows, plate.columns), (plate.columns, plate.rows))
+    )
 
 
 def search_charuco(

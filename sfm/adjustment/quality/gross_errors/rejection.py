@@ -357,9 +357,9 @@ def _without_angle(problem: Problem, state: State, used: BoolArray, changed: Boo
     o, count = problem.layout.observations, len(state.points)
     suspect = np.bincount(o.point[changed], minlength=count) > 0
     suspect &= problem.layout.point_free.all(axis=1)
-    for of_kind in problem.observed:
-        if of_kind.point is not None:
-            suspect[of_kind.point] = False
+    for observed_kind in problem.observed:
+        if observed_kind.point is not None:
+            suspect[observed_kind.point] = False
     rows = np.flatnonzero(used & suspect[o.point])
     ray = state.points[o.point[rows]] - state.position[o.image[rows]]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
