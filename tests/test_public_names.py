@@ -40,6 +40,7 @@ PUBLIC = {
         "Network",
     ),
     *(
+        "OrientSettings",
         "Observations",
         "ObservationTable",
         "ObservedExterior",
@@ -64,7 +65,15 @@ PUBLIC = {
         "network_from_colmap",
         "project",
     ),
-    *("OrientSettings", "orient", "read_photograph", "read_result", "read_survey", "run_survey", "write_result"),
+    *(
+        "OrientSettings",
+        "orient",
+        "read_photograph",
+        "read_result",
+        "read_survey",
+        "run_survey",
+        "write_result",
+    ),
 }
 
 

@@ -95,7 +95,14 @@ class NotOrientedError(GeometryError):
 @checked_fields
 @dataclass(frozen=True)
 class OrientSettings:
-    """Settings of the orientation of a network."""
+    """Settings of the orientation of a network.
+
+    Example:
+        >>> import sfm
+        >>> settings = sfm.OrientSettings(seed=1)
+        >>> sfm.orient(result.network, result.estimate.cameras, settings).estimate.oriented.all()
+        np.True_
+    """
 
     seed: int = 0  # of all random choices
     start_tolerance: float = START_TOLERANCE
