@@ -81,7 +81,7 @@ def assemble_result(
         eccentricity=matched.eccentricity,
         no_circles=matched.no_circles,
         left_out=(*before, *solution.left_out),
-        settings=settings_by_table(survey),
+        settings=settings_by_table(solution.model.survey),
         given_tests=solution.given_tests,
         other_solutions=solution.others,
         unused_image_points=solution.unused_image_points + sum(point.image_points for point in before),

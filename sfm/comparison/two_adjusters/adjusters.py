@@ -34,7 +34,7 @@ from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
 from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.display import counted, program_name
-from sfm.model.distortion.models import Role
+from sfm.model.distortion.models import OF_COLMAP, Role
 from sfm.model.distributions import FALSE_ALARM, LEVEL, chi2_isf, f_isf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -263,7 +263,7 @@ def common_problem(
     cameras = estimate.cameras
     if model is None:
         models = {camera.model for camera in cameras}
-        model = models.pop() if len(models) == 1 and not cameras[0].in_mm else "full_opencv"
+        model = models.pop() if len(models) == 1 and models <= OF_COLMAP else "full_opencv"
     conversions = tuple(convert_camera(camera, model) for camera in cameras)
     converted = tuple(conversion.camera for conversion in conversions)
     grouped = grouped_free(converted)

@@ -263,6 +263,7 @@ WIDE_ANGLE = (
 COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
 ALL = (*GENERAL, *COLMAP)
 MODELS = {model.name: model for model in ALL}
+OF_COLMAP = frozenset(("opencv", "full_opencv", *(model.name for model in COLMAP)))  # models that it has
 GENERAL_MODELS = tuple(model.name for model in GENERAL)
 CONVERTIBLE = (*GENERAL_MODELS, *(model.name for model in PERSPECTIVE))  # with coefficients of one kind
 MAX_PARAMETERS = max(len(model.names) for model in ALL)
