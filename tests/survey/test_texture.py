@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses.hypotheses import JudgedAssumptions
 from sfm.model.camera import project
 from sfm.model.estimate import Estimate
@@ -16,6 +18,7 @@ from sfm.model.remarks.remark import of_kind, remark
 from sfm.model.similarity import fit_similarity
 from sfm.survey.adjusting import solved_survey
 from sfm.survey.adjusting.choices import OF_CAMERAS, solve_survey
+from sfm.survey.adjusting.settling import Task
 from sfm.survey.adjusting.solved_survey import SolvedSurvey
 from sfm.survey.inputs.sources import MARKS, TEXTURE
 from sfm.survey.inputs.survey import CameraSetup, Survey
@@ -81,6 +84,33 @@ def test_what_control_names_stays(noisy: tuple[Network, Estimate]) -> None:
     found = solve_survey(rejecting(network, truth, "tau"), textured(network, truth))
     left = set(network.points) - set(found.adjustment.network.points)
     assert left == {network.points[j] for j in SPOILED[1:]}
+
+
+def test_a_point_that_the_final_adjustment_leaves_one_ray_is_left_out(
+    noisy: tuple[Network, Estimate], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its weights are others, and what they reject may be the second ray of a point."""
+    network, truth = noisy
+    seen, finally_adjusted = network.image_points, solved_survey.adjust_finally
+    two = np.ones(len(seen), dtype=bool)
+    two[np.flatnonzero(seen.point == 7)[2:]] = False
+    network = replace(network, image_points=seen.select(two))
+
+    def adjust_finally(task: Task, part: Network, *given: Any) -> Adjustment:
+        final = finally_adjusted(task, part, *given)
+        if network.points[7] not in part.points:
+            return final
+        row = np.flatnonzero(part.image_points.point == part.point_index(network.points[7]))[0]
+        return replace(final, rejected=final.rejected | (np.arange(len(final.rejected)) == row))
+
+    monkeypatch.setattr(solved_survey, "adjust_finally", adjust_finally)
+    solution = solve_survey(
+        rejecting(network, truth, "tau"), Correspondences(network, truth, np.full(150, 2))
+    )
+    assert network.points[7] not in solution.adjustment.network.points
+    assert solution.adjustment.defect == solution.adjustment.expected_defect
+    (left_out,) = [point for point in solution.left_out if point.point == network.points[7]]
+    assert left_out.reason.kind == "points_contradicted" and left_out.reason.number("accepted") == 1
 
 
 def test_a_survey_that_rejects_nothing_loses_nothing(noisy: tuple[Network, Estimate]) -> None:

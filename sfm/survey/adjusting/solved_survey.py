@@ -464,6 +464,12 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
     before: the solution that this one replaces.
     """
     final, check = _place_settled(start, settled)
+    lost = _lost_points(settled, final)
+    if lost.any():
+        whole = settled.whole
+        without = replace(whole, points=np.where(lost[:, None], np.nan, whole.points))
+        again = settle(settled.task, without, settled.accepted).after(settled)
+        return _finish(start, replace(again, rays=np.where(lost, 1, again.rays)), before=before)
     final = replace(
         final, iterations=settled.iterations + final.iterations, start_sigma0=settled.start_sigma0
     )
@@ -482,6 +488,17 @@ def _finish(start: _Prepared, settled: StableAdjustment, *, before: Adjustment |
     if before is not None and len(before.network.points) == len(final.network.points):
         starts = (*starts, before.estimate)
     return _Final(settled, final, check, c_held, other_solutions(final, starts=starts, had_to_be_held=c_held))
+
+
+def _lost_points(settled: StableAdjustment, final: Adjustment) -> BoolArray:
+    """Return the settled points of which a final adjustment, with other weights, accepts one ray only, (n,).
+
+    The ray does not determine them, unless they need no other, as control.
+    """
+    rays = np.bincount(final.network.image_points.point[~final.rejected], minlength=len(final.network.points))
+    lost = settled.points.copy()
+    lost[settled.points] = (rays == 1) & (settled.task.needed[settled.points] > 1)
+    return lost
 
 
 def _free_network_in_frame(before: Estimate, free: Estimate, task: Task, given: JudgedGiven) -> Estimate:
