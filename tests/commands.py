@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import pytest
 
 from sfm import cli
+from sfm.cli.app import commands
 
 
 def kolinear(*arguments: object) -> int:
@@ -18,6 +20,14 @@ def kolinear(*arguments: object) -> int:
         except SystemExit as end:
             return int(end.code or 0) if not isinstance(end.code, str) else 1
     return 0
+
+
+def command_of(words: str) -> Any:
+    """Return the command that typer builds for the words that follow `kolinear`."""
+    command = commands()
+    for word in words.split():
+        command = command.commands[word]
+    return command
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:

@@ -218,7 +218,8 @@ class Network:
 
     def of_kind(self, kind: type[K]) -> K:
         """Return the set of observations of a kind, which is empty if there is none."""
-        return next((given for given in self.observations if isinstance(given, kind)), kind())
+        given = next((given for given in self.observations if isinstance(given, kind)), None)
+        return kind() if given is None else given
 
     @property
     def control(self) -> ObjectPoints:
@@ -362,10 +363,11 @@ class Network:
             if not isinstance(given, SETS):
                 name = getattr(given, "name", type(given).__name__)
                 raise GeometryError(f"{name}: not with_given, expected further or with_observations")
+        replaced = tuple(kind for kind in SETS if any(isinstance(given, kind) for given in sets))
         kept = [
             present
             for present in self.observations
-            if isinstance(present, SETS) and not any(isinstance(present, _kind_of(given)) for given in sets)
+            if isinstance(present, SETS) and not isinstance(present, replaced)
         ]
         rest = self.further if further is None else tuple(further)
         return replace(self, observations=(*kept, *(given for given in sets if len(given)), *rest))
@@ -467,11 +469,6 @@ class Network:
         )
         counts = [counted(count, what) for count, what in parts if count]
         return f"<Network: {', '.join(counts)}>"
-
-
-def _kind_of(given: Kind) -> type[Kind]:
-    """Return the kind of `SETS` that a set of observations is of."""
-    return next(kind for kind in SETS if isinstance(given, kind))
 
 
 def without_given(network: Network) -> Network:

@@ -13,12 +13,12 @@ import cv2
 import pytest
 
 from sfm.cli import process
-from sfm.cli.app import COMMANDS, commands
+from sfm.cli.app import COMMANDS
 from sfm.model.errors import KolinearError
 from sfm.products.batch.run import run_batch
 from sfm.report.output import read_log
 from sfm.runtime.faults import error_in_words, is_fault, working_on
-from tests.commands import kolinear
+from tests.commands import command_of, kolinear
 from tests.engines import ALONE, HERE, PLOTLESS, Notes
 from tests.places import ROOT
 from tests.surveys import write_observed_survey, write_photograph_survey
@@ -35,11 +35,8 @@ POINTS = """point,X,Y,Z,x_mm,y_mm
 
 def line_of(words: str) -> tuple[str, ...]:
     """Return a command with 1 for each of its required arguments."""
-    command: Any = commands()
-    for word in words.split():
-        command = command.commands[word]
     line = words.split()
-    for parameter in command.params:
+    for parameter in command_of(words).params:
         if parameter.required:
             line += ["1"] if parameter.param_type_name == "argument" else [parameter.opts[0], "1"]
     return tuple(line)

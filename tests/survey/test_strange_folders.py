@@ -224,12 +224,8 @@ COMMANDS: dict[str, Command] = {
 
 def test_every_command_that_writes_is_here() -> None:
     """Each command of the app with an option --out."""
-    root = app.commands()
     for row in app.COMMANDS:
-        command: Any = root
-        for word in row.words.split():
-            command = command.commands[word]
-        writes = any("--out" in parameter.opts for parameter in command.params)
+        writes = any("--out" in parameter.opts for parameter in commands.command_of(row.words).params)
         listed = any(f"{name} ".startswith(f"{row.words} ") for name in COMMANDS)
         assert listed or not writes, row.words
 

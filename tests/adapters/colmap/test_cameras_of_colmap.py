@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adapters.colmap.reconstruction import as_opencv, camera_of, colmap_camera
+from adapters.colmap.reconstruction import COLMAP_NAMES, as_opencv, camera_of, colmap_camera
 from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import FloatArray
-from sfm.model.distortion.models import COLMAP, MAX_PARAMETERS, MODELS, Role, observe
+from sfm.model.distortion.models import COLMAP, MAX_PARAMETERS, MODELS, OF_COLMAP, Role, observe
 from sfm.model.errors import BackendError
 from tests.synthetic import DISTORTION, seed_of
 
@@ -110,3 +110,7 @@ def test_a_panorama_is_refused_with_what_to_do() -> None:
         BackendError, match=r"camera 3: COLMAP's model EQUIRECTANGULAR is not read.*perspective"
     ):
         camera_of(panorama)
+
+
+def test_the_models_of_colmap_are_those_that_pycolmap_has() -> None:
+    assert set(COLMAP_NAMES) == OF_COLMAP
