@@ -64,6 +64,7 @@ class Source:
     # factor by which errors in common multiply the variance of what its image points tell of unknowns that
     # they share with other sources; as many image points have the weight of one with an error of its own
     design_effect: float = 1.0
+    noun: str = ""  # what remarks call its image points; else its name
 
 
 @dataclass(frozen=True)

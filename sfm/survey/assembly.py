@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sfm.adjustment.quality.correlations import exterior_correlations, strong_correlations
 from sfm.comparison.solutions import Baseline, BaselineComparison, compare_baseline
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
-from sfm.judgement.survey_result import CheckPoint, SeenPlate, StageTime, SurveyResult
+from sfm.judgement.survey_result import SeenPlate, StageTime, SurveyResult
 from sfm.judgement.verdict import judge_survey
 from sfm.model.errors import KolinearError, MissingLibraryError
 from sfm.model.estimate import Estimate
@@ -26,7 +24,7 @@ from sfm.survey.adjusting.solved_survey import SolvedSurvey
 from sfm.survey.diagnosis.codes_found import plates_not_in_result
 from sfm.survey.inputs.measurements import PhotographList, remarks_on_contradicting
 from sfm.survey.inputs.settings import Section
-from sfm.survey.inputs.sources import tables_of
+from sfm.survey.inputs.sources import given_tables
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.joined import sources_of
@@ -88,7 +86,7 @@ def assemble_result(
         reject=survey.reject,
         weights=survey.adjust.weights,
         plates=tuple(SeenPlate(points, sigma) for points, sigma in zip(plates, sigmas, strict=True)),
-        check_points=_check_points(survey),
+        check_points=survey.check_points,
         equipment=survey.equipment,
         balance_radius_mm=tuple(
             (camera.name, dict(camera.balanced)["R0"]) for camera in survey.cameras if camera.balanced
@@ -98,17 +96,6 @@ def assemble_result(
         seconds=tuple(StageTime(stage, seconds) for stage, seconds in clock.seconds),
     )
     return judge_survey(result)
-
-
-def _check_points(survey: Survey) -> tuple[CheckPoint, ...]:
-    """Return the points with coordinates that the control table marks as check coordinates."""
-    control = survey.control
-    if control is None or control.check is None:
-        return ()
-    return tuple(
-        CheckPoint(control.names[k], np.where(control.check[k], control.xyz[k], np.nan), control.sigma[k])
-        for k in np.flatnonzero(control.check.any(axis=1))
-    )
 
 
 def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
@@ -133,7 +120,10 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         ("photographs of [exterior]", survey.exterior and survey.exterior.names),
         ("scale bars", survey.scale_bars),
         ("named points", dict.fromkeys(mark.name for mark in survey.marks)),
-        ("image points", [name for given in tables_of(survey.observations) for name in given.point]),
+        (
+            "image points",
+            [name for tables in given_tables(survey).values() for table in tables for name in table.point],
+        ),
     )
     counts = [f"{len(values)} {name}" for name, values in given if values]
     if counts:

@@ -77,11 +77,6 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "no normals": "that points are seen from everywhere",
     "precision of targets": "the precision that the targets allow, without errors of lens and sensor",
     "no depth of field": "that all distances are sharp",
-    # sources of image points
-    "given": "the given image points",
-    "marks": "the named points",
-    "targets": "the targets",
-    "texture": "the natural texture",
     # what shows which of two parts is mirrored
     "known handedness": "The handedness of codes or control",
     "most photographs": "The larger number of the others",

@@ -53,7 +53,9 @@ def remarks_on_solution(
     return (
         *adjustment.remarks,
         *remarks_on_left_out(
-            tuple(point for point in left_out if point.point not in missing), network, _check_points(survey)
+            tuple(point for point in left_out if point.point not in missing),
+            network,
+            {point.point for point in survey.check_points},
         ),
         *no_datum,
         *remarks_on_principal_distances(survey, adjustment.estimate, sigma_of_c),
@@ -194,7 +196,7 @@ def missing_control(survey: Survey, network: Network, left_out: tuple[LeftOutPoi
     """
     if survey.control is None or is_plate_control(survey.control, plate_control(survey.targets)):
         return ()
-    checks = _check_points(survey)
+    checks = {check.point for check in survey.check_points}
     named = {point.point for point in left_out if point.point in checks or point.reason.severity != "note"}
     return tuple(name for name in survey.control.names if name not in named.union(network.points))
 
@@ -243,13 +245,6 @@ def unused_image_points(network: Network, images: BoolArray, points: BoolArray) 
     """Return the number of image points outside the photographs, (m,), and points, (n,), of the result."""
     seen = network.image_points
     return int((~(images[seen.image] & points[seen.point])).sum())
-
-
-def _check_points(survey: Survey) -> frozenset[str]:
-    control = survey.control
-    if control is None or control.check is None:
-        return frozenset()
-    return frozenset(name for name, axes in zip(control.names, control.check, strict=True) if axes.any())
 
 
 def remarks_on_left_out(

@@ -6,6 +6,7 @@ The comment on each key is its description in the reference of the survey file.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -79,6 +80,9 @@ Unit = Annotated[
     Literal["km", "m", "dm", "cm", "mm", "um", "µm", "nm", "in", "ft"],
     BeforeValidator(lambda v: _plain(v) if isinstance(v, str) else v),
 ]
+NAMES_A_FILE = "names a file"  # metadata of keys whose text is a path relative to the survey file
+File = Annotated[Name, NAMES_A_FILE]
+FileOrNone = Annotated[Name | None, NAMES_A_FILE]
 TwoLengths = Annotated[tuple[Length, Length], Field(strict=False)]
 Side = Annotated[int, Field(gt=0, le=MAX_SIDE_PX)]
 TwoCounts = Annotated[tuple[Side, Side], Field(strict=False)]
@@ -119,6 +123,16 @@ class Section(BaseModel):
     model_config = ConfigDict(
         strict=True, extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=False
     )
+
+    def files(self) -> Iterator[str]:
+        """Yield the paths of the files that this table and those in it name, as they are written."""
+        for key, field in type(self).model_fields.items():
+            value = getattr(self, key)
+            for section in value if isinstance(value, tuple) else (value,):
+                if isinstance(section, Section):
+                    yield from section.files()
+            if NAMES_A_FILE in field.metadata and value is not None:
+                yield value
 
 
 class Head(Section):
@@ -210,7 +224,7 @@ class TargetSettings(PlateSettings):
     min_diameter_px: Length = 6.0  # diameter of the smallest target to measure, px
     eccentricity: bool = True  # whether to correct the eccentricity of the ellipses
     diameter: Length | None = None  # of all targets, object unit; else from the ellipses of each target
-    diameters: Name | None = None  # a table id,diameter of single targets, which replaces diameter
+    diameters: FileOrNone = None  # a table id,diameter of single targets, which replaces diameter
     tag_sigma: Length | None = None  # standard deviation of tag_size, common to all tags, object unit
     pitch_assumed: bool = False  # whether the pitch is assumed and not measured
 
@@ -248,7 +262,7 @@ class RigSettings(Section):
     tolerance_s: Annotated[float, Field(ge=0, le=86_400)] = 1.0  # difference of EXIF times of one moment, s
     # camera,X,Y,Z,sX,sY,sZ,omega_deg,phi_deg,kappa_deg,somega_deg,sphi_deg,skappa_deg in the image axes of
     # the reference camera; sigma 0 = held fixed
-    mounts: Name | None = None
+    mounts: FileOrNone = None
 
     @property
     def named(self) -> bool:
@@ -264,7 +278,7 @@ class RigSettings(Section):
 class ControlSettings(Section):
     """[control]: known object points."""
 
-    file: Name  # id,X,Y,Z[,sX,sY,sZ], or gcp_list.txt or ground_control_points.json with image points
+    file: File  # id,X,Y,Z[,sX,sY,sZ], or gcp_list.txt or ground_control_points.json with image points
     sigma: TwoLengths | None = None  # of X and Y, and of Z, where the file states none; else they are fixed
     check: Names = ()  # points that are not adjusted but check the result
 
@@ -273,7 +287,7 @@ class ExteriorSettings(Section):
     """[exterior]: exterior orientation observed by satellite positioning, a tracker or known stations."""
 
     # image,X,Y,Z[,sX,sY,sZ][,omega_deg,phi_deg,kappa_deg[,somega_deg,sphi_deg,skappa_deg]]
-    file: Name | None = None
+    file: FileOrNone = None
     # in place of file: standard deviations of positions in EXIF data, in the plane and of the height
     exif_sigma_m: TwoLengths | None = None  # for photographs that state none, m
 
@@ -297,7 +311,7 @@ class EquipmentSettings(Section):
 class ObservationSettings(Section):
     """[observations]: measured image points in place of photographs; [[observations]]: beside them."""
 
-    file: Name  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
+    file: File  # image,point,x_px,y_px[,sx_px,sy_px] or image,point,x_mm,y_mm[,sx_mm,sy_mm]
     sigma_px: Length | None = None  # standard deviation of rows that state none; else that of [adjust]
 
 
@@ -316,15 +330,15 @@ class ObservationTableSettings(Section):
 
     # distance, height difference, plane, ...: see docs/how-to/scale-and-control.md for kinds and columns
     kind: Literal[tuple(TABLES)]  # type: ignore[valid-type]
-    file: Name  # a table with the columns of its kind
+    file: File  # a table with the columns of its kind
 
 
 class ApproximateSettings(Section):
     """[approximate]: start values of exterior orientation, object points and interior orientation."""
 
-    images: Name | None = None  # image,X,Y,Z,omega_deg,phi_deg,kappa_deg
-    points: Name | None = None  # point,X,Y,Z
-    cameras: Name | None = None  # camera,parameter,value
+    images: FileOrNone = None  # image,X,Y,Z,omega_deg,phi_deg,kappa_deg
+    points: FileOrNone = None  # point,X,Y,Z
+    cameras: FileOrNone = None  # camera,parameter,value
 
 
 class AdjustSettings(Section):

@@ -11,14 +11,16 @@ from typing import Any
 
 from sfm.model.display import counted
 from sfm.model.network import Source
+from sfm.survey.inputs.given_values import Observations
 
 # Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
-TARGETS = Source("targets")
-GIVEN = Source("given", is_exact=True, points="given")
-MARKS = Source("marks", is_matched=True, points="named")
+TARGETS = Source("targets", noun="the targets")
+GIVEN = Source("given", noun="the given image points", is_exact=True, points="given")
+MARKS = Source("marks", noun="the named points", is_matched=True, points="named")
 TEXTURE = Source(
     "texture",
+    noun="the natural texture",
     names_last=False,
     fewest=MIN_TIE_POINTS,
     has_common_errors=True,
@@ -80,6 +82,16 @@ def tables_of(given: Any) -> tuple[Any, ...]:
     if given is None:
         return ()
     return given if isinstance(given, tuple) else (given,)
+
+
+def given_tables(survey: object) -> dict[str, tuple[Observations, ...]]:
+    """Return the tables of image points that a survey gives, by the table of the survey file they are of."""
+    given = {row.table: tables_of(getattr(survey, row.table)) for row in ROWS}
+    return {
+        name: tables
+        for name, tables in given.items()
+        if tables and all(isinstance(table, Observations) for table in tables)
+    }
 
 
 def descriptions(survey: object) -> list[str]:

@@ -15,7 +15,7 @@ from sfm.model.observations.pose import MountObservations
 from sfm.survey.inputs.cameras import refuse_unknown_cameras
 from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
-from sfm.survey.inputs.sources import reads_photographs, tables_of
+from sfm.survey.inputs.sources import given_tables, reads_photographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.observation_tables import with_tables
 from sfm.survey.rigs import with_moments
@@ -29,7 +29,8 @@ def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
         images: all photographs of the survey, including unreadable ones; given image points may name more.
     """
     refuse_unknown_cameras(survey.cameras, survey.start_cameras)
-    known = {*images, *(name for given in tables_of(survey.observations) for name in given.image)}
+    given_of = given_tables(survey).values()
+    known = {*images, *(name for tables in given_of for given in tables for name in given.image)}
     lacks = "is no photograph of the survey" if reads_photographs(survey) else "has no observations"
     for given, what in ((survey.exterior, "column image:"), (survey.start_orientations, "image")):
         for k, name in enumerate(given.names if given is not None else ()):

@@ -8,12 +8,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import ValidationError
 
 from sfm.adjustment.datum import Datum
 from sfm.files.plain_text import as_plain
 from sfm.files.result_tables import read_moments
-from sfm.judgement.survey_result import PlacedEquipment
+from sfm.judgement.survey_result import CheckPoint, PlacedEquipment
 from sfm.model.arguments import checked_arguments
 from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
@@ -229,6 +230,17 @@ class Survey:
             SurveyFileError: the code table is unreadable.
         """
         return survey_family(self.targets, self.codes, self.plates)
+
+    @cached_property
+    def check_points(self) -> tuple[CheckPoint, ...]:
+        """The points of the control with coordinates that take no part, but check the result."""
+        control = self.control
+        if control is None or control.check is None:
+            return ()
+        return tuple(
+            CheckPoint(control.names[k], np.where(control.check[k], control.xyz[k], np.nan), control.sigma[k])
+            for k in np.flatnonzero(control.check.any(axis=1))
+        )
 
     @cached_property
     def given_mounts(self) -> MountObservations:

@@ -39,7 +39,6 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
-from sfm.survey.inputs.sources import tables_of
 from sfm.targets.codes.plates import is_table
 
 BESIDE = "[[observations]]"  # key of tables of image points beside photographs
@@ -153,17 +152,9 @@ class SurveyFile(Section):
         Raises:
             SurveyFileError: a path leaves the survey's folder.
         """
-        names = [
-            self.control.file if self.control else None,
-            self.exterior.file if self.exterior else None,
-            self.approximate.images,
-            self.approximate.points,
-            self.approximate.cameras,
-            self.targets.codes if is_table(self.targets.codes) else None,
-            self.targets.diameters,
-        ]
-        names += [name for rig in self.rigs for name in (rig.mounts, rig.table)]
-        names += [table.file for table in (*tables_of(self.observations), *self.observation_tables)]
+        names = [*self.files(), *(rig.table for rig in self.rigs if rig.table is not None)]
+        if is_table(self.targets.codes):
+            names.append(self.targets.codes)
         if self.head.equipment is not None:
             path = self.beside(self.head.equipment)
             equipment = read_equipment(path, allow_outside=self._allow_outside)
@@ -172,7 +163,7 @@ class SurveyFile(Section):
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]
-        return tuple(self.beside(name) for name in names if name is not None)
+        return tuple(self.beside(name) for name in names)
 
 
 def path_inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:

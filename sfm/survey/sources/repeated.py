@@ -123,7 +123,7 @@ def without_repeated(seen: ImagePoints, sources: tuple[Source, ...]) -> OfOneSou
         said = partial(
             remark,
             "sources_contradict",
-            sources=[sources[b].name, sources[a].name],
+            sources=[sources[k].noun or sources[k].name for k in (b, a)],
             distance=distance,
             common=len(of_a),
         )
