@@ -120,10 +120,7 @@ def settings_by_table(survey: Survey) -> tuple[tuple[str, str], ...]:
         ("photographs of [exterior]", survey.exterior and survey.exterior.names),
         ("scale bars", survey.scale_bars),
         ("named points", dict.fromkeys(mark.name for mark in survey.marks)),
-        (
-            "image points",
-            [name for tables in given_tables(survey).values() for table in tables for name in table.point],
-        ),
+        ("image points", [name for given in given_tables(survey) for name in given.point]),
     )
     counts = [f"{len(values)} {name}" for name, values in given if values]
     if counts:

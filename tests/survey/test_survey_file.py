@@ -499,3 +499,47 @@ def test_single_brackets_of_a_camera_are_explained(tmp_path: Path) -> None:
     path = write(tmp_path, MINIMAL.replace("[[camera]]", "[camera]"))
     with pytest.raises(SurveyFileError, match=r"found \[camera\], needed \[\[camera\]\] in double brackets"):
         read_survey_file(path)
+
+
+def test_every_file_that_a_survey_names_is_among_its_tables(tmp_path: Path) -> None:
+    (tmp_path / "codes.csv").write_text("code\n", "utf-8")
+    camera = """[[camera]]
+name = "{0}"
+images = "{0}*.jpg"
+c_mm = 8.0
+pixel_mm = [0.005, 0.005]
+"""
+    path = tmp_path / "survey.toml"
+    path.write_text(
+        '[survey]\nname = "all"\nunit = "m"\n'
+        + camera.format("left")
+        + camera.format("right")
+        + """[targets]
+codes = "codes.csv"
+diameters = "diameters.csv"
+[control]
+file = "control.csv"
+[exterior]
+file = "exterior.csv"
+[[rig]]
+name = "stereo"
+cameras = ["left", "right"]
+moment = "moments.csv"
+mounts = "mounts.csv"
+[[observations]]
+file = "by_hand.csv"
+[[observations]]
+file = "tracker.csv"
+[[survey_observations]]
+kind = "distance"
+file = "tape.csv"
+[approximate]
+images = "images.csv"
+points = "points.csv"
+cameras = "cameras.csv"
+""",
+        "utf-8",
+    )
+    named = {word.strip('"') for word in path.read_text("utf-8").split() if word.endswith('.csv"')}
+    tables = read_survey_file(path).tables()
+    assert {table.name for table in tables} == named and len(tables) == len(named)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from sfm.survey.inputs.exterior_table import ObservedExterior
 from sfm.survey.inputs.given_values import Observations, StartOrientations
 from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import PointSettings
-from sfm.survey.inputs.sources import given_tables
+from sfm.survey.inputs.sources import given_tables, with_each_table
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.inputs.survey_file import path_inside
 
@@ -77,29 +77,20 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
     for mark in marks:
         if mark.image not in known:
             _refuse_no_template(mark, survey)
-    named = {
-        key: [replace(table, image=tuple(map(name_of, table.image))) for table in tables]
-        for key, tables in given_tables(survey).items()
-    }
-    every = [table for tables in named.values() for table in tables]
-    without_file = dict.fromkeys(name for table in every for name in table.image if name not in known)
-    of_survey = {key: tuple(_of_survey(table, survey, files) for table in of) for key, of in named.items()}
-    renamed: dict[str, Any] = {
-        key: tables if isinstance(getattr(survey, key), tuple) else tables[0]
-        for key, tables in of_survey.items()
-    }
+    named = with_each_table(survey, lambda table: replace(table, image=tuple(map(name_of, table.image))))
+    given = given_tables(named)
+    without_file = dict.fromkeys(name for table in given for name in table.image if name not in known)
     survey = replace(
-        survey,
+        with_each_table(named, lambda table: _of_survey(table, survey, files)),
         marks=marks,
         exterior=_renamed(survey.exterior, name_of),
         start_orientations=_renamed(survey.start_orientations, name_of),
         moments=_moments_renamed(survey, name_of),
-        **renamed,
     )
     if not without_file:
         return NamedPhotographs(survey)
-    marked = {name for tables in of_survey.values() for table in tables for name in table.point}
-    unmarked = dict.fromkeys(name for table in every for name in table.point if name not in marked)
+    marked = {name for table in given_tables(survey) for name in table.point}
+    unmarked = dict.fromkeys(name for table in given for name in table.point if name not in marked)
     said = remark("photographs_without_file", photographs=without_file, points=unmarked or None)
     return NamedPhotographs(survey, frozenset(unmarked), (said,))
 

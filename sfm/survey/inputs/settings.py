@@ -140,7 +140,7 @@ class Head(Section):
 
     name: Name  # of the survey, in the report and its file names
     unit: Unit  # of the object coordinates
-    equipment: Name | None = None  # equipment file with the bars and frames of [[equipment]]
+    equipment: FileOrNone = None  # equipment file with the bars and frames of [[equipment]]
     temperature: Temperature | None = None  # of the equipment during the survey, deg C
     temperature_sigma: Length = 1.0  # standard deviation of temperature, K
     masks: Name | None = None  # folder of masks NAME.png of photographs; what is black in them is ignored
@@ -273,6 +273,12 @@ class RigSettings(Section):
     def table(self) -> str | None:
         """The table that names the moments, or None."""
         return self.moment if self.moment.endswith(".csv") and "(" not in self.moment else None
+
+    def files(self) -> Iterator[str]:
+        """Yield the paths of the tables of its mounts and moments, as they are written."""
+        yield from super().files()
+        if self.table is not None:
+            yield self.table
 
 
 class ControlSettings(Section):

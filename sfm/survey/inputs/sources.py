@@ -6,13 +6,17 @@ A source is a row here and a module of `sfm.survey.sources` of the same name.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sfm.model.display import counted
 from sfm.model.network import Source
 from sfm.survey.inputs.given_values import Observations
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+S = TypeVar("S", bound="DataclassInstance")
 # Image points of a photograph. Matches of a repeated pattern are wrong together, and few of them may fit.
 MIN_TIE_POINTS = 15
 TARGETS = Source("targets", noun="the targets")
@@ -84,12 +88,27 @@ def tables_of(given: Any) -> tuple[Any, ...]:
     return given if isinstance(given, tuple) else (given,)
 
 
-def given_tables(survey: object) -> dict[str, tuple[Observations, ...]]:
-    """Return the tables of image points that a survey gives, by the table of the survey file they are of."""
-    given = {row.table: tables_of(getattr(survey, row.table)) for row in ROWS}
+def given_tables(survey: object) -> tuple[Observations, ...]:
+    """Return all tables of image points that a survey gives."""
+    return tuple(table for tables in _given_by_field(survey).values() for table in tables)
+
+
+def with_each_table(survey: S, change: Callable[[Observations], Observations]) -> S:
+    """Return a survey whose tables of image points are changed, each by itself."""
+    changed = {name: tuple(map(change, tables)) for name, tables in _given_by_field(survey).items()}
+    values: dict[str, Any] = {
+        name: tables if isinstance(getattr(survey, name), tuple) else tables[0]
+        for name, tables in changed.items()
+    }
+    return replace(survey, **values) if values else survey
+
+
+def _given_by_field(survey: object) -> dict[str, tuple[Observations, ...]]:
+    """Return the tables of image points of a survey by its fields, which have one or several."""
+    stated = {row.table: tables_of(getattr(survey, row.table)) for row in ROWS}
     return {
         name: tables
-        for name, tables in given.items()
+        for name, tables in stated.items()
         if tables and all(isinstance(table, Observations) for table in tables)
     }
 

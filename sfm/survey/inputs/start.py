@@ -29,8 +29,7 @@ def refuse_unknown_photographs(survey: Survey, images: Sequence[str]) -> None:
         images: all photographs of the survey, including unreadable ones; given image points may name more.
     """
     refuse_unknown_cameras(survey.cameras, survey.start_cameras)
-    given_of = given_tables(survey).values()
-    known = {*images, *(name for tables in given_of for given in tables for name in given.image)}
+    known = {*images, *(name for given in given_tables(survey) for name in given.image)}
     lacks = "is no photograph of the survey" if reads_photographs(survey) else "has no observations"
     for given, what in ((survey.exterior, "column image:"), (survey.start_orientations, "image")):
         for k, name in enumerate(given.names if given is not None else ()):

@@ -152,14 +152,14 @@ class SurveyFile(Section):
         Raises:
             SurveyFileError: a path leaves the survey's folder.
         """
-        names = [*self.files(), *(rig.table for rig in self.rigs if rig.table is not None)]
+        names = list(self.files())
         if is_table(self.targets.codes):
             names.append(self.targets.codes)
         if self.head.equipment is not None:
             path = self.beside(self.head.equipment)
             equipment = read_equipment(path, allow_outside=self._allow_outside)
             folder = Path(self.head.equipment).parent
-            names += [self.head.equipment, *(str(folder / frame.file) for frame in equipment.content.frames)]
+            names += [str(folder / frame.file) for frame in equipment.content.frames]
         for camera in self.cameras:
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]
