@@ -145,37 +145,40 @@ def test_shift_model_on_patches_that_are_only_shifted() -> None:
     assert (e**2 / matches.covariance[:, [0, 1], [0, 1]]).mean() == pytest.approx(1, abs=0.3)
 
 
-def test_a_window_of_a_plane_whose_tilt_is_wrong() -> None:
-    """Nothing else of its warp is estimated; windows that are only shifted take the tilt for a shift."""
+def test_residuals_of_shifted_windows_show_the_linear_part_that_is_missing() -> None:
+    """The step that they give leads to what the affine model estimates, with its covariance."""
     pairs, left, right = _pairs()
     rng = np.random.default_rng(3)
-    angle = rng.uniform(0, 2 * np.pi, PATCHES)
-    along = np.column_stack([np.cos(angle), np.sin(angle)])
-    wrong = np.eye(2) + along[:, :, None] * rng.uniform(-0.05, 0.05, (PATCHES, 1, 2))
-    start = pairs.linear @ wrong
+    missing = rng.uniform(-0.03, 0.03, (PATCHES, 2, 2))
+    start = pairs.linear @ np.linalg.inv(np.eye(2) + missing)
 
-    def over_stated(matches: LsmMatches) -> float:
-        e = matches.xy - pairs.centre - pairs.shift
-        return float(np.sqrt(np.einsum("ki,kij,kj->k", e, np.linalg.inv(matches.covariance), e).mean() / 2))
+    def over_stated(error: FloatArray, covariance: FloatArray) -> float:
+        square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(covariance), error)
+        return float(np.sqrt(square.mean() / error.shape[1]))
 
-    shift, affine = (
-        match_lsm(left, right, pairs.centre, pairs.centre, start=start, settings=LsmSettings(model=model))
-        for model in ("shift", "affine")
+    shift = match_lsm(
+        left, right, pairs.centre, pairs.centre, LsmSettings(model="shift", linear=True), start=start
     )
-    tilt = match_lsm(
-        left,
-        right,
-        pairs.centre,
-        pairs.centre,
-        start=start,
-        along=rng.uniform(1, 9) * along,
-        settings=LsmSettings(model="tilt"),
+    part = shift.linear
+    assert part is not None
+    back = np.linalg.inv(part.derivative)
+    d = (back @ part.score[:, :, None])[:, :, 0]
+    of_d = back @ (part.variance[:, None, None] * part.spread) @ back.transpose(0, 2, 1)
+    true = missing.reshape(-1, 4)
+    assert over_stated(d - true, of_d) == pytest.approx(1, abs=0.1)
+    assert over_stated(-true, of_d) > 1.5
+    moved = pairs.linear @ part.shift
+    off = shift.xy - pairs.centre - pairs.shift
+    assert over_stated(off, shift.covariance) > 1.5
+    corrected = off + np.einsum("kab,kb->ka", moved, d)
+    whole = shift.covariance + moved @ of_d @ moved.transpose(0, 2, 1)
+    assert over_stated(corrected, whole) == pytest.approx(1, abs=0.1)
+    affine = match_lsm(left, right, pairs.centre, pairs.centre)
+    assert np.trace(whole, axis1=1, axis2=2) == pytest.approx(
+        np.trace(affine.covariance, axis1=1, axis2=2), rel=0.2
     )
-    assert over_stated(tilt) == pytest.approx(over_stated(affine), abs=3 * UNCERTAIN)
-    assert over_stated(shift) > 1.5 * over_stated(tilt)
-    assert tilt.warp[:, :2, :2] == pytest.approx(pairs.linear, abs=0.05)
-    variances = [np.trace(one.covariance, axis1=1, axis2=2) for one in (tilt, affine)]
-    assert (variances[0] < 1.02 * variances[1]).all() and variances[0].mean() < 0.97 * variances[1].mean()
+    plain = match_lsm(left, right, pairs.centre, pairs.centre, LsmSettings(model="shift"), start=start)
+    assert plain.linear is None and plain.xy == pytest.approx(shift.xy, abs=0)
 
 
 def test_without_noise_the_warp_itself_is_found() -> None:
@@ -242,8 +245,10 @@ def test_bad_input_is_refused_in_one_line() -> None:
         LsmSettings(**wrong)
     with pytest.raises(GeometryError, match="model 'helmert', expected one of"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="helmert"))
-    with pytest.raises(GeometryError, match=r"epipolar lines of shape \(0,\), needed \(1, 2\) for a tilt"):
-        match_lsm(photograph, photograph, at, at, settings=LsmSettings(model="tilt"))
+    with pytest.raises(
+        GeometryError, match="score of a linear part with model 'affine', needed model 'shift'"
+    ):
+        match_lsm(photograph, photograph, at, at, settings=LsmSettings(linear=True))
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(interpolation="sinc"))
     with pytest.raises(GeometryError, match="1 point in the left photograph, 2 in the right"):

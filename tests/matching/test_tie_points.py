@@ -22,7 +22,6 @@ from sfm.matching.epipolar import epipolar_paths
 from sfm.matching.lsm.coverage import (
     MAX_SHARED_FRACTION,
     CoveredPixels,
-    Windows,
     first_alike,
     plane_warps,
     points_apart,
@@ -64,7 +63,7 @@ from sfm.products.refining.refinement import RefineSettings, refine_model, refin
 from sfm.report.output import read_log
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.covering_points import _epipolar_lines, _returning, find_covering_points
+from sfm.survey.measuring.covering_points import _returning, find_covering_points
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.textbook.matching import match_along_line
 from tests.engines import ALONE, HERE, Notes
@@ -186,11 +185,12 @@ def test_places_are_put_on_the_planes_of_the_points_around_them() -> None:
     lost = np.vstack([on_plane(at), [X0 + R[:, 2], [np.nan] * 3]])  # one behind, one that is not known
     estimate = replace(truth, points=lost)
     places = np.vstack([at[:5] + np.array([7.0, -3.0]), [[np.nan, 0.0]]])
-    points, normals = planes_at(estimate, camera, 0, places, np.arange(len(lost)))
+    planes = planes_at(estimate, camera, 0, places, np.arange(len(lost)))
+    points, normals = planes.points, planes.normal
     assert points[:5] == pytest.approx(on_plane(places[:5]), abs=1e-6)
     assert normals[:5] == pytest.approx(np.tile(normal, (5, 1)), abs=1e-4)
     assert np.isnan(points[5]).all() and np.isnan(normals[5]).all()
-    assert np.isnan(planes_at(estimate, camera, 0, places, np.arange(5))[0]).all()  # too few for a plane
+    assert np.isnan(planes_at(estimate, camera, 0, places, np.arange(5)).points).all()  # too few for a plane
 
 
 def _seen(image: Sequence[int], point: Sequence[int], xy: Sequence[Sequence[float]]) -> ImagePoints:
@@ -262,8 +262,8 @@ def test_covered_pixels_are_not_free() -> None:
 
 
 def test_preferred_windows_give_way_to_clearly_better_ones() -> None:
-    assert first_alike([(Windows(15), 3.1), (Windows(11), 3.0)]) == Windows(15)
-    assert first_alike([(Windows(15), 3.4), (Windows(11), 3.0)]) == Windows(11)
+    assert first_alike([(15, 3.1), (11, 3.0)]) == 15
+    assert first_alike([(15, 3.4), (11, 3.0)]) == 11
 
 
 def test_windows_of_a_plane_are_seen_in_perspective() -> None:
@@ -294,7 +294,7 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     )
     ties = ImagePoints(image, point, xy, np.tile(0.01 * np.eye(2), (3 * n, 1, 1)))
     network = Network(("a", "b", "c"), camera, tuple(map(str, range(n))), ties)
-    found = find_covering_points(photographs, network, truth, windows=Windows(15), side_px=15)
+    found = find_covering_points(photographs, network, truth, window_px=15, side_px=15)
     seen, count = found.image_points, np.bincount(found.image_points.point)
     assert (count == 3).sum() > 3 * n and set(count.tolist()) == {2, 3}
     # every reference is on whole pixels; no pixel of it is in two windows, and most pixels are in one
@@ -319,14 +319,14 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     height = found.points[:, 2] - render.height(found.points[:, 0], found.points[:, 1])
     assert np.sqrt((height**2).mean()) < 3e-4
     assert np.sqrt((found.residuals**2).mean()) < 0.05
-    none = find_covering_points(photographs, network, truth, windows=Windows(15), side_px=15, references=[])
+    none = find_covering_points(photographs, network, truth, window_px=15, side_px=15, references=[])
     assert len(none.points) == 0
     assert len(seen) >= 0.95 * found.matched and remarks_on_disagreement(found) == ()
     # a photograph that is turned by 3 px: its windows are found, their rays do not meet the others
     turned = truth.rotation.copy()
     turned[2] = turned[2] @ rotation_from_vector(np.array([3 / lens.c_px, 0.0, 0.0]))
     apart = replace(truth, rotation=turned)
-    wrong = find_covering_points(photographs, network, apart, windows=Windows(15), side_px=15)
+    wrong = find_covering_points(photographs, network, apart, window_px=15, side_px=15)
     assert wrong.matched > 100
     (found_wrong,) = remarks_on_disagreement(wrong)
     assert found_wrong.number("share") == pytest.approx(1 - len(wrong.residuals) / wrong.matched)
@@ -420,14 +420,12 @@ def test_matches_that_do_not_come_back_are_refused() -> None:
     there = project(truth.cameras[0], truth.position[1], truth.rotation[1], truth.points)
     match = match_lsm(left, right, at, there, settings=LsmSettings(window_px=15, blur=True))
     assert match.good.sum() > 15
-    camera, warp = np.zeros(len(photographs), dtype=np.int64), match.warp
-    along = _epipolar_lines(truth, camera, 0, 1, truth.points, np.where(np.isfinite(warp), warp, np.eye(3)))
-    good = _returning(left, right, at, match, along, Windows(15))
+    good = _returning(left, right, at, match, 15)
     assert good.sum() >= match.good.sum() - 2
     first, *_ = np.flatnonzero(good).tolist()
     moved = match.xy.copy()
     moved[first] += [1.0, 0.0]
-    again = _returning(left, right, at, replace(match, xy=moved), along, Windows(15))
+    again = _returning(left, right, at, replace(match, xy=moved), 15)
     assert not again[first] and again.sum() == good.sum() - 1
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.matching.lsm.coverage import CoveredPixels, Windows
+from sfm.matching.lsm.coverage import CoveredPixels
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.matching.tracks import feature_tracks
 from sfm.model.camera import project
@@ -199,41 +199,41 @@ def test_a_photograph_has_as_many_points_as_the_survey_says(tmp_path: Path) -> N
 def test_windows_have_the_size_that_the_surface_bears_unless_the_survey_says_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(surface_points, "TRIED_WINDOWS", (Windows(9),))
+    monkeypatch.setattr(surface_points, "TRIED_WINDOWS_PX", (9,))
     monkeypatch.setattr(surface_points, "TRIAL_RAYS", 10)
     for more, side in (("", 9), (HELD, 15)):
         assert all((one.semi_axes == side / 2).all() for one in covered(tmp_path, more).overlays)
 
 
 @pytest.mark.parametrize(
-    ("found", "windows"),
+    ("found", "window_px"),
     [
-        ({15: (1750, 0.057), 11: (2983, 0.066), 21: (973, 0.058)}, Windows(11)),  # stone
-        ({15: (3889, 0.025), 11: (7112, 0.032), 21: (1937, 0.021)}, Windows(15)),  # smooth, white noise
-        ({15: (265, 0.359), 11: (274, 0.316), 21: (300, 0.28)}, Windows(21)),  # correlated noise
-        ({15: (265, 0.359), 11: (274, 0.316), 21: (10, 0.01)}, Windows(11)),  # too few of 21 px
-        ({15: (265, 0.359), 11: (274, 0.316), -15: (820, 0.28), -21: (610, 0.25)}, Windows(15, "shift")),
-        ({15: (265, 0.359), -15: (320, 0.35), -21: (610, 0.15)}, Windows(21, "shift")),
-        ({15: (1000, 0.05), -15: (1050, 0.047), -21: (500, 0.05)}, Windows(15)),  # hardly better: not shown
-        ({}, Windows(15)),
+        ({15: (1750, 0.057), 11: (2983, 0.066), 21: (973, 0.058)}, 11),  # stone
+        ({15: (3889, 0.025), 11: (7112, 0.032), 21: (1937, 0.021)}, 15),  # smooth, white noise
+        ({15: (265, 0.359), 11: (274, 0.316), 21: (300, 0.28)}, 21),  # correlated noise
+        ({15: (265, 0.359), 11: (274, 0.316), 21: (10, 0.01)}, 11),  # too few of 21 px
+        ({15: (1000, 0.05), 11: (1859, 0.048), 21: (510, 0.048)}, 15),  # hardly better: not shown
+        ({}, 15),
     ],
 )
 def test_windows_are_taken_whose_rays_together_are_precise(
-    monkeypatch: pytest.MonkeyPatch, found: dict[int, tuple[int, float]], windows: Windows
+    monkeypatch: pytest.MonkeyPatch, found: dict[int, tuple[int, float]], window_px: int
 ) -> None:
-    """Rays and their spread on two photographs by side (negative: shifts), four sides apart in each case."""
+    """Rays and their spread on two photographs by side, four sides apart in each case."""
 
-    def trial(*_: object, windows: Windows, **__: object) -> CoveringPoints:
-        rays, spread = found.get(windows.side_px * (1 if windows.model == "tilt" else -1), (0, 1.0))
+    def trial(*_: object, window_px: int, **__: object) -> CoveringPoints:
+        rays, spread = found.get(window_px, (0, 1.0))
         seen = ImagePoints(*(np.zeros((rays, *shape)) for shape in ((), (), (2,), (2, 2))))
-        return CoveringPoints(seen, np.zeros((0, 3)), np.full((rays, 2), spread), rays)
+        return CoveringPoints(
+            seen, np.zeros((0, 3)), np.zeros((rays, 2, 2)), np.full((rays, 2), spread), rays
+        )
 
     monkeypatch.setattr(surface_points, "find_covering_points", trial)
     network, truth = make_network(seed_of("trial"), images=2, points=20)
     truth = replace(truth, cameras=tuple(replace(one, size_px=(1024, 768)) for one in truth.cameras))
-    assert surface_points._best_windows([], network, truth, TiePointSettings(), 1) == windows
+    assert surface_points._best_window([], network, truth, TiePointSettings(), 1) == window_px
     given = TiePointSettings(window_px=15)
-    assert surface_points._best_windows([], network, truth, given, 1).side_px == 15
+    assert surface_points._best_window([], network, truth, given, 1) == 15
 
 
 def test_windows_that_agree_off_the_surface_do_not_disagree(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ reported as too precise, and no residual would show it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -24,26 +23,18 @@ MAX_SHARED_FRACTION = 0.15  # of the pixels of a point, or of a window, that oth
 SAMPLES = np.linspace(-0.42, 0.42, 6)  # positions in a window, in sides, where coverage is checked
 
 
-@dataclass(frozen=True)
-class Windows:
-    """Windows of least squares matching."""
-
-    side_px: int  # odd
-    model: str = "tilt"  # or shift, for which the tilt comes from the plane through the tie points
-
-
-def first_alike(costs: Sequence[tuple[Windows, float]]) -> Windows:
-    """Return the first windows that are nearly as precise as the best for the same pixels.
+def first_alike(costs: Sequence[tuple[int, float]]) -> int:
+    """Return the side of the first windows that are nearly as precise as the best for the same pixels, px.
 
     The standard deviation of a window's position is proportional to 1 / side, and the number of windows to
     1 / side^2. With noise alone, all sizes together give the same precision. If larger ones give less, the
     surface is not plane over them.
 
     Args:
-        costs: windows, the preferred ones first, each with the standard deviation from all its rays together.
+        costs: sides of windows, the preferred ones first, with the standard deviation from all rays together.
     """
     best = min(cost for _, cost in costs)
-    return next(windows for windows, cost in costs if cost <= MAX_COST_RATIO * best)
+    return next(side_px for side_px, cost in costs if cost <= MAX_COST_RATIO * best)
 
 
 class CoveredPixels:

@@ -1,6 +1,6 @@
 """Least squares matching of a patch: window, warp, gradients and normal equations.
 
-Observations are the intensities of the window. Unknowns are 2, 4, 6 or 8 geometric parameters, gain and
+Observations are the intensities of the window. Unknowns are 2, 6 or 8 geometric parameters, gain and
 offset, and three parameters for a difference of blur if the photographs may be blurred differently. The
 template is in single precision, the sums are in double precision.
 """
@@ -18,10 +18,8 @@ from sfm.runtime.sampling import AFTER, BEFORE, BILINEAR, TAPS, kernel_weights, 
 from sfm.runtime.small_algebra import factorise
 
 MAX_STRETCH = 3.0  # ratio of lengths of a patch in both photographs above which it is not a match
-# Geometric parameters. A tilt of the surface moves what a window shows along the epipolar line, in proportion
-# to the distance from its centre.
-SHIFT, TILT = 2, 4
-MODELS = {"shift": SHIFT, "tilt": TILT, "affine": 6, "projective": 8}
+SHIFT, LINEAR = 2, 4  # geometric parameters of the shift, and of the linear part of a warp
+MODELS = {"shift": SHIFT, "affine": SHIFT + LINEAR, "projective": 8}
 RADIOMETRIC = 2  # offset and gain
 # Differences of the second moments of blur, px^2: xx, xy, yy. A blur changes intensities by half the products
 # of its second moments and the second derivatives, up to moments of higher order.
@@ -45,7 +43,6 @@ class Workspace(NamedTuple):
     kind: int  # kernel of resampling
     geometric: int  # geometric parameters
     blurred: int  # parameters of blur: 0 or BLUR
-    along: FloatArray  # direction of the epipolar line in the template, unit vector, (2,)
     grid: AnyArray  # template with its margin, float32
     J: AnyArray  # d (patch) / d (unknowns), one row each, float32, (u, side^2)
     N: FloatArray  # normal matrix, (u, u)
@@ -67,7 +64,6 @@ def new_workspace(half: int, kind: int, geometric: int, blurred: int) -> Workspa
         kind,
         geometric,
         blurred,
-        np.zeros(2),
         np.empty((wide, wide), np.float32),
         np.empty((size, side * side), np.float32),
         np.empty((size, size)),
@@ -85,7 +81,7 @@ def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int
     """Compute gradients, normal matrix and factor of the template around a point; return the flag."""
     if not resample_window(left, x, y, work.half + MARGIN, work.kind, work.wx, work.wy, work.grid):
         return OUTSIDE
-    gradients(work.grid, work.half, work.geometric, work.along, work.J)
+    gradients(work.grid, work.half, work.geometric, work.J)
     if work.blurred:
         blur_changes(work.grid, work.half, work.J[work.geometric + RADIOMETRIC :])
     fill_normals(work.J, work.N)
@@ -93,12 +89,11 @@ def prepare_template(left: AnyArray, x: float, y: float, work: Workspace) -> int
 
 
 @compiled
-def gradients(grid: AnyArray, half: int, geometric: int, along: FloatArray, J: AnyArray) -> None:
+def gradients(grid: AnyArray, half: int, geometric: int, J: AnyArray) -> None:
     """Fill J: d (patch) / d (geometric, offset, gain), with window coordinates in half windows.
 
-    Order of the geometric parameters: shift x, y; xx, xy, yx, yy, or tilt x, y; and the two of perspective.
+    Order of the geometric parameters: shift x, y; xx, xy, yx, yy; and the two of perspective.
     """
-    ex, ey = np.float32(along[0]), np.float32(along[1])
     a, b, c = np.float32(half * SLOPE[0]), np.float32(half * SLOPE[1]), np.float32(half * SLOPE[2])
     side = 2 * half + 1
     for i in range(side):
@@ -113,10 +108,7 @@ def gradients(grid: AnyArray, half: int, geometric: int, along: FloatArray, J: A
             gy = a * (grid[y + 1, x] - grid[y - 1, x]) + b * (grid[y + 2, x] - grid[y - 2, x])
             gy += c * (grid[y + 3, x] - grid[y - 3, x])
             J[0, p], J[1, p] = gx, gy
-            if geometric == TILT:
-                slope = ex * gx + ey * gy
-                J[2, p], J[3, p] = slope * u, slope * v
-            elif geometric > TILT:
+            if geometric > SHIFT:
                 J[2, p], J[3, p], J[4, p], J[5, p] = gx * u, gx * v, gy * u, gy * v
             if geometric > 6:
                 outwards = gx * u + gy * v
@@ -233,7 +225,7 @@ def resample_patch(
 
 
 @compiled
-def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int, along: FloatArray) -> float:
+def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int) -> float:
     """Apply the step q, H <- H dH^-1; return the shift in px, inf if gain or warp become degenerate."""
     beta = q[geometric + 1]
     if not beta > 0.0:
@@ -242,12 +234,7 @@ def put_step(H: FloatArray, q: FloatArray, half: int, geometric: int, along: Flo
     d00, d01, d02 = 1.0, 0.0, half * q[0] / beta
     d10, d11, d12 = 0.0, 1.0, half * q[1] / beta
     d20, d21 = 0.0, 0.0
-    if geometric == TILT:
-        d00 += along[0] * q[2] / beta
-        d01 += along[0] * q[3] / beta
-        d10 += along[1] * q[2] / beta
-        d11 += along[1] * q[3] / beta
-    elif geometric > TILT:
+    if geometric > SHIFT:
         d00 += q[2] / beta
         d01 += q[3] / beta
         d10 += q[4] / beta

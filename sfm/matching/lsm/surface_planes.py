@@ -7,14 +7,14 @@ windows then lead to another position. The largest window that no smaller one co
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
-from sfm.model.camera import tangents_from_pixel
+from sfm.model.camera import Camera, tangents_from_pixel
 from sfm.model.conventions import MAD_TO_SIGMA, AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, rows_of
@@ -32,12 +32,28 @@ TOLERANCE_FACTOR = 6.0  # of the spread of points about the planes of their neig
 REGULARISATION_FRACTION = 1e-6
 
 
-def planes_at(
-    estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray
-) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True)
+class Planes:
+    """Planes of the surface at positions in a photograph; NaN where there are none in front of it.
+
+    The slope of a plane is the change of its inverse depth per px of the photograph, relative to that at the
+    position.
+    """
+
+    points: FloatArray  # object points at the positions, (k, 3)
+    normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
+    slope_covariance: FloatArray  # 1 / px^2, (k, 2, 2)
+
+    def select(self, rows: BoolArray | IntArray) -> Planes:
+        """Return the selected planes."""
+        return Planes(self.points[rows], self.normal[rows], self.slope_covariance[rows])
+
+
+def planes_at(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, point: IntArray) -> Planes:
     """Project positions in a photograph onto the planes through the object points around them.
 
-    Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c.
+    Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c. The covariance of
+    a slope is that of the fit, with the spread of all points about the planes of their neighbours.
 
     Args:
         estimate: orientation and object points.
@@ -45,30 +61,63 @@ def planes_at(
         i: the photograph.
         xy: positions, px, (k, 2).
         point: object points that it sees.
-
-    Returns:
-        Object points at the positions, and unit normals of the surface there, towards the photograph, both
-        (k, 3); NaN where the neighbours define no plane in front of the photograph.
     """
     lens, X0, R = estimate.cameras[camera[i]], estimate.position[i], estimate.rotation[i]
     points, normal = np.full((len(xy), 3), np.nan), np.full((len(xy), 3), np.nan)
+    covariance = np.full((len(xy), 2, 2), np.nan)
     UVW = (estimate.points[point] - X0) @ R
     UVW = UVW[UVW[:, 2] < 0]
     uv = tangents_from_pixel(lens, xy)
     rows = np.flatnonzero(np.isfinite(uv).all(axis=1))
-    if len(UVW) < NEIGHBOURS or not len(rows):
-        return points, normal
+    if len(UVW) <= NEIGHBOURS or not len(rows):
+        return Planes(points, normal, covariance)
     known, inverse, uv = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2], uv[rows]
     near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
-    plane = _planes(known[near] - uv[:, None], inverse[near])[0]
+    plane, N = _planes(known[near] - uv[:, None], inverse[near])
+    spread = MAD_TO_SIGMA * np.median(np.abs(_off_neighbours(known, inverse)[0]))
     value = plane[:, 2].copy()  # inverse of the depth at the position
     plane[:, 2] -= np.sum(plane[:, :2] * uv, axis=1)
     inside = (value > inverse.min() / FARTHEST) & (value < inverse.max() / NEAREST)
     rows, uv, value, plane = rows[inside], uv[inside], value[inside], plane[inside]
+    T = _tangents_per_px(lens, xy[rows]) * (spread / value)[:, None, None]
+    covariance[rows] = T @ np.linalg.inv(N[inside])[:, :2, :2] @ T.transpose(0, 2, 1)
     points[rows] = X0 + (np.column_stack([uv, -np.ones(len(uv))]) / value[:, None]) @ R.T
     across = -(plane * [1.0, 1.0, -1.0]) @ R.T
     normal[rows] = across / np.linalg.norm(across, axis=1, keepdims=True)
-    return points, normal
+    return Planes(points, normal, covariance)
+
+
+def tilted_planes(
+    estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, planes: Planes, slope: FloatArray
+) -> Planes:
+    """Return the planes at positions in a photograph after a change of their slopes.
+
+    Args:
+        estimate: orientation.
+        camera: index of the camera of each photograph, (m,).
+        i: the photograph.
+        xy: positions, px, (k, 2).
+        planes: planes there.
+        slope: changes, 1 / px, (k, 2).
+    """
+    lens, R = estimate.cameras[camera[i]], estimate.rotation[i]
+    uv = tangents_from_pixel(lens, xy)
+    normal = planes.normal @ R  # of U, V, W = t (u, v, -1); scaled so that 1 / t is 1 at the position
+    normal /= (normal[:, :2] * uv).sum(axis=1, keepdims=True) - normal[:, 2:]
+    change = np.linalg.solve(_tangents_per_px(lens, xy), slope[:, :, None])[:, :, 0]
+    normal[:, :2] += change
+    normal[:, 2] += (change * uv).sum(axis=1)
+    across = -normal @ R.T
+    return replace(planes, normal=across / np.linalg.norm(across, axis=1, keepdims=True))
+
+
+def _tangents_per_px(lens: Camera, xy: FloatArray) -> FloatArray:
+    """Return d(u, v) / d(x) in the first row and d(u, v) / d(y) in the second, (k, 2, 2)."""
+    moved = [
+        (tangents_from_pixel(lens, xy + half) - tangents_from_pixel(lens, xy - half))
+        for half in np.eye(2) / 2
+    ]
+    return np.stack(moved, axis=1)
 
 
 def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> BoolArray:
@@ -98,18 +147,33 @@ def on_surface(seen: ImagePoints, estimate: Estimate, doubtful: BoolArray) -> Bo
                 good[point[on[doubtful[point[on]]]]] = False
                 break
             uv, inverse = -UVW[on, :2] / UVW[on, 2:], -1 / UVW[on, 2]
-            near = cKDTree(uv).query(uv, k=NEIGHBOURS + 1)[1]
-            itself = near == np.arange(len(near))[:, None]
-            itself[~itself.any(axis=1), -1] = True  # several at one position
-            near = near[~itself].reshape(len(near), -1)
-            plane, N = _planes(uv[near] - uv[:, None], inverse[near])
-            off = np.abs(inverse - plane[:, 2]) / np.sqrt(1 + np.linalg.inv(N)[:, 2, 2])
+            off, near = _off_neighbours(uv, inverse)
+            off = np.abs(off)
             out = doubtful[point[on]] & (off > TOLERANCE_FACTOR * MAD_TO_SIGMA * np.median(off))
             if not out.any():
                 break
             worst = out & (off >= np.where(out[near], off[near], 0.0).max(axis=1))
             good[point[on[worst]]] = False
     return good
+
+
+def _off_neighbours(uv: FloatArray, inverse: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return how far points are from the planes of their neighbours, and these.
+
+    Args:
+        uv: tangents of more than NEIGHBOURS points, (k, 2).
+        inverse: their inverse depths, (k,).
+
+    Returns:
+        Differences of inverse depths, all with the standard deviation of that of a point, (k,), and indices,
+        (k, NEIGHBOURS).
+    """
+    near = cKDTree(uv).query(uv, k=NEIGHBOURS + 1)[1]
+    itself = near == np.arange(len(near))[:, None]
+    itself[~itself.any(axis=1), -1] = True  # several at one position
+    near = near[~itself].reshape(len(near), -1)
+    plane, N = _planes(uv[near] - uv[:, None], inverse[near])
+    return (inverse - plane[:, 2]) / np.sqrt(1 + np.linalg.inv(N)[:, 2, 2]), near
 
 
 def _planes(away: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -156,7 +220,8 @@ def match_where_plane(
     """
     rows = np.flatnonzero(matches.good)
     start, linear = matches.xy[rows].copy(), linear_part(matches.warp[rows])
-    good = LsmMatches(**{field.name: getattr(matches, field.name)[rows] for field in fields(matches)})
+    names = [field.name for field in fields(matches) if field.name != "linear"]
+    good = LsmMatches(**{name: getattr(matches, name)[rows] for name in names})
     sides, by_size = [window_px], [good]
     while len(rows) and (side := int(SIDE_RATIO * sides[-1]) | 1) >= MIN_WINDOW_PX:
         settings = LsmSettings(window_px=side, interpolation=interpolation)
@@ -168,7 +233,7 @@ def match_where_plane(
         sides.append(side)
         by_size.append(smaller)
     chosen, off = _largest_that_agrees(by_size), np.zeros((len(matches), 2))
-    columns = {field.name: getattr(matches, field.name).copy() for field in fields(matches)}
+    columns = {name: getattr(matches, name).copy() for name in names}
     for number in range(1, len(sides)):
         of_size = np.flatnonzero(chosen == number)
         for name, column in columns.items():

@@ -4,7 +4,7 @@ The patch T around a point of the left photograph is related to the right photog
 
     S(H x) = alpha + beta T(x) + noise
 
-for x in the window, with a geometric model H (shift, tilt, affine or projective) and two radiometric ones.
+for x in the window, with a geometric model H (shift, affine or projective) and two radiometric ones.
 Gauss-Newton is written in its inverse form. The change dH of a step is applied to the template, whose
 gradients and normal equations then stay the same in all steps, and H is updated by H <- H dH^-1. The right
 photograph is resampled in every step. The gradients are symmetric differences of the resampled template. At
@@ -15,7 +15,7 @@ gradients.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from sfm.matching.correlation import (
 from sfm.matching.lsm.patch_equations import (
     BLUR,
     BLUR_NOISE,
+    LINEAR,
     MODELS,
     RADIOMETRIC,
     SHIFT,
@@ -59,9 +60,12 @@ TEXTURE_SIGMAS = 3.0
 # Variance of this energy over n pixels, times n, for a mean of 1: twice the sum of squared autocorrelations
 # of white noise seen through the difference formula, and through the mask that estimates its variance.
 ENERGY_VARIANCE = 2.0 * 1.576 + 2.0 * (35.0 / 18.0) ** 2
-# Columns of the result for a patch: position with its covariances, gain, offset, r, sigma0, steps.
-OUTPUTS = 11
-FLAG, X, Y, CXX, CXY, CYY, GAIN, OFFSET, R, SIGMA0, STEPS = range(OUTPUTS)
+# Columns of the result for a patch: position with its covariances, gain, offset, r, sigma0, steps, and in
+# left units the variance of a difference of intensities and that of white noise.
+OUTPUTS = 13
+FLAG, X, Y, CXX, CXY, CYY, GAIN, OFFSET, R, SIGMA0, STEPS, VARIANCE, WHITE = range(OUTPUTS)
+# Columns of the linear part of a warp: score, its derivative and its spread, and the derivative of the shift.
+OF_LINEAR = (LINEAR, LINEAR * LINEAR, LINEAR * LINEAR, SHIFT * LINEAR)
 COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longer than this, px
 CONTRACTION = 0.04  # largest ratio of a step to the previous one; 0.01 to 0.03 on texture with noise
 # Next step after the last one allowed, up to which a match is accepted; along edges, steps shrink slowly.
@@ -79,6 +83,25 @@ class Limits(NamedTuple):
 
 
 @dataclass(frozen=True)
+class LinearParts:
+    """What the residuals of shifted windows say of the linear parts of their warps, which were kept.
+
+    A linear part is d = (xx, xy, yx, yy) in the left photograph: H (1 + d) fits better than H. Its score is
+    the product of the residuals and their derivatives by d, after elimination of all that was estimated.
+    """
+
+    score: FloatArray  # in left units, (k, 4)
+    derivative: FloatArray  # of the expected score by d, (k, 4, 4)
+    spread: FloatArray  # covariance of the score if a difference of intensities has the variance 1, (k, 4, 4)
+    variance: FloatArray  # of a difference of intensities, left units, (k,)
+    shift: FloatArray  # derivative of the estimated shift by d, px in the left photograph, (k, 2, 4)
+
+    def select(self, rows: BoolArray) -> LinearParts:
+        """Return those of the selected matches."""
+        return LinearParts(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+@dataclass(frozen=True)
 class LsmMatches:
     """Positions in the right photograph found by least squares matching; NaN with the reason in the flag."""
 
@@ -91,6 +114,7 @@ class LsmMatches:
     sigma0: FloatArray  # standard deviation of an intensity difference, right units, (k,)
     steps: IntArray  # Gauss-Newton steps, (k,)
     flag: IntArray  # see LsmFlag, 0 = matched, (k,)
+    linear: LinearParts | None = None  # where the settings ask for them
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -107,8 +131,7 @@ class LsmSettings:
     """Settings of least squares matching."""
 
     model: str = "affine"
-    """shift (2), tilt (4), affine (6) or projective (8 parameters), each with gain and offset. The tilt of a
-    plane is all that is unknown of its warp in oriented photographs."""
+    """shift (2), affine (6) or projective (8 parameters), each with gain and offset."""
     window_px: int = 21  # odd side of the template
     interpolation: str = "six_tap"
     """kernel for the right photograph. On fine texture the standard deviation is 1.25 times that of six_tap
@@ -124,6 +147,8 @@ class LsmSettings:
     """whether three more unknowns describe the difference of blur between the photographs. On an oblique
     surface the blur always differs, since a pixel covers more of it. Without these unknowns, windows move by
     0.01 px, in the same way in all matches of a template."""
+    linear: bool = False
+    """whether the matches of a shift have the score of the linear part of their warp."""
 
 
 @checked_arguments(xy_left="k 2", xy_right="n 2")
@@ -135,7 +160,6 @@ def match_lsm(
     settings: LsmSettings = LsmSettings(),
     *,
     start: FloatArray | None = None,
-    along: FloatArray | None = None,
     threads: int = 1,
 ) -> LsmMatches:
     """Match points of the left photograph in the right one, from positions known to a pixel or two.
@@ -148,16 +172,14 @@ def match_lsm(
         settings: geometric model, window, interpolation, end of the steps, and limits of a match.
         start: linear part of the warp, right px per left px, (k, 2, 2), or its homography relative to both
             points, (k, 3, 3), whose perspective an affine model keeps; by default the unit matrix.
-        along: for tilt: directions of the epipolar lines in the left photograph, of any length, (k, 2); a
-            point without one (NaN or 0) is not matched.
         threads: number of threads that share the patches.
 
     Returns:
         One match per point; the covariance assumes the same noise in both photographs, after the gain.
 
     Raises:
-        GeometryError: an unknown model or kernel, an even window, different numbers of points, or a tilt
-            without epipolar lines.
+        GeometryError: an unknown model or kernel, an even window, different numbers of points, or the score
+            of a linear part that is estimated.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
     Computer and Robot Vision II, ch. 16; the inverse form is Baker and Matthews (2004), IJCV 56(3).
@@ -181,17 +203,13 @@ def match_lsm(
     given = np.broadcast_to(np.eye(2), (k, 2, 2)) if start is None else start
     if given.shape not in ((k, 2, 2), (k, 3, 3)):
         raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")
-    lines = np.zeros((k, 2)) if model != "tilt" else np.array([] if along is None else along, dtype=float)
-    if lines.shape != (k, 2):
-        raise GeometryError(f"LSM: epipolar lines of shape {lines.shape}, needed ({k}, 2) for a tilt")
-    lines[~np.isfinite(lines).all(axis=1)] = 0.0  # no line, no match
-    lines /= np.maximum(np.abs(lines).max(axis=1, initial=0.0, keepdims=True), np.finfo(float).tiny)
-    lines /= np.maximum(np.linalg.norm(lines, axis=1, keepdims=True), np.finfo(float).tiny)
+    if settings.linear and model != "shift":
+        raise GeometryError(f"LSM: score of a linear part with model '{model}', needed model 'shift'")
     warp = np.zeros((k, 3, 3))
     warp[:, : given.shape[1], : given.shape[1]] = given
     warp[:, 2, 2] = 1.0
     warp[:, :2] += b[:, :, None] * warp[:, 2, None]
-    out = np.zeros((k, OUTPUTS))
+    out, linear = np.zeros((k, OUTPUTS)), np.zeros((k, sum(OF_LINEAR) if settings.linear else 0))
     grey_left, grey_right, blurred = grey_of(left), grey_of(right), BLUR if settings.blur else 0
     limits = Limits(
         float(settings.stop_px),
@@ -210,9 +228,9 @@ def match_lsm(
             blurred,
             limits,
             a[part],
-            lines[part],
             warp[part],
             out[part],
+            linear[part],
         )
 
     if threads > 1:
@@ -227,7 +245,26 @@ def match_lsm(
     covariance[flag != 0] = np.nan
     steps = out[:, STEPS].astype(np.int64)
     return LsmMatches(
-        xy, covariance, warp, out[:, GAIN], out[:, OFFSET], out[:, R], out[:, SIGMA0], steps, flag
+        xy,
+        covariance,
+        warp,
+        out[:, GAIN],
+        out[:, OFFSET],
+        out[:, R],
+        out[:, SIGMA0],
+        steps,
+        flag,
+        _linear_parts(linear, out[:, VARIANCE]) if settings.linear else None,
+    )
+
+
+def _linear_parts(columns: FloatArray, variance: FloatArray) -> LinearParts:
+    """Return the columns of the linear parts of k patches with their names."""
+    k = len(columns)
+    score, derivative, spread, shift = np.split(columns, np.cumsum(OF_LINEAR)[:-1], axis=1)
+    square = (k, LINEAR, LINEAR)
+    return LinearParts(
+        score, derivative.reshape(square), spread.reshape(square), variance, shift.reshape(k, SHIFT, LINEAR)
     )
 
 
@@ -241,19 +278,20 @@ def _match_all(
     blurred: int,
     limits: Limits,
     xy: FloatArray,
-    along: FloatArray,
     warp: FloatArray,
     out: FloatArray,
+    linear: FloatArray,
 ) -> None:
-    """Match the patches one by one; `warp` changes from start to solution, `out` receives the columns."""
+    """Match the patches one by one; `warp` changes from start to solution, `out` and `linear` are filled."""
     work = new_workspace(half, kind, geometric, blurred)
     for i in range(len(xy)):
-        work.along[:] = along[i]
         out[i, FLAG] = prepare_template(left, xy[i, 0], xy[i, 1], work)
         if out[i, FLAG] == MATCHED:
             out[i, FLAG] = _iterate(right, work, limits, warp[i], out[i])
         if out[i, FLAG] == MATCHED:
             out[i, FLAG] = judge(work, limits.min_correlation, warp[i], out[i])
+        if out[i, FLAG] == MATCHED and linear.shape[1] > 0:
+            fill_linear_part(work, out[i], linear[i])
 
 
 @compiled
@@ -271,7 +309,7 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         for a in range(len(q)):
             rhs[a] = q[a] = dot(work.J[a], work.patch)
         solve_factorised(work.L, q)
-        length = put_step(H, q, half, work.geometric, work.along)
+        length = put_step(H, q, half, work.geometric)
         if not length < np.inf:
             return DIVERGED
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
@@ -310,13 +348,14 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
     out[X], out[Y] = H[0, 2], H[1, 2]
     out[GAIN], out[OFFSET], out[R], out[SIGMA0] = beta, alpha, r, np.sqrt(residual / (n - len(q)))
     variance *= 1.0 + max(1.0, 1.0 / area_ratio(H))  # of the difference of two, as it affects texture
+    out[VARIANCE], out[WHITE] = variance / (beta * beta), white / (beta * beta)
     variance *= (half / beta) ** 2
     # The solution obeys J'^T (S - ...) = 0 with noisy J': its covariance is (J'^T J)^-1 J'^T J' (J^T J')^-1,
     # where J'^T J' = N, and J'^T J is N minus the contribution of noise.
     least = 1.0 + TEXTURE_SIGMAS * np.sqrt(ENERGY_VARIANCE / n)
-    clean = without_noise(N, least * white / (beta * beta), half, geometric)
+    clean = without_noise(N, least * out[WHITE], half, geometric)
     flat = not factorise(clean, clean, 0.0)
-    clean = N.copy() if flat else without_noise(N, white / (beta * beta), half, geometric)
+    clean = N.copy() if flat else without_noise(N, out[WHITE], half, geometric)
     factorise(clean, clean, 0.0)
     column, middle = np.empty(len(q)), np.empty(len(q))
     for k in range(2):
@@ -342,6 +381,56 @@ def judge(work: Workspace, min_r: float, H: FloatArray, out: FloatArray) -> int:
 
 
 @compiled
+def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> None:
+    """Fill the columns of the linear part of a warp at the solution of its shift.
+
+    The residuals obey J'^T v = 0 with the noisy gradients J' of what was estimated. A linear part d that was
+    not estimated moves this solution by -(J'^T J)^-1 J'^T J_d d.
+    """
+    half, N, J, v = work.half, work.N, work.J, work.patch  # which holds residuals
+    side, u = 2 * half + 1, len(work.q)
+    rows = np.empty((LINEAR, side * side), np.float32)
+    for i in range(side):
+        y = np.float32((i - half) / half)
+        for j in range(side):
+            p = i * side + j
+            x = np.float32((j - half) / half)
+            rows[0, p], rows[1, p] = J[0, p] * x, J[0, p] * y
+            rows[2, p], rows[3, p] = J[1, p] * x, J[1, p] * y
+    clean = without_noise(N, out[WHITE], half, SHIFT)
+    factorise(clean, clean, 0.0)
+    cross, solved, weighted = np.empty((LINEAR, u)), np.empty((LINEAR, u)), np.zeros((LINEAR, u))
+    for a in range(LINEAR):
+        for k in range(u):
+            cross[a, k] = solved[a, k] = dot(rows[a], J[k])
+        solve_factorised(clean, solved[a])
+        for k in range(u):
+            for m in range(u):
+                weighted[a, k] += N[k, m] * solved[a, m]
+    derivative, spread = LINEAR, LINEAR + LINEAR * LINEAR
+    shift = spread + LINEAR * LINEAR
+    noise = side * side * out[WHITE] * SLOPE_NOISE * half * half * mean_square(half)
+    for a in range(LINEAR):
+        linear[a] = -dot(rows[a], v) / out[GAIN]
+        for b in range(a + 1):
+            whole = dot(rows[a], rows[b])
+            expected = whole - noise if a == b else whole
+            for k in range(u):
+                expected -= cross[a, k] * solved[b, k]
+                whole += (weighted[a, k] - cross[a, k]) * solved[b, k] - solved[a, k] * cross[b, k]
+            linear[derivative + LINEAR * a + b] = linear[derivative + LINEAR * b + a] = expected
+            linear[spread + LINEAR * a + b] = linear[spread + LINEAR * b + a] = whole
+        for k in range(SHIFT):
+            linear[shift + LINEAR * k + a] = -half * solved[a, k]
+
+
+@compiled
+def mean_square(half: int) -> float:
+    """Return the mean square of the coordinates of a window along one axis, in half windows."""
+    return (half + 1.0) / (3.0 * half)
+
+
+@compiled
 def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> FloatArray:
     """Return a normal matrix without the mean contribution of white noise in the template.
 
@@ -354,7 +443,7 @@ def without_noise(N: FloatArray, white: float, half: int, geometric: int) -> Flo
     clean = N.copy()
     n = (2 * half + 1) ** 2
     noise = n * white * SLOPE_NOISE * half * half  # of gradients along x and y, which share no noise
-    second = (half + 1.0) / (3.0 * half)  # mean squares of the window coordinates; below, their fourth powers
+    second = mean_square(half)
     fourth = second * (3.0 * half * half + 3.0 * half - 1.0) / (5.0 * half * half)
     for a in range(geometric):
         if a < SHIFT:

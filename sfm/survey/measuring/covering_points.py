@@ -4,9 +4,10 @@ A few hundred tie points orient the photographs and give the shape of the surfac
 after that. Textured squares, side by side, are placed on the plane through the points around them in space.
 They are projected into all photographs that see the plane, and matched there. Photographs with the most
 similar direction come first, and their rays correct the position of the point for the others. A point is thus
-followed through all its photographs, even if their directions are too different for descriptors. No pixel is
-measured twice. Each photograph takes squares from pixels that earlier photographs did not cover. A square is
-matched only in photographs whose pixels there are still free.
+followed through all its photographs, even if their directions are too different for descriptors. All rays of
+a point share the slope of its plane, which their windows correct. No pixel is measured twice. Each photograph
+takes squares from pixels that earlier photographs did not cover. A square is matched only in photographs
+whose pixels there are still free.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.matching.correlation import MIN_CORRELATION
-from sfm.matching.lsm.coverage import CoveredPixels, Windows, plane_warps, project_points
+from sfm.matching.lsm.coverage import CoveredPixels, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
-from sfm.matching.lsm.surface_planes import NEIGHBOURS, planes_at
+from sfm.matching.lsm.surface_planes import NEIGHBOURS, Planes, planes_at, tilted_planes
 from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
+from sfm.matching.lsm.window_slopes import ShiftedWindows, estimate_slopes, slope_equations
 from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
@@ -38,7 +40,10 @@ SCALES = (0.4, 2.5)  # smallest and largest scale of a window relative to the re
 BORDER_PX = 4  # between a window and the border of a photograph
 RETURN_FACTOR = 3.0  # largest return error of a match that is matched back, over the median error, in sigmas
 MIN_RAYS = 3  # of a point; two where only two photographs see the surface
-STEP = 1e-3  # towards the photograph, relative to the distance, that shows the direction of epipolar lines
+STEP = 1e-3  # towards the photograph, relative to the distance, that shows parallaxes
+# Mean square of the tangent, along one axis, of the angle between a plane and the one across its ray, if all
+# directions of MIN_COSINE and more are alike: the variance of slopes that are not known, times c^2.
+UNKNOWN_SLOPE = (1 / MIN_COSINE - 1) / 2
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -48,6 +53,7 @@ class CoveringPoints:
 
     image_points: ImagePoints  # k image points of the points 0 to n - 1
     points: FloatArray  # object points, (n, 3)
+    of_slopes: FloatArray  # covariance of the rays by the slopes of their windows, px^2, (k, 2, 2)
     residuals: FloatArray  # of the rays in the given orientation, px, (k, 2)
     matched: int  # rays of points that enough photographs matched; k of them agree with each other
 
@@ -58,22 +64,26 @@ class Squares:
 
     image: int  # the photograph
     xy: FloatArray  # middles, px, (k, 2)
-    normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
-    points: FloatArray  # object points, (k, 3)
+    planes: Planes  # of the surface there
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def select(self, rows: BoolArray) -> Squares:
         """Return the selected squares."""
-        return Squares(self.image, self.xy[rows], self.normal[rows], self.points[rows])
+        return Squares(self.image, self.xy[rows], self.planes.select(rows))
 
 
 @dataclass(frozen=True)
 class SquareRays:
-    """The squares of one reference photograph, measured in all photographs that see them."""
+    """The squares of one reference photograph, measured in all photographs that see them.
+
+    The errors of the slopes of their windows move a square in depth, the same in all its rays. No residual
+    shows that. It is not in the covariance of the image points, but apart.
+    """
 
     image_points: ImagePoints
+    of_slopes: FloatArray  # covariance of the image points by the slopes of the windows, px^2, (k, 2, 2)
     scale: FloatArray  # of the windows relative to the reference, (k,)
     correlation: FloatArray  # r of each window and that of the reference, 1 for the latter, (k,)
 
@@ -83,6 +93,7 @@ class _Matched:
     """Rays of one photograph."""
 
     seen: ImagePoints
+    windows: ShiftedWindows
     correlation: FloatArray  # (k,)
     scale: FloatArray  # of the windows relative to the reference, (k,)
     in_reference: FloatArray  # half of the noise, assigned to the reference, px^2, (k, 2, 2)
@@ -93,7 +104,7 @@ def find_covering_points(
     network: Network,
     estimate: Estimate,
     *,
-    windows: Windows,
+    window_px: int,
     side_px: int,
     references: Sequence[int] | None = None,
     hidden: CoveredPixels | None = None,
@@ -105,7 +116,7 @@ def find_covering_points(
         photographs: m photographs, (H, W) each; files are read when needed.
         network: fitting image points of the tie points, which give the surface.
         estimate: orientation of the photographs, good to a few pixels, and the tie points.
-        windows: side and model of the windows.
+        window_px: odd side of the windows.
         side_px: side of the squares around the windows, px; no two squares share pixels.
         references: photographs to take points from; by default all, those with the most tie points first.
         hidden: masked pixels, which show nothing of the surface.
@@ -114,7 +125,7 @@ def find_covering_points(
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3).
     """
     m, camera, seen = len(photographs), network.camera, network.image_points
-    margin = windows.side_px // 2 + BORDER_PX
+    margin = window_px // 2 + BORDER_PX
     tie_rows = rows_of(seen.image, m)
     order = np.argsort([-len(rows) for rows in tie_rows], kind="stable") if references is None else references
     shapes = [estimate.cameras[lens].size_px[::-1] for lens in camera]
@@ -122,18 +133,17 @@ def find_covering_points(
     grey = GreyPhotographs(photographs.__getitem__)
     none = np.zeros(0, dtype=np.int64)
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    parts = [CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2)), 0)]
+    parts = [CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros((0, 2)), 0)]
 
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
         free_middles = covered.free_middles(i, side_px)
         if hidden is not None:
-            free_middles &= hidden.free_middles(i, windows.side_px)
+            free_middles &= hidden.free_middles(i, window_px)
         xy = textured_squares(grey[i].pixels, side_px, free_middles, border_px=margin)
-        points, normal = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
-        known = np.asarray(np.isfinite(points).all(axis=1))
-        squares = Squares(i, xy, normal, points).select(known)
-        visible, free = _visible(estimate, camera, squares, covered, margin, side_px, windows.side_px, hidden)
+        planes = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
+        squares = Squares(i, xy, planes).select(np.isfinite(planes.points).all(axis=1))
+        visible, free = _visible(estimate, camera, squares, covered, margin, side_px, window_px, hidden)
         of = free.sum(axis=0) >= rays
         if not more:
             of &= visible.sum(axis=0) == rays
@@ -145,18 +155,18 @@ def find_covering_points(
             camera,
             squares.select(of),
             free[:, of],
-            windows,
+            window_px,
             threads,
             both_ways=not more,
         )
-        new, used = _points_that_meet(measured.image_points, estimate, camera, rays)
+        new, used = _points_that_meet(measured, estimate, camera, rays)
         parts.append(new)
         covered.cover(new.image_points.image, new.image_points.xy, side_px * measured.scale[used])
 
     in_order = [
         i for i in np.asarray(order).tolist() if estimate.oriented[i] and len(tie_rows[i]) >= NEIGHBOURS
     ]
-    for i in reported(f"photographs covered by windows of {windows.side_px} px", in_order, len(in_order)):
+    for i in reported(f"photographs covered by windows of {window_px} px", in_order, len(in_order)):
         cover(i, MIN_RAYS, more=True)
         give_back_memory()
     for i in reported("photographs covered where one other one sees the surface", in_order, len(in_order)):
@@ -170,10 +180,10 @@ def seen_squares(
 ) -> Iterator[tuple[int, IntArray, FloatArray]]:
     """Yield each oriented photograph that sees squares from their front, which these are, and where, px."""
     for j in np.flatnonzero(estimate.oriented).tolist():
-        at = project_points(estimate, camera, np.full(len(squares), j), squares.points)
+        at = project_points(estimate, camera, np.full(len(squares), j), squares.planes.points)
         size = np.array(estimate.cameras[camera[j]].size_px)
-        ray = estimate.position[j] - squares.points
-        cosine = np.sum(ray * squares.normal, axis=1) / np.linalg.norm(ray, axis=1)
+        ray = estimate.position[j] - squares.planes.points
+        cosine = np.sum(ray * squares.planes.normal, axis=1) / np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin_px) & (at <= size - 1 - margin_px)).all(axis=1)
         rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
@@ -212,97 +222,126 @@ def match_squares(
     camera: IntArray,
     squares: Squares,
     visible: BoolArray,
-    windows: Windows,
+    window_px: int,
     threads: int,
     *,
     both_ways: bool,
 ) -> SquareRays:
     """Measure the squares of a photograph in the others, those with the most similar direction first.
 
-    Position and tilt of a plane are unknown in oriented photographs, and nothing else of its warp. A tilt
-    that is assumed instead moves the depth of a window by the same in all photographs, which no residual
-    shows.
+    Windows are shifted on the planes of the squares. The first matches correct positions and slopes of the
+    planes, on which all photographs are matched then. What these say of the slopes is applied to the matches
+    themselves, of which it is a linear function.
 
     Half of the noise of a match is that of the template, and is assigned to the reference, as in
     `tie_points`. If no third ray checks a match, it is also matched back.
     """
-    i, k = squares.image, len(squares.xy)
-    ray = estimate.position[:, None] - squares.points[None]
+    i, k = squares.image, len(squares)
+    ray = estimate.position[:, None] - squares.planes.points[None]
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)
     cosine = np.where(visible, np.einsum("mkc,kc->mk", ray, ray[i]), -np.inf)
     cosine[i] = np.inf
     rank = np.argsort(np.argsort(-cosine, axis=0, kind="stable"), axis=0, kind="stable")
-    first = visible & (rank <= FIRST_PHOTOGRAPHS)
-    template = photographs[i]
-    parts = [ImagePoints(np.full(k, i), np.arange(k), squares.xy, np.full((k, 2, 2), np.nan))]
-    scales, correlations = [np.ones(k)], [np.ones(k)]
-    in_reference, number = np.zeros((k, 2, 2)), np.zeros(k, dtype=np.int64)
+    reference = ImagePoints(np.full(k, i), np.arange(k), squares.xy, np.full((k, 2, 2), np.nan))
 
-    def matched(j: int, rows: IntArray, points: FloatArray, max_shift_px: float) -> _Matched | None:
-        at = project_points(estimate, camera, np.full(len(rows), j), points[rows])
-        warp = plane_warps(
-            estimate, camera, i, j, squares.xy[rows], points[rows], squares.normal[rows], windows.side_px / 2
+    def measure(which: BoolArray, planes: Planes, max_shift_px: float) -> list[_Matched]:
+        settings = LsmSettings(
+            model="shift",
+            window_px=window_px,
+            max_shift_px=max_shift_px,
+            min_correlation=MIN_CORRELATION,
+            blur=True,
+            linear=True,
         )
-        with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
-            scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
-        fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
-        if not fits.any():
-            return None
-        along = _epipolar_lines(estimate, camera, i, j, points[rows[fits]], warp[fits])
-        match = match_lsm(
-            template,
-            photographs[j],
-            squares.xy[rows[fits]],
-            at[fits],
-            start=warp[fits],
-            along=along,
-            settings=LsmSettings(
-                model=windows.model,
-                window_px=windows.side_px,
-                max_shift_px=max_shift_px,
-                min_correlation=MIN_CORRELATION,
-                blur=True,
-            ),
-        )
-        good = match.good
-        if both_ways:
-            at = squares.xy[rows[fits]]
-            good &= _returning(template, photographs[j], at, match, along, windows)
-        half = match.covariance[good] / 2
-        back = np.linalg.inv(linear_part(match.warp[good]))
-        seen = ImagePoints(np.full(int(good.sum()), j), rows[fits][good], match.xy[good], half)
-        r = match.correlation[good]
-        return _Matched(seen, r, scale[fits][good], back @ half @ back.transpose(0, 2, 1))
-
-    def measure(which: BoolArray, points: FloatArray, max_shift_px: float) -> None:
         others = np.flatnonzero(which.any(axis=1))
-        others = others[others != i].tolist()
-        for rays in in_threads(
-            lambda j: matched(j, np.flatnonzero(which[j]), points, max_shift_px), others, threads
-        ):
-            if rays is not None:
-                in_reference[rays.seen.point] += rays.in_reference
-                number[rays.seen.point] += 1
-                parts.append(rays.seen)
-                scales.append(rays.scale)
-                correlations.append(rays.correlation)
+        on_planes = replace(squares, planes=planes)
+        matched = in_threads(
+            lambda j: _matched(
+                photographs, estimate, camera, on_planes, j, np.flatnonzero(which[j]), settings, both_ways
+            ),
+            others[others != i].tolist(),
+            threads,
+        )
+        return [rays for rays in matched if rays is not None]
 
-    measure(first, squares.points, FIRST_SHIFT_PX)
+    unknown = np.eye(2) * UNKNOWN_SLOPE / estimate.cameras[camera[i]].c_px ** 2
+    first = measure(visible & (rank <= FIRST_PHOTOGRAPHS), squares.planes, FIRST_SHIFT_PX)
+    equations = slope_equations([rays.windows for rays in first], k)
+    of_planes, changed = squares.planes.slope_covariance, np.zeros((k, 2))
+    changed = estimate_slopes(equations, of_planes, unknown, changed).slope
     points = intersect_image_points(
-        ImagePoints.joined(parts), camera, estimate, n_points=k, tolerance_px=TOLERANCE_PX
+        ImagePoints.joined([reference, *(rays.seen for rays in first)]),
+        camera,
+        estimate,
+        n_points=k,
+        tolerance_px=TOLERANCE_PX,
     ).points
-    measure(visible & ~first & np.isfinite(points).all(axis=1), points, LATER_SHIFT_PX)
-    used = number > 0
-    parts[0].covariance[used] = in_reference[used] / number[used, None, None]
-    seen = ImagePoints.joined(parts)
-    used = used[seen.point]
-    return SquareRays(seen.select(used), np.concatenate(scales)[used], np.concatenate(correlations)[used])
+    planes = tilted_planes(estimate, camera, i, squares.xy, replace(squares.planes, points=points), changed)
+    matched = measure(visible & np.isfinite(points).all(axis=1), planes, LATER_SHIFT_PX)
+    equations = slope_equations([rays.windows for rays in matched], k)
+    slopes = estimate_slopes(equations, of_planes, unknown, changed)
+    number, in_reference = np.zeros(k), np.zeros((k, 2, 2))
+    seen, of_slopes = [reference], [np.zeros((k, 2, 2))]
+    for rays in matched:
+        window, G = rays.seen.point, rays.windows.shift_per_slope()
+        number[window] += 1
+        in_reference[window] += rays.in_reference
+        moved = np.einsum("kab,kb->ka", G, (slopes.slope - changed)[window])
+        seen.append(replace(rays.seen, xy=rays.seen.xy + moved))
+        of_slopes.append(G @ slopes.covariance[window] @ G.transpose(0, 2, 1))
+    reference.covariance[:] = in_reference / np.where(number > 0, number, np.nan)[:, None, None]
+    joined = ImagePoints.joined(seen)
+    used = (number > 0)[joined.point]
+    return SquareRays(
+        joined.select(used),
+        np.concatenate(of_slopes)[used],
+        np.concatenate([np.ones(k), *(rays.scale for rays in matched)])[used],
+        np.concatenate([np.ones(k), *(rays.correlation for rays in matched)])[used],
+    )
 
 
-def _epipolar_lines(
+def _matched(
+    photographs: GreyPhotographs,
+    estimate: Estimate,
+    camera: IntArray,
+    squares: Squares,
+    j: int,
+    rows: IntArray,
+    settings: LsmSettings,
+    both_ways: bool,
+) -> _Matched | None:
+    """Return the matches of some squares in photograph j; None if it sees none of their planes."""
+    i, half_px, planes = squares.image, settings.window_px / 2, squares.planes.select(rows)
+    at = project_points(estimate, camera, np.full(len(rows), j), planes.points)
+    warp = plane_warps(estimate, camera, i, j, squares.xy[rows], planes.points, planes.normal, half_px)
+    with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
+        scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
+    fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
+    if not fits.any():
+        return None
+    rows, xy = rows[fits], squares.xy[rows[fits]]
+    match = match_lsm(photographs[i], photographs[j], xy, at[fits], settings, start=warp[fits])
+    good = match.good
+    if both_ways:
+        good &= _returning(photographs[i], photographs[j], xy, match, settings.window_px)
+    if match.linear is None or not good.any():
+        return None
+    linear, half = linear_part(match.warp[good]), match.covariance[good] / 2
+    parallax = _parallaxes(estimate, camera, i, j, planes.points[fits], warp[fits])[good]
+    back = np.linalg.inv(linear)
+    return _Matched(
+        ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half),
+        ShiftedWindows(rows[good], linear, parallax, match.linear.select(good)),
+        match.correlation[good],
+        scale[fits][good],
+        back @ half @ back.transpose(0, 2, 1),
+    )
+
+
+def _parallaxes(
     estimate: Estimate, camera: IntArray, i: int, j: int, points: FloatArray, warp: FloatArray
 ) -> FloatArray:
-    """Return the directions in photograph i along which its windows move against photograph j, (k, 2).
+    """Return by how much windows of photograph i move against j if the inverse depth doubles, linearly, px.
 
     Args:
         estimate: interior and exterior orientation of all photographs.
@@ -315,25 +354,19 @@ def _epipolar_lines(
     nearer = points + STEP * (estimate.position[i] - points)
     image = np.full(len(points), j)
     moved = project_points(estimate, camera, image, nearer) - project_points(estimate, camera, image, points)
-    return np.asarray(np.linalg.solve(linear_part(warp), moved[:, :, None])[:, :, 0])
+    return np.asarray(np.linalg.solve(linear_part(warp), moved[:, :, None])[:, :, 0]) / STEP
 
 
-def _returning(
-    template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, along: FloatArray, windows: Windows
-) -> BoolArray:
+def _returning(template: Grey, other: Grey, xy: FloatArray, match: LsmMatches, window_px: int) -> BoolArray:
     """Return which matches, matched back, return to their origin within the usual error, (k,)."""
     rows = np.flatnonzero(match.good)
-    linear = linear_part(match.warp[rows])
     back = match_lsm(
         other,
         template,
         match.xy[rows],
         xy[rows],
-        start=np.asarray(np.linalg.inv(linear)),
-        along=np.einsum("kab,kb->ka", linear, along[rows]),
-        settings=LsmSettings(
-            model=windows.model, window_px=windows.side_px, min_correlation=MIN_CORRELATION, blur=True
-        ),
+        start=np.asarray(np.linalg.inv(linear_part(match.warp[rows]))),
+        settings=LsmSettings(model="shift", window_px=window_px, min_correlation=MIN_CORRELATION, blur=True),
     )
     off = back.xy - xy[rows]
     square = np.einsum("ka,kab,kb->k", off, np.linalg.inv(back.covariance), off)
@@ -342,10 +375,26 @@ def _returning(
     return good
 
 
+def covariance_with_slopes(seen: ImagePoints, of_slopes: FloatArray) -> FloatArray:
+    """Return covariances of image points that give object points their whole variance, (k, 2, 2).
+
+    The errors of matching of n rays of a point average, those of its slope are the same in all. Slopes
+    therefore count n times. The reference has none.
+
+    Args:
+        seen: image points with the covariance of matching.
+        of_slopes: covariance by the slopes, px^2, (k, 2, 2).
+    """
+    moved = np.einsum("kaa->k", of_slopes) > 0
+    rays = np.bincount(seen.point[moved], minlength=int(seen.point.max(initial=-1)) + 1)[seen.point]
+    return np.asarray(seen.covariance + rays[:, None, None] * of_slopes)
+
+
 def _points_that_meet(
-    seen: ImagePoints, estimate: Estimate, camera: IntArray, min_rays: int
+    measured: SquareRays, estimate: Estimate, camera: IntArray, min_rays: int
 ) -> tuple[CoveringPoints, BoolArray]:
     """Return the points with enough rays that meet, and which rays these are, (k,)."""
+    seen = measured.image_points
     n = int(seen.point.max(initial=-1)) + 1
     met = intersect_image_points(seen, camera, estimate, n_points=n, tolerance_px=TOLERANCE_PX)
     used = met.used & (np.bincount(seen.point[met.used], minlength=n) >= min_rays)[seen.point]
@@ -354,7 +403,8 @@ def _points_that_meet(
     image_points = replace(seen.select(used), point=point.ravel())
     residuals = met.residuals[used] * c[:, None]
     matched = int((np.bincount(seen.point, minlength=n) >= min_rays)[seen.point].sum())
-    return CoveringPoints(image_points, met.points[kept], residuals, matched), used
+    of_slopes = measured.of_slopes[used]
+    return CoveringPoints(image_points, met.points[kept], of_slopes, residuals, matched), used
 
 
 def _concatenate_points(parts: Sequence[CoveringPoints]) -> CoveringPoints:
@@ -367,6 +417,7 @@ def _concatenate_points(parts: Sequence[CoveringPoints]) -> CoveringPoints:
     return CoveringPoints(
         ImagePoints.joined(moved),
         np.concatenate([part.points for part in parts]),
+        np.concatenate([part.of_slopes for part in parts]),
         np.concatenate([part.residuals for part in parts]),
         sum(part.matched for part in parts),
     )

@@ -19,7 +19,6 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement.survey_result import PhotographTargets
 from sfm.matching.lsm.coverage import (
     CoveredPixels,
-    Windows,
     first_alike,
     points_apart,
     project_points,
@@ -42,25 +41,21 @@ from sfm.survey.inputs.measurements import MeasuredPhotographs, Measurements
 from sfm.survey.inputs.settings import AdjustSettings, TiePointSettings
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.measuring.covering_points import CoveringPoints, find_covering_points
+from sfm.survey.measuring.covering_points import (
+    CoveringPoints,
+    covariance_with_slopes,
+    find_covering_points,
+)
 from sfm.survey.measuring.tie_points import MIN_RAYS, drawn_windows, needed_rays
 from sfm.targets.codes.plates import TargetFamily
 from sfm.targets.codes.rings import CodeFamily
 from sfm.targets.detect import Targets
 
-# Windows that are tried; the first of those with about the best precision is taken. Noise that is
+# Sides of windows that are tried; the first of those with about the best precision is taken. Noise that is
 # correlated over several pixels hides the texture of small windows. Over large ones a surface is curved:
 # windows of 31 px measure its mean depth, with the same error in all photographs; their standard deviation
-# is 0.93 to 1.8 times that of smaller ones. Windows that are only shifted come last. They take the tilt of
-# the plane through the tie points, whose error is common to all rays and is shown by no residual. Where
-# texture is weak, an unknown tilt is worse: on varnished wood it leaves far fewer matches.
-TRIED_WINDOWS = (
-    Windows(15),
-    Windows(11),
-    Windows(21),
-    Windows(15, "shift"),
-    Windows(21, "shift"),
-)
+# is 0.93 to 1.8 times that of smaller ones.
+TRIED_WINDOWS_PX = (15, 11, 21)
 TRIAL_PHOTOGRAPHS = 2  # whose points choose the window
 TRIAL_RAYS = 100  # with fewer rays the window stays as it is
 TRIAL_SIDES = 4  # distance of trial windows in sides: they need not cover the photograph
@@ -118,13 +113,13 @@ def cover_photographs(
     hidden = masked_pixels(Masks(survey.masks), network, estimate)
     if targets is not None:
         hidden = _with_targets(hidden, targets, survey.family, network, estimate)
-    windows = _best_windows(photographs, surface, estimate, settings, jobs, hidden)
+    window_px = _best_window(photographs, surface, estimate, settings, jobs, hidden)
     covered = find_covering_points(
         photographs,
         surface,
         estimate,
-        windows=windows,
-        side_px=_side(estimate, windows.side_px, settings.max_points),
+        window_px=window_px,
+        side_px=_side(estimate, window_px, settings.max_points),
         hidden=hidden,
         threads=jobs,
     )
@@ -141,21 +136,25 @@ def cover_photographs(
         return Surface(tied, values, measured.overlays, ())
     points = tuple(f"t{j + 1:05d}" for j in range(len(covered.points)))
     order = np.argsort(covered.image_points.point, kind="stable")
-    covariance = covered.image_points.covariance + survey.adjust.sigma_px**2 * np.eye(2)
+    with_slopes = covariance_with_slopes(covered.image_points, covered.of_slopes)
     covering = network_of(
         survey,
         network.images,
         network.camera,
         points,
-        replace(covered.image_points, covariance=covariance).select(order),
+        replace(covered.image_points, covariance=with_slopes + survey.adjust.sigma_px**2 * np.eye(2)).select(
+            order
+        ),
     )
     placed = replace(estimate, points=covered.points)
-    covering = _with_common_part(covering, placed, covered.image_points.covariance[order], survey.adjust)
+    covering = _with_common_part(
+        covering, placed, covered.image_points.covariance[order], with_slopes[order], survey.adjust
+    )
     control = covering.control.complete
     if start.kind != "given" and len(control) >= MIN_CONTROL:  # tie points cannot be placed on control
         placed = fit_similarity(placed.points[control.point], control.xyz).apply_estimate(placed)
     return Surface(
-        covering, placed, drawn_windows(covering, paths, windows.side_px), remarks_on_disagreement(covered)
+        covering, placed, drawn_windows(covering, paths, window_px), remarks_on_disagreement(covered)
     )
 
 
@@ -167,17 +166,22 @@ def remarks_on_disagreement(covering: CoveringPoints) -> tuple[Remark, ...]:
 
 
 def _with_common_part(
-    network: Network, estimate: Estimate, matching: FloatArray, settings: AdjustSettings
+    network: Network,
+    estimate: Estimate,
+    matching: FloatArray,
+    with_slopes: FloatArray,
+    settings: AdjustSettings,
 ) -> Network:
     """Return the network with the share of matching in its covariances estimated from the residuals.
 
-    The median covariance does not change: sigma0 still shows how much worse the image points are than
-    expected.
+    Residuals do not show the errors of slopes, which have the factor of matching. The median covariance does
+    not change: sigma0 still shows how much worse the image points are than expected.
 
     Args:
         network: covering points with the expected weights.
         estimate: approximate values.
         matching: covariance from matching, px^2, (k, 2, 2).
+        with_slopes: the same with the slopes of windows, px^2, (k, 2, 2).
         settings: has the expected sigma of errors that matching does not see, px, and the level of the tests.
     """
     seen = network.image_points
@@ -197,7 +201,7 @@ def _with_common_part(
         factor, common_px = estimate_common_part(adjust_with, matching[chosen[seen.point]], settings.sigma_px)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
-    shown = factor**2 * matching + common_px**2 * np.eye(2)
+    shown = factor**2 * with_slopes + common_px**2 * np.eye(2)
     return with_weights(network, shown)
 
 
@@ -310,6 +314,7 @@ def _some_points(covering: CoveringPoints, points: BoolArray, rays: BoolArray) -
     return CoveringPoints(
         replace(seen.select(kept), point=number[seen.point[kept]]),
         covering.points[points],
+        covering.of_slopes[kept],
         covering.residuals[kept],
         covering.matched - int((~kept).sum()),
     )
@@ -321,26 +326,26 @@ def _side(estimate: Estimate, window_px: int, most: int) -> int:
     return max(window_px, int(np.sqrt(area / most)) | 1)
 
 
-def _best_windows(
+def _best_window(
     photographs: Sequence[AnyArray],
     surface: Network,
     estimate: Estimate,
     settings: TiePointSettings,
     jobs: int,
     hidden: CoveredPixels | None = None,
-) -> Windows:
-    """Return the windows of TRIED_WINDOWS whose rays together have the smallest standard deviation."""
+) -> int:
+    """Return the side of TRIED_WINDOWS_PX whose rays together have the smallest standard deviation, px."""
     most = np.argsort(-np.bincount(surface.image_points.image, minlength=len(photographs)), kind="stable")
-    costs: list[tuple[Windows, float]] = []
-    given = settings.window_px if "window_px" in settings.model_fields_set else None
-    for windows in dict.fromkeys(replace(tried, side_px=given or tried.side_px) for tried in TRIED_WINDOWS):
-        side = _side(estimate, windows.side_px, settings.max_points)
-        trial_side = max(TRIAL_SIDES * windows.side_px + 1, side)
+    costs: list[tuple[int, float]] = []
+    given = (settings.window_px,) if "window_px" in settings.model_fields_set else TRIED_WINDOWS_PX
+    for window_px in given:
+        side = _side(estimate, window_px, settings.max_points)
+        trial_side = max(TRIAL_SIDES * window_px + 1, side)
         trial = find_covering_points(
             photographs,
             surface,
             estimate,
-            windows=windows,
+            window_px=window_px,
             side_px=trial_side,
             references=most[:TRIAL_PHOTOGRAPHS].tolist(),
             hidden=hidden,
@@ -349,5 +354,5 @@ def _best_windows(
         if len(trial.residuals) >= TRIAL_RAYS:
             spread = MAD_TO_SIGMA * float(np.median(np.abs(trial.residuals)))
             rays = len(trial.residuals) * (trial_side / side) ** 2  # of windows side by side
-            costs.append((windows, spread / np.sqrt(rays)))
-    return first_alike(costs) if costs else Windows(settings.window_px)
+            costs.append((window_px, spread / np.sqrt(rays)))
+    return first_alike(costs) if costs else settings.window_px

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.matching.correlation import MAX_R, ambiguous, independent_pixels
-from sfm.matching.lsm.coverage import CoveredPixels, Windows
+from sfm.matching.lsm.coverage import CoveredPixels
 from sfm.matching.lsm.depth_search import SearchedRay, search_depths
-from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, planes_at
+from sfm.matching.lsm.surface_planes import FARTHEST, NEAREST, Planes, planes_at
 from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.distributions import Levels, normal_ppf
@@ -29,7 +29,9 @@ from sfm.survey.measuring.covering_points import (
     FIRST_PHOTOGRAPHS,
     MIN_RAYS,
     TOLERANCE_PX,
+    UNKNOWN_SLOPE,
     Squares,
+    covariance_with_slopes,
     match_squares,
     seen_squares,
 )
@@ -95,7 +97,7 @@ def match_templates(
     i: int,
     xy: FloatArray,
     known: FloatArray,
-    windows: Windows,
+    window_px: int,
     levels: Levels,
     jobs: int,
 ) -> TemplateRays:
@@ -106,29 +108,26 @@ def match_templates(
         i: photograph of the templates.
         xy: middles of the templates, px, (k, 2).
         known: approximate object points, NaN where unknown, (k, 3).
-        windows: size of the windows; larger ones are tried where these are not matched.
+        window_px: odd side of the windows; larger ones are tried where these are not matched.
         levels: of the comparisons of places that look alike.
         jobs: number of photographs processed in parallel.
     """
-    estimate, camera = scene.estimate, scene.network.camera
     neighbours = np.unique(scene.seen.point[scene.seen.image == i])
-    on_surface, normal = planes_at(estimate, camera, i, xy, neighbours)
-    normal = np.where(np.isfinite(normal), normal, estimate.rotation[i][:, 2])
-
+    planes = _planes(scene, i, xy, neighbours)
     grey, parts = grey_of(scene.grey[i].pixels), [scene.seen.select(NONE)]
     lost, alike = np.arange(len(xy), dtype=np.int64), NONE
-    for side_px in (windows.side_px, 2 * windows.side_px - 1):
+    for side_px in (window_px, 2 * window_px - 1):
         if not len(lost):
             break
-        along = _along_rays(scene, i, xy[lost], normal[lost], neighbours, side_px)
-        points = np.vstack([known[lost], on_surface[lost], *along])
+        along = _along_rays(scene, i, xy[lost], planes.normal[lost], neighbours, side_px)
+        points = np.vstack([known[lost], planes.points[lost], *along])
         template = np.concatenate([lost, lost, np.repeat(lost, [len(places) for places in along])])
         finite = np.asarray(np.isfinite(points).all(axis=1))
         if not finite.any():
             continue
         candidates = _Candidates(template, np.arange(len(template)) < len(lost), points).select(finite)
         for _ in range(2):  # the rays of the first time correct the places, so that all others find them
-            matched = _matched(scene, i, xy, normal, candidates, replace(windows, side_px=side_px), jobs)
+            matched = _matched(scene, i, xy, planes, candidates, side_px, jobs)
             candidates = matched
         pixels = np.full(len(xy), np.nan)
         pixels[lost] = independent_pixels(grey, xy[lost], side_px)
@@ -137,6 +136,19 @@ def match_templates(
         alike = np.union1d(alike, doubtful)  # larger windows would only lose some of the places
         lost = np.setdiff1d(lost, np.union1d(rays.point, alike))
     return TemplateRays(ImagePoints.joined(parts), alike)
+
+
+def _planes(scene: TemplateScene, i: int, xy: FloatArray, neighbours: IntArray) -> Planes:
+    """Return the planes of neighbours, and planes across the axis of the photograph where there are none."""
+    estimate, camera = scene.estimate, scene.network.camera
+    planes = planes_at(estimate, camera, i, xy, neighbours)
+    known = np.isfinite(planes.normal).all(axis=1)
+    unknown = np.eye(2) * UNKNOWN_SLOPE / estimate.cameras[camera[i]].c_px ** 2
+    return replace(
+        planes,
+        normal=np.where(known[:, None], planes.normal, estimate.rotation[i][:, 2]),
+        slope_covariance=np.where(known[:, None, None], planes.slope_covariance, unknown),
+    )
 
 
 def _along_rays(
@@ -171,16 +183,17 @@ def _matched(
     scene: TemplateScene,
     i: int,
     xy: FloatArray,
-    normal: FloatArray,
+    planes: Planes,
     candidates: _Candidates,
-    windows: Windows,
+    window_px: int,
     jobs: int,
 ) -> _Matched:
     """Return the places where rays meet: three, or two where only two photographs show it."""
     estimate, camera, n = scene.estimate, scene.network.camera, len(candidates)
-    squares = Squares(i, xy[candidates.template], normal[candidates.template], candidates.points)
+    on_planes = replace(planes.select(candidates.template), points=candidates.points)
+    squares = Squares(i, xy[candidates.template], on_planes)
     shown = np.zeros((len(scene.network.images), n), dtype=bool)
-    for j, rows, at in seen_squares(estimate, camera, squares, windows.side_px // 2 + BORDER_PX):
+    for j, rows, at in seen_squares(estimate, camera, squares, window_px // 2 + BORDER_PX):
         shown[j, rows[scene.visible(np.full(len(rows), j), at)]] = True
     shown[i] = True
     count = shown.sum(axis=0) - (i == scene.earlier)
@@ -195,12 +208,14 @@ def _matched(
             camera,
             squares.select(these),
             shown[:, these],
-            windows,
+            window_px,
             jobs,
             both_ways=needed == 2,
         )
         here = measured.image_points.image != scene.earlier
-        rays, r = measured.image_points.select(here), measured.correlation[here]
+        seen = measured.image_points
+        seen = replace(seen, covariance=covariance_with_slopes(seen, measured.of_slopes))
+        rays, r = seen.select(here), measured.correlation[here]
         met = intersect_image_points(rays, camera, estimate, n_points=len(numbers), tolerance_px=TOLERANCE_PX)
         kept = met.used & scene.visible(rays.image, rays.xy)
         rays, r = rays.select(kept), r[kept]

@@ -26,7 +26,7 @@ import numpy as np
 
 from sfm.judgement.survey_result import LeftOutPoint
 from sfm.matching.conjugate import match_points
-from sfm.matching.lsm.coverage import Windows, project_points
+from sfm.matching.lsm.coverage import project_points
 from sfm.matching.lsm.surface_planes import squares_over_covariance
 from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.model.camera import tangents_from_pixel
@@ -242,7 +242,7 @@ def _match_all(
     that have not moved, and gives nothing but templates.
     """
     survey, files = oriented.survey, oriented.measured.files or NO_PHOTOGRAPHS
-    windows = Windows(survey.texture.window_px)
+    window_px = survey.texture.window_px
     scenes: dict[str, tuple[TemplateScene, int] | None] = {}
     templates: defaultdict[str, list[PointSettings]] = defaultdict(list)
     named: set[str] = set()
@@ -259,7 +259,7 @@ def _match_all(
         with_template, i = cast(tuple[TemplateScene, int], scenes[name])
         xy = np.array([[mark.x_px, mark.y_px] for mark in marks])
         point = np.array([points.index(mark.name) for mark in marks])
-        rays = match_templates(with_template, i, xy, known[point], windows, survey.adjust.levels, jobs)
+        rays = match_templates(with_template, i, xy, known[point], window_px, survey.adjust.levels, jobs)
         parts.append(replace(rays.image_points, point=point[rays.image_points.point]))
         alike.append(point[rays.alike])
     return TemplateRays(ImagePoints.joined(parts), np.concatenate(alike))
