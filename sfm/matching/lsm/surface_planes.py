@@ -42,7 +42,7 @@ class Planes:
 
     points: FloatArray  # object points at the positions, (k, 3)
     normal: FloatArray  # of the surface there, towards the photograph, unit vectors, (k, 3)
-    slope_covariance: FloatArray  # 1 / px^2, (k, 2, 2)
+    slope_covariance: FloatArray  # 1 / px^2, (k, 2, 2); NaN where no further point shows it
 
     def select(self, rows: BoolArray | IntArray) -> Planes:
         """Return the selected planes."""
@@ -69,12 +69,14 @@ def planes_at(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, poin
     UVW = UVW[UVW[:, 2] < 0]
     uv = tangents_from_pixel(lens, xy)
     rows = np.flatnonzero(np.isfinite(uv).all(axis=1))
-    if len(UVW) <= NEIGHBOURS or not len(rows):
+    if len(UVW) < NEIGHBOURS or not len(rows):
         return Planes(points, normal, covariance)
     known, inverse, uv = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2], uv[rows]
     near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
     plane, N = _planes(known[near] - uv[:, None], inverse[near])
-    spread = MAD_TO_SIGMA * np.median(np.abs(_off_neighbours(known, inverse)[0]))
+    spread = np.nan
+    if len(known) > NEIGHBOURS:
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(_off_neighbours(known, inverse)[0])))
     value = plane[:, 2].copy()  # inverse of the depth at the position
     plane[:, 2] -= np.sum(plane[:, :2] * uv, axis=1)
     inside = (value > inverse.min() / FARTHEST) & (value < inverse.max() / NEAREST)

@@ -78,11 +78,12 @@ def estimate_slopes(
 
     Args:
         equations: those of the matches.
-        of_planes: covariance of the slopes of the planes, 1 / px^2, (n, 2, 2).
+        of_planes: covariance of the slopes of the planes, 1 / px^2, NaN where unknown, (n, 2, 2).
         unknown: that of slopes that may be any, 1 / px^2, (2, 2).
         changed: slopes of the windows that were matched, relative to the planes, 1 / px, (n, 2).
     """
     right = equations.right + np.einsum("nab,nb->na", equations.N, changed)
+    of_planes = np.where(np.isfinite(of_planes), of_planes, unknown)
     with_plane, likely = _posterior(equations.N, right, of_planes)
     without, likely_without = _posterior(equations.N, right, np.broadcast_to(unknown, of_planes.shape))
     Q = np.where((likely_without > likely)[:, None, None], without, with_plane)

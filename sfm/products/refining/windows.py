@@ -265,7 +265,8 @@ def _planes(
 
     Without a known plane, the normal is the viewing direction of the photograph.
     """
-    points, normal = planes_at(estimate, camera, i, place, seen.point[rows_seen])
+    planes = planes_at(estimate, camera, i, place, seen.point[rows_seen])
+    points, normal = planes.points, planes.normal
     unknown = ~np.isfinite(points).all(axis=1)
     points[unknown] = estimate.points[point[unknown]]
     normal[unknown] = estimate.rotation[i][:, 2]

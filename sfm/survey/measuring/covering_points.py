@@ -142,7 +142,7 @@ def find_covering_points(
             free_middles &= hidden.free_middles(i, window_px)
         xy = textured_squares(grey[i].pixels, side_px, free_middles, border_px=margin)
         planes = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
-        squares = Squares(i, xy, planes).select(np.isfinite(planes.points).all(axis=1))
+        squares = Squares(i, xy, planes).select(np.asarray(np.isfinite(planes.points).all(axis=1)))
         visible, free = _visible(estimate, camera, squares, covered, margin, side_px, window_px, hidden)
         of = free.sum(axis=0) >= rays
         if not more:

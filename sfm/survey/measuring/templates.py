@@ -29,7 +29,6 @@ from sfm.survey.measuring.covering_points import (
     FIRST_PHOTOGRAPHS,
     MIN_RAYS,
     TOLERANCE_PX,
-    UNKNOWN_SLOPE,
     Squares,
     covariance_with_slopes,
     match_squares,
@@ -142,13 +141,8 @@ def _planes(scene: TemplateScene, i: int, xy: FloatArray, neighbours: IntArray) 
     """Return the planes of neighbours, and planes across the axis of the photograph where there are none."""
     estimate, camera = scene.estimate, scene.network.camera
     planes = planes_at(estimate, camera, i, xy, neighbours)
-    known = np.isfinite(planes.normal).all(axis=1)
-    unknown = np.eye(2) * UNKNOWN_SLOPE / estimate.cameras[camera[i]].c_px ** 2
-    return replace(
-        planes,
-        normal=np.where(known[:, None], planes.normal, estimate.rotation[i][:, 2]),
-        slope_covariance=np.where(known[:, None, None], planes.slope_covariance, unknown),
-    )
+    normal = np.where(np.isfinite(planes.normal), planes.normal, estimate.rotation[i][:, 2])
+    return replace(planes, normal=normal)
 
 
 def _along_rays(
