@@ -400,6 +400,7 @@ def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> No
     clean = without_noise(N, out[WHITE], half, SHIFT)
     factorise(clean, clean, 0.0)
     cross, solved, weighted = np.empty((LINEAR, u)), np.empty((LINEAR, u)), np.zeros((LINEAR, u))
+    left, noisy = np.empty((LINEAR, LINEAR)), np.empty(u)
     for a in range(LINEAR):
         for k in range(u):
             cross[a, k] = solved[a, k] = dot(rows[a], J[k])
@@ -420,8 +421,25 @@ def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> No
                 whole += (weighted[a, k] - cross[a, k]) * solved[b, k] - solved[a, k] * cross[b, k]
             linear[derivative + LINEAR * a + b] = linear[derivative + LINEAR * b + a] = expected
             linear[spread + LINEAR * a + b] = linear[spread + LINEAR * b + a] = whole
+            left[a, b] = left[b, a] = dot(rows[a], rows[b])
         for k in range(SHIFT):
             linear[shift + LINEAR * k + a] = -half * solved[a, k]
+    # what the linear part leaves of the residuals: a wrong plane does not count as noise
+    factorise(N, clean, 0.0)
+    for a in range(LINEAR):
+        noisy[:] = cross[a]
+        solve_factorised(clean, noisy)
+        for b in range(LINEAR):
+            for k in range(u):
+                left[a, b] -= noisy[k] * cross[b, k]
+    if factorise(left, left, 0.0):
+        step = linear[:LINEAR] * out[GAIN]
+        solve_factorised(left, step)
+        whole, explained = dot(v, v), 0.0
+        for a in range(LINEAR):
+            explained += step[a] * linear[a] * out[GAIN]
+        n = side * side
+        out[VARIANCE] *= max(1.0 - explained / whole, 0.0) * (n - u) / (n - u - LINEAR)
 
 
 @compiled

@@ -21,7 +21,7 @@ from sfm.matching.correlation import MIN_CORRELATION
 from sfm.matching.lsm.coverage import CoveredPixels, plane_warps, project_points
 from sfm.matching.lsm.patch_equations import linear_part
 from sfm.matching.lsm.surface_planes import NEIGHBOURS, Planes, planes_at, tilted_planes
-from sfm.matching.lsm.two_photo import LsmMatches, LsmSettings, match_lsm
+from sfm.matching.lsm.two_photo import COARSE_STEP, LsmMatches, LsmSettings, match_lsm
 from sfm.matching.lsm.window_slopes import ShiftedWindows, estimate_slopes, slope_equations
 from sfm.matching.radiometry import Grey, GreyPhotographs
 from sfm.matching.tracks.interest import textured_squares
@@ -44,6 +44,7 @@ STEP = 1e-3  # towards the photograph, relative to the distance, that shows para
 # Mean square of the tangent, along one axis, of the angle between a plane and the one across its ray, if all
 # directions of MIN_COSINE and more are alike: the variance of slopes that are not known, times c^2.
 UNKNOWN_SLOPE = (1 / MIN_COSINE - 1) / 2
+MAX_ROUNDS = 5  # of matching on planes whose slopes move the borders of windows by more than COARSE_STEP
 TOLERANCE_PX = 1.5  # largest residual of a ray that stays with its point
 
 
@@ -97,6 +98,16 @@ class _Matched:
     correlation: FloatArray  # (k,)
     scale: FloatArray  # of the windows relative to the reference, (k,)
     in_reference: FloatArray  # half of the noise, assigned to the reference, px^2, (k, 2, 2)
+
+    def select(self, rows: BoolArray) -> _Matched:
+        """Return the selected rays."""
+        return _Matched(
+            self.seen.select(rows),
+            self.windows.select(rows),
+            self.correlation[rows],
+            self.scale[rows],
+            self.in_reference[rows],
+        )
 
 
 def find_covering_points(
@@ -230,8 +241,8 @@ def match_squares(
     """Measure the squares of a photograph in the others, those with the most similar direction first.
 
     Windows are shifted on the planes of the squares. The first matches correct positions and slopes of the
-    planes, on which all photographs are matched then. What these say of the slopes is applied to the matches
-    themselves, of which it is a linear function.
+    planes, if need be several times, and all photographs are matched on these. What these say of the slopes
+    is applied to the matches themselves, of which it is a linear function.
 
     Half of the noise of a match is that of the template, and is assigned to the reference, as in
     `tie_points`. If no third ray checks a match, it is also matched back.
@@ -265,18 +276,37 @@ def match_squares(
         return [rays for rays in matched if rays is not None]
 
     unknown = np.eye(2) * UNKNOWN_SLOPE / estimate.cameras[camera[i]].c_px ** 2
-    first = measure(visible & (rank <= FIRST_PHOTOGRAPHS), squares.planes, FIRST_SHIFT_PX)
-    equations = slope_equations([rays.windows for rays in first], k)
-    of_planes, changed = squares.planes.slope_covariance, np.zeros((k, 2))
-    changed = estimate_slopes(equations, of_planes, unknown, changed).slope
-    points = intersect_image_points(
-        ImagePoints.joined([reference, *(rays.seen for rays in first)]),
-        camera,
-        estimate,
-        n_points=k,
-        tolerance_px=TOLERANCE_PX,
-    ).points
-    planes = tilted_planes(estimate, camera, i, squares.xy, replace(squares.planes, points=points), changed)
+    planes, of_planes, changed = squares.planes, squares.planes.slope_covariance, np.zeros((k, 2))
+    first, coarse = visible & (rank <= FIRST_PHOTOGRAPHS), np.ones(k, dtype=bool)
+    matched: list[_Matched] = []
+    unknown_planes = ~np.isfinite(of_planes).all(axis=(1, 2))
+    if unknown_planes.any():
+        changed = _affine_slopes(
+            photographs, estimate, camera, squares, first & unknown_planes, window_px, threads
+        )
+        planes = tilted_planes(estimate, camera, i, squares.xy, planes, changed)
+    for _ in range(MAX_ROUNDS):
+        matched = [rays.select(~coarse[rays.seen.point]) for rays in matched]
+        matched += measure(first & coarse, planes, FIRST_SHIFT_PX)
+        equations = slope_equations([rays.windows for rays in matched], k)
+        before, changed = changed, estimate_slopes(equations, of_planes, unknown, changed).slope
+        points = intersect_image_points(
+            ImagePoints.joined([reference, *(rays.seen for rays in matched)]),
+            camera,
+            estimate,
+            n_points=k,
+            tolerance_px=TOLERANCE_PX,
+        ).points
+        planes = replace(squares.planes, points=points)
+        planes = tilted_planes(estimate, camera, i, squares.xy, planes, changed)
+        step = np.linalg.norm(changed - before, axis=1) * window_px / 2
+        coarse = np.zeros(k, dtype=bool)
+        for rays in matched:
+            parallax = np.linalg.norm(rays.windows.parallax, axis=1)
+            coarse[rays.seen.point[parallax * step[rays.seen.point] > COARSE_STEP]] = True
+        coarse &= np.isfinite(points).all(axis=1)
+        if not coarse.any():
+            break
     matched = measure(visible & np.isfinite(points).all(axis=1), planes, LATER_SHIFT_PX)
     equations = slope_equations([rays.windows for rays in matched], k)
     slopes = estimate_slopes(equations, of_planes, unknown, changed)
@@ -311,31 +341,95 @@ def _matched(
     both_ways: bool,
 ) -> _Matched | None:
     """Return the matches of some squares in photograph j; None if it sees none of their planes."""
-    i, half_px, planes = squares.image, settings.window_px / 2, squares.planes.select(rows)
-    at = project_points(estimate, camera, np.full(len(rows), j), planes.points)
-    warp = plane_warps(estimate, camera, i, j, squares.xy[rows], planes.points, planes.normal, half_px)
-    with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
-        scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
-    fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
-    if not fits.any():
+    i = squares.image
+    placed = _placed(estimate, camera, squares, j, rows, settings.window_px / 2)
+    if not len(placed.rows):
         return None
-    rows, xy = rows[fits], squares.xy[rows[fits]]
-    match = match_lsm(photographs[i], photographs[j], xy, at[fits], settings, start=warp[fits])
+    xy = squares.xy[placed.rows]
+    match = match_lsm(photographs[i], photographs[j], xy, placed.at, settings, start=placed.warp)
     good = match.good
     if both_ways:
         good &= _returning(photographs[i], photographs[j], xy, match, settings.window_px)
     if match.linear is None or not good.any():
         return None
     linear, half = linear_part(match.warp[good]), match.covariance[good] / 2
-    parallax = _parallaxes(estimate, camera, i, j, planes.points[fits], warp[fits])[good]
     back = np.linalg.inv(linear)
     return _Matched(
-        ImagePoints(np.full(int(good.sum()), j), rows[good], match.xy[good], half),
-        ShiftedWindows(rows[good], linear, parallax, match.linear.select(good)),
+        ImagePoints(np.full(int(good.sum()), j), placed.rows[good], match.xy[good], half),
+        ShiftedWindows(placed.rows[good], linear, placed.parallax[good], match.linear.select(good)),
         match.correlation[good],
-        scale[fits][good],
+        placed.scale[good],
         back @ half @ back.transpose(0, 2, 1),
     )
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """Squares on their planes in another photograph."""
+
+    rows: IntArray  # of the squares that the photograph sees, (k,)
+    at: FloatArray  # where, px, (k, 2)
+    warp: FloatArray  # homographies of the windows, relative to both points, (k, 3, 3)
+    scale: FloatArray  # of the windows relative to the reference, (k,)
+    parallax: (
+        FloatArray  # displacement in the reference for a relative change of inverse depth by 1, px, (k, 2)
+    )
+
+
+def _placed(
+    estimate: Estimate, camera: IntArray, squares: Squares, j: int, rows: IntArray, reach_px: float
+) -> _Placed:
+    """Return where photograph j shows some squares on their planes."""
+    i, planes, xy = squares.image, squares.planes.select(rows), squares.xy[rows]
+    at = project_points(estimate, camera, np.full(len(rows), j), planes.points)
+    warp = plane_warps(estimate, camera, i, j, xy, planes.points, planes.normal, reach_px)
+    with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
+        scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
+    fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
+    parallax = _parallaxes(estimate, camera, i, j, planes.points[fits], warp[fits])
+    return _Placed(rows[fits], at[fits], warp[fits], scale[fits], parallax)
+
+
+def _affine_slopes(
+    photographs: GreyPhotographs,
+    estimate: Estimate,
+    camera: IntArray,
+    squares: Squares,
+    which: BoolArray,
+    window_px: int,
+    threads: int,
+) -> FloatArray:
+    """Return approximate slopes of squares from affine matches, which find planes that are far off, (k, 2).
+
+    Args:
+        photographs: m photographs.
+        estimate: their orientation.
+        camera: index of the camera of each photograph, (m,).
+        squares: k squares of one photograph.
+        which: squares to match in each of the others, (m, k).
+        window_px: odd side of the windows.
+        threads: number of photographs processed in parallel.
+    """
+    i, k = squares.image, len(squares)
+    settings = LsmSettings(
+        window_px=window_px, max_shift_px=FIRST_SHIFT_PX, min_correlation=MIN_CORRELATION, blur=True
+    )
+
+    def matched(j: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        placed = _placed(estimate, camera, squares, j, np.flatnonzero(which[j]), window_px / 2)
+        match = match_lsm(
+            photographs[i], photographs[j], squares.xy[placed.rows], placed.at, settings, start=placed.warp
+        )
+        rows, good = placed.rows[match.good], match.good
+        turned = np.linalg.solve(linear_part(placed.warp[good]), linear_part(match.warp[good])) - np.eye(2)
+        return rows, placed.parallax[good], turned
+
+    others = np.flatnonzero(which.any(axis=1))
+    products, squares_of = np.zeros((k, 2)), np.zeros(k)
+    for rows, parallax, turned in in_threads(matched, others[others != i].tolist(), threads):
+        products[rows] += np.einsum("ka,kab->kb", parallax, turned)
+        squares_of[rows] += np.einsum("ka,ka->k", parallax, parallax)
+    return products / np.where(squares_of > 0, squares_of, 1.0)[:, None]
 
 
 def _parallaxes(

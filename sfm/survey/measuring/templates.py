@@ -1,10 +1,11 @@
 """Templates of single points, matched in all oriented photographs that show them.
 
 A point lies somewhere on the ray of its template. Candidates are the surface of its neighbours, and every
-place along the ray where other photographs show its surroundings alike. All are matched by least squares in
-all photographs. On a repeated pattern several of them are matched: the one that the photographs show most
-alike is the point, if it differs from the others by more than chance, and else the point is not measured. An
-approximate position, of marks in several photographs, decides between them.
+place along the ray where other photographs show its surroundings alike, each with the plane of its neighbours
+and with a plane that is not known. All are matched by least squares in all photographs. On a repeated pattern
+several of them are matched: the one that the photographs show most alike is the point, if it differs from the
+others by more than chance, and else the point is not measured. An approximate position, of marks in several
+photographs, decides between them.
 """
 
 from __future__ import annotations
@@ -71,6 +72,9 @@ class _Candidates:
     """Places of templates."""
 
     template: IntArray  # of each candidate, (c,)
+    across: (
+        BoolArray  # whether its plane is across the axis of the photograph, and not that of neighbours, (c,)
+    )
     stated: BoolArray  # whether it started from the approximate position of the point, (c,)
     points: FloatArray  # object points, (c, 3)
 
@@ -79,7 +83,13 @@ class _Candidates:
 
     def select(self, rows: BoolArray | IntArray) -> _Candidates:
         """Return the selected candidates."""
-        return replace(self, template=self.template[rows], stated=self.stated[rows], points=self.points[rows])
+        return replace(
+            self,
+            template=self.template[rows],
+            across=self.across[rows],
+            stated=self.stated[rows],
+            points=self.points[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -112,19 +122,25 @@ def match_templates(
         jobs: number of photographs processed in parallel.
     """
     neighbours = np.unique(scene.seen.point[scene.seen.image == i])
-    planes = _planes(scene, i, xy, neighbours)
+    planes = planes_at(scene.estimate, scene.network.camera, i, xy, neighbours)
+    axis = np.tile(scene.estimate.rotation[i][:, 2], (len(xy), 1))
+    normal = np.where(np.isfinite(planes.normal), planes.normal, axis)
     grey, parts = grey_of(scene.grey[i].pixels), [scene.seen.select(NONE)]
     lost, alike = np.arange(len(xy), dtype=np.int64), NONE
     for side_px in (window_px, 2 * window_px - 1):
         if not len(lost):
             break
-        along = _along_rays(scene, i, xy[lost], planes.normal[lost], neighbours, side_px)
+        along = _along_rays(scene, i, xy[lost], normal[lost], neighbours, side_px)
         points = np.vstack([known[lost], planes.points[lost], *along])
         template = np.concatenate([lost, lost, np.repeat(lost, [len(places) for places in along])])
-        finite = np.asarray(np.isfinite(points).all(axis=1))
+        stated = np.arange(len(template)) < len(lost)
+        across = np.repeat([False, True], len(template))
+        candidates = _Candidates(np.tile(template, 2), across, np.tile(stated, 2), np.tile(points, (2, 1)))
+        has_plane = across | np.isfinite(planes.normal[candidates.template]).all(axis=1)
+        finite = np.asarray(np.isfinite(candidates.points).all(axis=1) & has_plane)
         if not finite.any():
             continue
-        candidates = _Candidates(template, np.arange(len(template)) < len(lost), points).select(finite)
+        candidates = candidates.select(finite)
         for _ in range(2):  # the rays of the first time correct the places, so that all others find them
             matched = _matched(scene, i, xy, planes, candidates, side_px, jobs)
             candidates = matched
@@ -135,14 +151,6 @@ def match_templates(
         alike = np.union1d(alike, doubtful)  # larger windows would only lose some of the places
         lost = np.setdiff1d(lost, np.union1d(rays.point, alike))
     return TemplateRays(ImagePoints.joined(parts), alike)
-
-
-def _planes(scene: TemplateScene, i: int, xy: FloatArray, neighbours: IntArray) -> Planes:
-    """Return the planes of neighbours, and planes across the axis of the photograph where there are none."""
-    estimate, camera = scene.estimate, scene.network.camera
-    planes = planes_at(estimate, camera, i, xy, neighbours)
-    normal = np.where(np.isfinite(planes.normal), planes.normal, estimate.rotation[i][:, 2])
-    return replace(planes, normal=normal)
 
 
 def _along_rays(
@@ -184,7 +192,13 @@ def _matched(
 ) -> _Matched:
     """Return the places where rays meet: three, or two where only two photographs show it."""
     estimate, camera, n = scene.estimate, scene.network.camera, len(candidates)
-    on_planes = replace(planes.select(candidates.template), points=candidates.points)
+    of_neighbours = planes.select(candidates.template)
+    across = candidates.across[:, None]
+    on_planes = Planes(
+        candidates.points,
+        np.where(across, estimate.rotation[i][:, 2], of_neighbours.normal),
+        np.where(across[:, None], np.nan, of_neighbours.slope_covariance),
+    )
     squares = Squares(i, xy[candidates.template], on_planes)
     shown = np.zeros((len(scene.network.images), n), dtype=bool)
     for j, rows, at in seen_squares(estimate, camera, squares, window_px // 2 + BORDER_PX):
@@ -230,6 +244,7 @@ def _matched(
     kept, point = np.unique(joined.point, return_inverse=True)
     return _Matched(
         candidates.template[kept],
+        candidates.across[kept],
         candidates.stated[kept],
         points[kept],
         replace(joined, point=point),
