@@ -100,6 +100,10 @@ def test_pictures_without_noise_are_matched() -> None:
     picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
     at = np.array([[x, y] for x in range(50, 210, 20) for y in range(50, 160, 20)], dtype=float)
     same = match_lsm(picture, picture, at, at, settings=LsmSettings(window_px=15, blur=True))
+    part = match_lsm(
+        picture, picture, at, at, LsmSettings("shift", window_px=15, blur=True, linear=True)
+    ).linear
+    assert part is not None and np.isfinite(part.score).all() and (part.variance >= 0).all()
     assert same.good.all() and np.isfinite(same.sigma0).all()
     assert (np.diagonal(same.covariance, axis1=1, axis2=2) >= 0).all()
     for levels in (picture, (picture // 64 * 64).astype(np.uint8)):

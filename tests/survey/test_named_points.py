@@ -155,7 +155,8 @@ def test_named_points_are_found_and_found_again_in_a_later_epoch(tmp_path: Path)
     difference = after - before - moved
     C = covariance + covariance_after
     square = np.einsum("na,nab,nb->n", difference, np.linalg.inv(C), difference)
-    assert (square < chi2_ppf(0.95, 3)).sum() >= 0.85 * len(names)
+    # 12 of 15 or more, but for 0.5 % of draws
+    assert (square < chi2_ppf(0.95, 3)).sum() >= 0.8 * len(names)
     assert 0.7 < np.sqrt(square.mean() / 3) < 1.4
 
 

@@ -432,14 +432,15 @@ def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> No
         for b in range(LINEAR):
             for k in range(u):
                 left[a, b] -= noisy[k] * cross[b, k]
-    if factorise(left, left, 0.0):
+    square = dot(v, v)
+    if square > 0.0 and factorise(left, left, 0.0):
         step = linear[:LINEAR] * out[GAIN]
         solve_factorised(left, step)
-        whole, explained = dot(v, v), 0.0
+        explained = 0.0
         for a in range(LINEAR):
             explained += step[a] * linear[a] * out[GAIN]
         n = side * side
-        out[VARIANCE] *= max(1.0 - explained / whole, 0.0) * (n - u) / (n - u - LINEAR)
+        out[VARIANCE] *= max(1.0 - explained / square, 0.0) * (n - u) / (n - u - LINEAR)
 
 
 @compiled

@@ -289,7 +289,8 @@ def match_squares(
         matched = [rays.select(~coarse[rays.seen.point]) for rays in matched]
         matched += measure(first & coarse, planes, FIRST_SHIFT_PX)
         equations = slope_equations([rays.windows for rays in matched], k)
-        before, changed = changed, estimate_slopes(equations, of_planes, unknown, changed).slope
+        better = estimate_slopes(equations, of_planes, unknown, changed).slope
+        before, changed = changed, np.where(coarse[:, None], better, changed)  # others are on earlier planes
         points = intersect_image_points(
             ImagePoints.joined([reference, *(rays.seen for rays in matched)]),
             camera,
