@@ -400,7 +400,7 @@ def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> No
     clean = without_noise(N, out[WHITE], half, SHIFT)
     factorise(clean, clean, 0.0)
     cross, solved, weighted = np.empty((LINEAR, u)), np.empty((LINEAR, u)), np.zeros((LINEAR, u))
-    left, noisy = np.empty((LINEAR, LINEAR)), np.empty(u)
+    products = np.empty((LINEAR, LINEAR))
     for a in range(LINEAR):
         for k in range(u):
             cross[a, k] = solved[a, k] = dot(rows[a], J[k])
@@ -414,33 +414,51 @@ def fill_linear_part(work: Workspace, out: FloatArray, linear: FloatArray) -> No
     for a in range(LINEAR):
         linear[a] = -dot(rows[a], v) / out[GAIN]
         for b in range(a + 1):
-            whole = dot(rows[a], rows[b])
+            whole = products[a, b] = products[b, a] = dot(rows[a], rows[b])
             expected = whole - noise if a == b else whole
             for k in range(u):
                 expected -= cross[a, k] * solved[b, k]
                 whole += (weighted[a, k] - cross[a, k]) * solved[b, k] - solved[a, k] * cross[b, k]
             linear[derivative + LINEAR * a + b] = linear[derivative + LINEAR * b + a] = expected
             linear[spread + LINEAR * a + b] = linear[spread + LINEAR * b + a] = whole
-            left[a, b] = left[b, a] = dot(rows[a], rows[b])
         for k in range(SHIFT):
             linear[shift + LINEAR * k + a] = -half * solved[a, k]
-    # what the linear part leaves of the residuals: a wrong plane does not count as noise
-    factorise(N, clean, 0.0)
+    out[VARIANCE] *= noise_left(N, cross, products, linear[:LINEAR] * out[GAIN], dot(v, v), side * side)
+
+
+@compiled
+def noise_left(
+    N: FloatArray, cross: FloatArray, products: FloatArray, score: FloatArray, square: float, n: int
+) -> float:
+    """Return the variance of intensities with the linear part estimated, over that without it.
+
+    What a wrong plane adds to the residuals does not count as noise then.
+
+    Args:
+        N: normal matrix of what was estimated, (u, u).
+        cross: its products with the rows of the linear part, (4, u).
+        products: products of these rows, (4, 4); changed.
+        score: of the linear part, (4,).
+        square: sum of squared residuals.
+        n: number of intensities.
+    """
+    u = len(N)
+    factor, solved = np.empty((u, u)), np.empty(u)
+    factorise(N, factor, 0.0)
     for a in range(LINEAR):
-        noisy[:] = cross[a]
-        solve_factorised(clean, noisy)
+        solved[:] = cross[a]
+        solve_factorised(factor, solved)
         for b in range(LINEAR):
             for k in range(u):
-                left[a, b] -= noisy[k] * cross[b, k]
-    square = dot(v, v)
-    if square > 0.0 and factorise(left, left, 0.0):
-        step = linear[:LINEAR] * out[GAIN]
-        solve_factorised(left, step)
-        explained = 0.0
-        for a in range(LINEAR):
-            explained += step[a] * linear[a] * out[GAIN]
-        n = side * side
-        out[VARIANCE] *= max(1.0 - explained / square, 0.0) * (n - u) / (n - u - LINEAR)
+                products[a, b] -= solved[k] * cross[b, k]
+    step = score.copy()
+    if not (square > 0.0 and factorise(products, products, 0.0)):
+        return 1.0
+    solve_factorised(products, step)
+    left = square
+    for a in range(LINEAR):
+        left -= step[a] * score[a]
+    return max(left / square, 0.0) * (n - u) / (n - u - LINEAR)
 
 
 @compiled
