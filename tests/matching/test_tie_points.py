@@ -311,7 +311,8 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
         assert (one > 1).sum() < 0.2 * (one > 0).sum()
         assert (one[40:-40, 40:-40] > 0).mean() > 0.6
     times = windows(count[seen.point] == 3)
-    assert times[0].max() == 1  # of the first, no pixel even where windows of others are smaller or larger
+    # of the first hardly a pixel, although windows of others are smaller or larger, and move to their matches
+    assert (times[0] > 1).sum() < 0.01 * (times[0] > 0).sum()
     # The orientation is the true one; photographs are blurred differently on an oblique surface, which adds
     # 0.12 to 1, and chance 0.04.
     v, dof = found.residuals, 2 * len(seen) - 3 * len(found.points)

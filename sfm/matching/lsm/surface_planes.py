@@ -26,6 +26,7 @@ MIN_WINDOW_PX = 9  # smaller windows hardly determine the parameters of an affin
 MAX_SQUARED_RATIO = 6.0
 ROUNDING_PX = 1e-6  # of positions from intensities in single precision
 NEIGHBOURS = 6  # object points that define the plane at a position
+PARAMETERS = 3  # of a plane
 NEAREST, FARTHEST = 0.5, 2.0  # depths allowed for a plane, times those of the nearest and farthest point
 TOLERANCE_FACTOR = 6.0  # of the spread of points about the planes of their neighbours
 # Fraction of the squares of neighbours' tangents that is added in case they lie in a row.
@@ -53,7 +54,8 @@ def planes_at(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, poin
     """Project positions in a photograph onto the planes through the object points around them.
 
     Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c. The covariance of
-    a slope is that of the fit, with the spread of all points about the planes of their neighbours.
+    a slope is that of the fit, with the spread of its own points, but not less than that of all points about
+    the planes of their neighbours.
 
     Args:
         estimate: orientation and object points.
@@ -73,15 +75,19 @@ def planes_at(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, poin
         return Planes(points, normal, covariance)
     known, inverse, uv = -UVW[:, :2] / UVW[:, 2:], -1 / UVW[:, 2], uv[rows]
     near = cKDTree(known).query(uv, k=NEIGHBOURS)[1]
-    plane, N = _planes(known[near] - uv[:, None], inverse[near])
-    spread = np.nan
+    away = known[near] - uv[:, None]
+    plane, N = _planes(away, inverse[near])
+    spread = np.full(len(uv), np.nan)
     if len(known) > NEIGHBOURS:
-        spread = MAD_TO_SIGMA * float(np.median(np.abs(_off_neighbours(known, inverse)[0])))
+        v = inverse[near] - np.einsum("kij,kj->ki", away, plane[:, :2]) - plane[:, 2:]
+        own = np.sqrt((v**2).sum(axis=1) / (NEIGHBOURS - PARAMETERS))
+        usual = MAD_TO_SIGMA * float(np.median(np.abs(_off_neighbours(known, inverse)[0])))
+        spread = np.maximum(own, usual)
     value = plane[:, 2].copy()  # inverse of the depth at the position
     plane[:, 2] -= np.sum(plane[:, :2] * uv, axis=1)
     inside = (value > inverse.min() / FARTHEST) & (value < inverse.max() / NEAREST)
     rows, uv, value, plane = rows[inside], uv[inside], value[inside], plane[inside]
-    T = _tangents_per_px(lens, xy[rows]) * (spread / value)[:, None, None]
+    T = _tangents_per_px(lens, xy[rows]) * (spread[inside] / value)[:, None, None]
     covariance[rows] = T @ np.linalg.inv(N[inside])[:, :2, :2] @ T.transpose(0, 2, 1)
     points[rows] = X0 + (np.column_stack([uv, -np.ones(len(uv))]) / value[:, None]) @ R.T
     across = -(plane * [1.0, 1.0, -1.0]) @ R.T
