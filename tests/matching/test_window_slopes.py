@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sfm.matching.lsm.surface_planes import Planes, planes_at, tilted_planes
 from sfm.matching.lsm.two_photo import LinearParts
 from sfm.matching.lsm.window_slopes import (
     ShiftedWindows,
@@ -12,8 +15,12 @@ from sfm.matching.lsm.window_slopes import (
     estimate_slopes,
     slope_equations,
 )
+from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import FloatArray
-from tests.synthetic import seed_of
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints
+from sfm.survey.measuring.covering_points import covariance_with_slopes
+from tests.synthetic import make_network, seed_of
 
 WINDOWS = 2000
 PLANE = np.eye(2) * 2e-6**2
@@ -110,3 +117,52 @@ def test_without_texture_or_matches_the_plane_stays_as_it_is() -> None:
     assert np.abs(equations.N).max() < 1e-3 and np.abs(equations.right).max() < 1e-3
     exact = slope_equations(_matches(np.ones((3, 2)) * 1e-6, [(300.0, 0.0)], noise=0.0), 3)
     assert np.isfinite(exact.N).all() and np.isfinite(exact.right).all()
+
+
+def _inverse_depths(truth: Estimate, planes: Planes, xy: FloatArray, beside: FloatArray) -> FloatArray:
+    """Return the inverse depths of planes beside their positions in photograph 0, relative to those there."""
+    lens, R = truth.cameras[0], truth.rotation[0]
+    at, there = (
+        np.column_stack([tangents_from_pixel(lens, places), -np.ones(len(xy))]) @ R.T
+        for places in (xy, xy + beside)
+    )
+    return np.asarray((there * planes.normal).sum(axis=1) / (at * planes.normal).sum(axis=1))
+
+
+def test_planes_state_their_slopes_and_are_tilted_by_them() -> None:
+    network, truth = make_network(seed_of("planes"), images=1, points=4000)
+    rng, lens, R = seed_of("points of planes"), truth.cameras[0], truth.rotation[0]
+    xy = rng.uniform(20, np.array(lens.size_px) - 20, (4000, 2))
+    uv = tangents_from_pixel(lens, xy)
+    for larger in (1.0, 5.0):  # the noise of a tenth of the points, over that of the others
+        noise = 1e-5 * np.where(rng.random(4000) < 0.1, larger, 1.0) * rng.normal(size=4000)
+        depth = 1 / (0.002 + 0.0004 * uv[:, 0] - 0.0003 * uv[:, 1] + noise)
+        points = truth.position[0] + (depth[:, None] * np.column_stack([uv, -np.ones(4000)])) @ R.T
+        estimate = replace(truth, points=points)
+        places = rng.uniform(100, np.array(lens.size_px) - 100, (500, 2))
+        planes = planes_at(estimate, network.camera, 0, places, np.arange(4000))
+        at = tangents_from_pixel(lens, places)
+        true = np.array([0.0004, -0.0003]) / (0.002 + at @ [0.0004, -0.0003])[:, None]
+        T = np.stack([tangents_from_pixel(lens, places + d) - at for d in np.eye(2)], axis=1)
+        stated = np.stack([_inverse_depths(estimate, planes, places, d) - 1 for d in np.eye(2)], axis=1)
+        error = stated - np.einsum("kab,kb->ka", T, true)
+        square = np.einsum("ka,kab,kb->k", error, np.linalg.inv(planes.slope_covariance), error) / 2
+        assert 0.4 < np.median(square) < 1.0 and np.quantile(square, 0.9) < 3.0  # 2.3 by chance
+    slope = rng.normal(size=(500, 2)) * 1e-4
+    moved = tilted_planes(estimate, network.camera, 0, places, planes, slope)
+    assert np.linalg.norm(moved.normal, axis=1) == pytest.approx(np.ones(500))
+    for d in (np.array([3.0, 0.0]), np.array([-2.0, 4.0])):
+        change = _inverse_depths(estimate, moved, places, d) - _inverse_depths(estimate, planes, places, d)
+        assert change == pytest.approx(slope @ d, rel=0.01, abs=1e-6)
+
+
+def test_slopes_count_as_often_as_a_point_has_rays() -> None:
+    """The mean of n rays has the covariance of matching over n, and that of slopes as it is."""
+    number = np.array([0, 0, 0, 0, 1, 1])
+    C, S = np.diag([0.04, 0.09]), np.diag([0.01, 0.02])
+    of_slopes = np.array([np.zeros((2, 2)), S, S, S, np.zeros((2, 2)), S])
+    seen = ImagePoints(np.array([0, 1, 2, 3, 0, 1]), number, np.zeros((6, 2)), np.tile(C, (6, 1, 1)))
+    whole = covariance_with_slopes(seen, of_slopes)
+    assert whole[[0, 4]] == pytest.approx(np.array([C, C]))
+    assert np.linalg.inv(np.linalg.inv(whole[1:4]).sum(axis=0)) == pytest.approx(C / 3 + S)
+    assert whole[5] == pytest.approx(C + S)
