@@ -315,6 +315,22 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
     return _pixels(camera.index, camera.linear_frame, camera.parameters, corrects, rays)
 
 
+def parameter_jacobian(camera: Camera, uv: FloatArray) -> FloatArray:
+    """Return d (x, y) / d (parameters), the change of the pixel coordinates of rays with each parameter.
+
+    Args:
+        camera: interior orientation of n parameters.
+        uv: tangents of the rays, shape (k, 2).
+
+    Returns:
+        Derivatives, shape (k, 2, n), px per unit of the parameter; NaN where the distortion folds over.
+    """
+    rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
+    corrects = MODELS[camera.model].corrects
+    xy = pixel_from_tangents(camera, rays)
+    return _by_parameters(camera.index, camera.linear_frame, camera.parameters, corrects, xy, rays)
+
+
 def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
     """Return directions of rays in object axes, shape (k, 3), one unit long along the camera axis.
 
@@ -432,6 +448,30 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, corrects: bool, uv: Fl
             at[:] = np.nan
         xy[i] = at
     return xy
+
+
+@compiled
+def _by_parameters(
+    model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: FloatArray, uv: FloatArray
+) -> FloatArray:
+    """Return the derivatives of pixels by the parameters, at given rays, (k, 2, n)."""
+    residual, J, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
+    n = len(p)
+    jacobian = np.full((len(xy), 2, n), np.nan)
+    for i in range(len(xy)):
+        if not (np.isfinite(xy[i, 0]) and np.isfinite(xy[i, 1])):
+            continue
+        if not corrects:
+            observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], residual, J, Jp)
+            jacobian[i] = Jp[:, :n]
+            continue
+        # the residual stays 0 if the measured point moves
+        _linearise(model, frame, p, True, uv[i], xy[i, 0], xy[i, 1], residual, J, Jp)
+        det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
+        for s in range(n):
+            jacobian[i, 0, s] = (J[0, 1] * Jp[1, s] - J[1, 1] * Jp[0, s]) / det
+            jacobian[i, 1, s] = (J[1, 0] * Jp[0, s] - J[0, 0] * Jp[1, s]) / det
+    return jacobian
 
 
 @kernel

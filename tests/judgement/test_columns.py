@@ -13,7 +13,7 @@ from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.judgement.hypotheses import columns
 from sfm.judgement.hypotheses.columns import columns_of, interior_columns, object_fields, rigid_motions
-from sfm.model.camera import pixel_from_tangents, project
+from sfm.model.camera import project
 from sfm.model.conventions import rotation_from_vector
 from sfm.model.distortion.models import Role
 from tests.synthetic import make_network, seed_of
@@ -107,16 +107,18 @@ def test_a_point_behind_a_photograph_has_no_columns(a: Adjustment) -> None:
         assert not part[~found.usable].any() and np.isfinite(part).all()
 
 
-def test_a_step_moves_image_points_by_a_hundredth_of_a_pixel(a: Adjustment) -> None:
-    camera = a.estimate.cameras[0]
-    uv = seed_of("step").uniform(-0.4, 0.4, (20, 2))
-    for s, name in enumerate(camera.names):
-        step = columns._step(camera, s, uv)
-        away = pixel_from_tangents(columns._changed(camera, s, step), uv) - pixel_from_tangents(camera, uv)
-        assert np.abs(away).max() == pytest.approx(0.01, rel=0.02), name
-        assert interior_columns(a, [(0, s)])[2][0] > 0
-    idle = uv[:0]
-    assert columns._step(camera, 0, idle) > 0
+def test_the_largest_effect_of_an_interior_parameter_is_a_pixel(a: Adjustment) -> None:
+    for index, camera in enumerate(a.estimate.cameras):
+        for s, name in enumerate(camera.names):
+            own, keys, (unit,) = interior_columns(a, [(index, s)])
+            assert np.abs(own).max() == pytest.approx(1.0), name
+            assert unit > 0 and keys == [(camera.owner_of(s), name)]
+
+
+def test_an_unused_camera_has_no_effect(a: Adjustment) -> None:
+    network = replace(a.network, camera=np.zeros_like(a.network.camera))
+    own, _, (unit,) = interior_columns(replace(a, network=network), [(1, 0)])
+    assert not own.any() and unit > 0
 
 
 def test_the_edge_of_the_longer_side_is_the_unit_of_the_camera_columns(a: Adjustment) -> None:

@@ -12,6 +12,7 @@ from sfm.model.camera import (
     Camera,
     camera_from_values,
     corner_shift,
+    parameter_jacobian,
     pixel_from_tangents,
     pixel_jacobian,
     project,
@@ -249,6 +250,31 @@ def test_pixel_jacobian_against_differences(model: str) -> None:
     for a, e in enumerate(np.eye(2)):
         ahead, behind = pixel_from_tangents(camera, uv + h * e), pixel_from_tangents(camera, uv - h * e)
         assert np.abs(J[:, :, a] - (ahead - behind) / (2 * h)).max() < 1e-6 * camera.c_px
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_parameter_jacobian_against_differences(model: str) -> None:
+    camera = lens(model)
+    uv = np.array([[0.2, -0.15], [-0.3, 0.1], [0.01, 0.02]])
+    J = parameter_jacobian(camera, uv)
+    assert J.shape == (3, 2, len(camera.parameters))
+    for s in range(len(camera.parameters)):
+        moves = np.abs(J[:, :, s]).max()
+        step = np.zeros(len(camera.parameters))
+        step[s] = 1e-3 / moves  # px
+        ahead, behind = (
+            pixel_from_tangents(camera.with_parameters(camera.parameters + sign * step), uv)
+            for sign in (1, -1)
+        )
+        assert np.abs(J[:, :, s] * step[s] - (ahead - behind) / 2).max() < 1e-8
+
+
+def test_parameter_jacobian_is_unknown_where_the_distortion_folds_over() -> None:
+    camera = camera_from_values("folded", "brown", SIZE_PX, PIXEL_MM, c_mm=10.0, values=(("K1", 0.1),))
+    uv = np.array([[0.05, 0.0], [3.0, 2.0]])
+    J = parameter_jacobian(camera, uv)
+    assert np.isfinite(J[0]).all()
+    assert np.isnan(J[1]).all() == np.isnan(pixel_from_tangents(camera, uv)[1]).all()
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.model.camera import Camera, pixel_from_tangents, pixel_jacobian
+from sfm.model.camera import Camera, parameter_jacobian, pixel_jacobian
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distortion.models import Role
 from sfm.model.network import rows_of
@@ -40,7 +40,6 @@ STRAIN, BENDING = 5, 18  # columns
 CAMERA_PLACES = tuple(range(len(CAMERA)))  # indices in the freedoms of a photograph
 STRAIN_PLACES = tuple(range(len(CAMERA), len(CAMERA) + STRAIN))
 BENDING_PLACES = tuple(range(len(CAMERA) + STRAIN, len(CAMERA) + STRAIN + BENDING))
-SMALL_MOVE_PX = 0.01  # shift of image points by a parameter in its numerical derivative
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,7 @@ def columns_of(a: Adjustment) -> Columns:
     """Return the derivatives of all image points of an adjustment."""
     network, estimate = a.network, a.estimate
     seen = network.image_points
-    R, X = estimate.rotation[seen.image], estimate.points[seen.point] - estimate.position[seen.image]
-    UVW = np.einsum("kji,kj->ki", R, X)
+    R, UVW = estimate.rotation[seen.image], _in_photographs(a, np.arange(len(seen)))
     U, V, W = UVW.T
     uv = -UVW[:, :2] / W[:, None]
     k = len(seen)
@@ -100,14 +98,9 @@ def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
         camera: camera.
         uv: tangents of the rays, (k, 2).
     """
-    step, focal = SMALL_MOVE_PX / (max(camera.size_px) / 2), camera.plays(Role.FOCAL)
-
-    def seen(factor: float) -> FloatArray:
-        return pixel_from_tangents(
-            camera.with_parameters(np.where(focal, factor, 1.0) * camera.parameters), uv
-        )
-
-    return np.nan_to_num((seen(1 + step) - seen(1 - step)) / (2 * SMALL_MOVE_PX))
+    focal = camera.plays(Role.FOCAL)
+    by_focal = parameter_jacobian(camera, uv)[:, :, focal] @ camera.parameters[focal]
+    return np.asarray(np.nan_to_num(by_focal)) / (max(camera.size_px) / 2)
 
 
 def _camera(flat: FloatArray) -> FloatArray:
@@ -181,41 +174,29 @@ def interior_columns(
         Columns (k, 2, g), (camera or group, parameter name) of each, and the change of the parameter for one
         unit of the column.
     """
-    seen = a.network.image_points
-    groups: dict[tuple[str, str], FloatArray] = {}
+    network, estimate = a.network, a.estimate
+    seen = network.image_points
+    owners = [
+        (estimate.cameras[index].owner_of(s), estimate.cameras[index].names[s]) for index, s in parameters
+    ]
+    groups = {owner: np.zeros((len(seen), 2)) for owner in owners}
     units: dict[tuple[str, str], float] = {}
-    for index, s in parameters:
-        camera = a.estimate.cameras[index]
-        rows = np.flatnonzero(a.network.camera[seen.image] == index)
-        image, point = seen.image[rows], seen.point[rows]
-        away = a.estimate.points[point] - a.estimate.position[image]
-        UVW = np.einsum("kji,kj->ki", a.estimate.rotation[image], away)
-        uv = -UVW[:, :2] / UVW[:, 2:]
-        step = _step(camera, s, uv)
-        key = (camera.owner_of(s), camera.names[s])
-        unit = units.setdefault(key, step / SMALL_MOVE_PX)
-        difference = pixel_from_tangents(_changed(camera, s, step), uv)
-        difference -= pixel_from_tangents(_changed(camera, s, -step), uv)
-        column = groups.setdefault(key, np.zeros((len(seen), 2)))
-        column[rows] += np.nan_to_num(difference) * (unit / (2 * step))
+    for index in dict.fromkeys(index for index, _ in parameters):
+        camera = estimate.cameras[index]
+        rows = np.flatnonzero(network.camera[seen.image] == index)
+        UVW = _in_photographs(a, rows)
+        jacobian = np.nan_to_num(parameter_jacobian(camera, -UVW[:, :2] / UVW[:, 2:]))
+        largest = np.abs(jacobian).max(axis=(0, 1), initial=0.0)
+        for (other, s), owner in zip(parameters, owners, strict=True):
+            if other == index:
+                unit = units.setdefault(owner, 1 / float(largest[s]) if largest[s] > 0 else 1.0)
+                groups[owner][rows] += jacobian[:, :, s] * unit
     stacked = np.stack(list(groups.values()), axis=2) if groups else np.zeros((len(seen), 2, 0))
-    return stacked, list(groups), [units[key] for key in groups]
+    return stacked, list(groups), [units[owner] for owner in groups]
 
 
-def _step(camera: Camera, s: int, uv: FloatArray) -> float:
-    """Return the step of a parameter that moves image points by at most `SMALL_MOVE_PX`."""
-    step = 1e-6 * max(abs(float(camera.parameters[s])), 1e-6)
-    at = pixel_from_tangents(camera, uv)
-    for _ in range(20):
-        away = np.abs(pixel_from_tangents(_changed(camera, s, step), uv) - at)
-        most = float(np.nanmax(away, initial=0.0))
-        if most > SMALL_MOVE_PX / 10:
-            return step * SMALL_MOVE_PX / most
-        step *= 10
-    return step
-
-
-def _changed(camera: Camera, s: int, step: float) -> Camera:
-    p = camera.parameters.copy()
-    p[s] += step
-    return camera.with_parameters(p)
+def _in_photographs(a: Adjustment, rows: IntArray) -> FloatArray:
+    """Return the object points of image points in the system of their photograph, (r, 3)."""
+    image, point = a.network.image_points.image[rows], a.network.image_points.point[rows]
+    away = a.estimate.points[point] - a.estimate.position[image]
+    return np.asarray(np.einsum("kji,kj->ki", a.estimate.rotation[image], away))

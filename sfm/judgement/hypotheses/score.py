@@ -29,6 +29,7 @@ from sfm.judgement.hypotheses.columns import Columns, interior_columns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distributions import f_sf
 from sfm.model.network import rows_of, sum_rows
+from sfm.runtime.compiling import compiled
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
 MIN_DETERMINED_SHARE = 1e-5
@@ -168,14 +169,42 @@ class Reduced:
     def _eliminated(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return L B'D (3 n, u f), and A'D (a, u f) reduced by the object points."""
         n, m, f, count = len(self.L), self.photographs, D.shape[2], int(run.max()) + 1
-        owner = run[self.image]
-        by_points = sum_rows(self.point * count + owner, np.swapaxes(self.B, 1, 2) @ D, n * count)
-        C = np.moveaxis(self.L[:, None] @ by_points.reshape(n, count, 3, f), 1, 2).reshape(3 * n, count * f)
-        by = np.swapaxes(self.A, 1, 2) @ D
-        K = np.zeros((len(self.t), count, f))
-        K[: 6 * m].reshape(m, 6, count, f)[np.arange(m), :, run] = sum_rows(self.image, by[:, :6], m)
-        K[6 * m :] = np.moveaxis(sum_rows(owner, by[:, 6:], count), 0, 1)
+        by_points, K = np.zeros((n, 3, count, f)), np.zeros((len(self.t), count, f))
+        _sum_products(self.B, self.A, D, self.image, self.point, run[self.image], by_points, K, m)
+        C = (self.L @ by_points.reshape(n, 3, count * f)).reshape(3 * n, count * f)
         return C, K.reshape(len(self.t), count * f) - self.W.reshape(3 * n, -1).T @ C
+
+
+@compiled
+def _sum_products(
+    B: FloatArray, A: FloatArray, D: FloatArray, image: IntArray, point: IntArray, run: IntArray,
+    by_points: FloatArray, by_cameras: FloatArray, m: int,
+) -> None:  # fmt: skip
+    """Add B'D to each object point (n, 3, u, f), and A'D to photographs and cameras, (a, u, f).
+
+    Args:
+        B: derivatives by object points, (k, 2, 3).
+        A: those by photographs and interior parameters, (k, 2, 6 + i).
+        D: columns, (k, 2, f).
+        image: photograph of each image point, (k,).
+        point: object point of each image point, (k,).
+        run: run of photographs of each image point, (k,).
+        by_points: sums of object points.
+        by_cameras: sums of m photographs, 6 rows each, and of i interior parameters.
+        m: number of photographs.
+    """
+    f = D.shape[2]
+    for k in range(len(D)):
+        u, x, y = run[k], D[k, 0], D[k, 1]
+        for c in range(3):
+            total = by_points[point[k], c, u]
+            for j in range(f):
+                total[j] += B[k, 0, c] * x[j] + B[k, 1, c] * y[j]
+        for c in range(A.shape[2]):
+            row = 6 * image[k] + c if c < 6 else 6 * (m - 1) + c
+            total = by_cameras[row, u]
+            for j in range(f):
+                total[j] += A[k, 0, c] * x[j] + A[k, 1, c] * y[j]
 
 
 def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
