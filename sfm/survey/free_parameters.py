@@ -78,8 +78,10 @@ def choose_free_parameters(
     if not silent:
         return FreeParameters(survey.cameras, estimate, ())
     names: Chosen = [None] * len(survey.cameras)
+    on_plates = plate_family(survey.targets) is not None
     for a in silent:
-        names[a] = _candidates(survey, survey.cameras[a])
+        of_plates = MODELS[survey.cameras[a].model].names_of(*OF_PLATES) if on_plates else ()
+        names[a] = {*survey.cameras[a].may_be_free, *of_plates}
     estimate = _with_free(estimate, names)
     everything = np.ones(len(network.image_points), dtype=bool)
     images, points = select_supported(
@@ -124,12 +126,6 @@ def choose_free_parameters(
         for said in _remarks(settings[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
     return FreeParameters(tuple(settings), _with_free(estimate, names), tuple(remarks))
-
-
-def _candidates(survey: Survey, settings: CameraSettings) -> set[str]:
-    """Return the parameters of a camera that may be free."""
-    further = MODELS[settings.model].names_of(*OF_PLATES) if plate_family(survey.targets) is not None else ()
-    return {*settings.may_be_free, *further}
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:

@@ -320,7 +320,9 @@ def separate_sizes(survey: Survey, files: PhotographList) -> OtherSizes:
             if size == main:
                 continue
             what = _kind(size, main)
-            held = _is_held(camera) and what != RESAMPLED
+            # given values apply to the whole format only
+            held = bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
+            held &= what != RESAMPLED
             if len(rows) < MIN_OWN or held:
                 reason = remark(
                     "photograph_of_other_size",
@@ -386,11 +388,6 @@ def _kind(size: Size, main: Size) -> str:
         return UPRIGHT
     ratio = (size[0] / size[1]) / (main[0] / main[1])
     return RESAMPLED if abs(ratio - 1) < MAX_ASPECT_DIFFERENCE else CROPPED
-
-
-def _is_held(camera: CameraSettings) -> bool:
-    """Return whether a camera is held at given values, which apply to its whole format only."""
-    return bool(camera.fixed or camera.weighted or (camera.states_free and not camera.may_be_free))
 
 
 def _resized(
