@@ -22,6 +22,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters
 from sfm.model.camera import KNOWN_WITHOUT, Camera, corner_shift
+from sfm.model.conventions import BoolArray
 from sfm.model.distortion.models import MODELS, Role
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -167,7 +168,9 @@ def _determined_parameters(
                 wider[index[camera]] = (wider[index[camera]] or set()) | {parameter}
         if adjusted is None or wider == names:
             break
-        tried, adjusted = _hold_undetermined(part, adjusted.estimate, wider, datum, false_alarm)
+        tried, adjusted = _hold_undetermined(
+            part, adjusted.estimate, wider, datum, false_alarm, adjusted.rejected
+        )
         if adjusted is None or tried == names:
             break
         names = tried
@@ -175,15 +178,22 @@ def _determined_parameters(
 
 
 def _hold_undetermined(
-    part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float
+    part: Network,
+    start: Estimate,
+    names: Chosen,
+    datum: str,
+    false_alarm: float,
+    rejected: BoolArray | None = None,
 ) -> tuple[Chosen, Adjustment | None]:
     """Hold the worst parameters one by one until all others are determined; also the last adjustment.
 
-    Observed parameters are never held: they take part with the precision of their values.
+    Observed parameters are never held: they take part with the precision of their values. Each adjustment
+    begins without the image points that the one before rejected.
     """
     observed = set(zip(part.interior.camera.tolist(), part.interior.parameter.tolist(), strict=True))
     while any(names):
-        adjusted = _adjust_or_none(part, _with_free(start, names), datum, false_alarm)
+        adjusted = _adjust_or_none(part, _with_free(start, names), datum, false_alarm, rejected)
+        rejected = rejected if adjusted is None else adjusted.rejected
         worst, reach = None, KNOWN_WITHOUT
         for a, chosen in enumerate(names):
             index = start.cameras[a].names.index
@@ -205,7 +215,9 @@ def _hold_undetermined(
     return names, None
 
 
-def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: float) -> Adjustment | None:
+def _adjust_or_none(
+    part: Network, start: Estimate, datum: str, false_alarm: float, rejected: BoolArray | None
+) -> Adjustment | None:
     """Adjust the free parameters; None if the adjustment fails or does not determine everything."""
     try:
         adjustment = adjust(
@@ -213,6 +225,7 @@ def _adjust_or_none(part: Network, start: Estimate, datum: str, false_alarm: flo
             start,
             datum=Datum(datum),
             false_alarm=false_alarm,
+            rejected=rejected,
             options=AdjustmentOptions(redundancy_numbers=False),
         )
     except (GeometryError, np.linalg.LinAlgError):

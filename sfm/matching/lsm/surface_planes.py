@@ -55,7 +55,7 @@ def planes_at(estimate: Estimate, camera: IntArray, i: int, xy: FloatArray, poin
 
     Over a plane the inverse of the depth is linear in the tangents: 1 / t = a u + b v + c. The covariance of
     a slope is that of the fit, with the spread of its own points, but not less than that of all points about
-    the planes of their neighbours.
+    the planes of their neighbours: three degrees of freedom alone often show too little.
 
     Args:
         estimate: orientation and object points.

@@ -90,11 +90,11 @@ class LinearParts:
     the product of the residuals and their derivatives by d, after elimination of all that was estimated.
     """
 
-    score: FloatArray  # in left units, (k, 4)
+    score: FloatArray  # in squares of left units, (k, 4)
     derivative: FloatArray  # of the expected score by d, (k, 4, 4)
     spread: FloatArray  # covariance of the score if a difference of intensities has the variance 1, (k, 4, 4)
-    variance: FloatArray  # of a difference of intensities, left units, (k,)
-    shift: FloatArray  # derivative of the estimated shift by d, px in the left photograph, (k, 2, 4)
+    variance: FloatArray  # of a difference of intensities, squares of left units, (k,)
+    shift: FloatArray  # change of the match by d put into the warp, px in the left photograph, (k, 2, 4)
 
     def select(self, rows: BoolArray) -> LinearParts:
         """Return those of the selected matches."""
@@ -179,7 +179,7 @@ def match_lsm(
 
     Raises:
         GeometryError: an unknown model or kernel, an even window, different numbers of points, or the score
-            of a linear part that is estimated.
+            of a linear part that is estimated, or of too few pixels.
 
     Source: Gruen (1985), S. Afr. J. Photogrammetry 14(3), and Foerstner (1993) in Haralick and Shapiro,
     Computer and Robot Vision II, ch. 16; the inverse form is Baker and Matthews (2004), IJCV 56(3).
@@ -205,6 +205,11 @@ def match_lsm(
         raise GeometryError(f"LSM: start has shape {given.shape}, needed ({k}, 2, 2) or ({k}, 3, 3)")
     if settings.linear and model != "shift":
         raise GeometryError(f"LSM: score of a linear part with model '{model}', needed model 'shift'")
+    unknowns = MODELS[model] + RADIOMETRIC + (BLUR if settings.blur else 0) + LINEAR
+    if settings.linear and settings.window_px**2 <= unknowns:
+        raise GeometryError(
+            f"LSM: window of {settings.window_px} px with a linear part, expected more than {unknowns} pixels"
+        )
     warp = np.zeros((k, 3, 3))
     warp[:, : given.shape[1], : given.shape[1]] = given
     warp[:, 2, 2] = 1.0
@@ -243,6 +248,7 @@ def match_lsm(
     xy = np.where((flag == 0)[:, None], out[:, [X, Y]], np.nan)
     covariance = out[:, [CXX, CXY, CXY, CYY]].reshape(k, 2, 2)
     covariance[flag != 0] = np.nan
+    linear[flag != 0] = np.nan
     steps = out[:, STEPS].astype(np.int64)
     return LsmMatches(
         xy,

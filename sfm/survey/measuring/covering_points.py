@@ -5,7 +5,7 @@ after that. Textured squares, side by side, are placed on the plane through the 
 They are projected into all photographs that see the plane, and matched there. Photographs with the most
 similar direction come first, and their rays correct the position of the point for the others. A point is thus
 followed through all its photographs, even if their directions are too different for descriptors. All rays of
-a point share the slope of its plane, which their windows correct. No pixel is measured twice. Each photograph
+a point share the slope of its plane, which their windows correct. Windows hardly overlap. Each photograph
 takes squares from pixels that earlier photographs did not cover. A square is matched only in photographs
 whose pixels there are still free.
 """
@@ -109,6 +109,10 @@ class _Matched:
             self.in_reference[rows],
         )
 
+    def border_step(self, step: FloatArray) -> FloatArray:
+        """Return how far borders of windows move by changes of slope times half a side, px, (k,)."""
+        return np.asarray(np.linalg.norm(self.windows.parallax, axis=1) * step[self.seen.point])
+
 
 def find_covering_points(
     photographs: Sequence[AnyArray],
@@ -193,12 +197,16 @@ def seen_squares(
     for j in np.flatnonzero(estimate.oriented).tolist():
         at = project_points(estimate, camera, np.full(len(squares), j), squares.planes.points)
         size = np.array(estimate.cameras[camera[j]].size_px)
-        ray = estimate.position[j] - squares.planes.points
-        cosine = np.sum(ray * squares.planes.normal, axis=1) / np.linalg.norm(ray, axis=1)
         with np.errstate(invalid="ignore"):
             inside = ((at >= margin_px) & (at <= size - 1 - margin_px)).all(axis=1)
-        rows = np.flatnonzero(inside & (cosine > MIN_COSINE))
+        rows = np.flatnonzero(inside & (_cosines(estimate, j, squares.planes) > MIN_COSINE))
         yield j, rows, at[rows]
+
+
+def _cosines(estimate: Estimate, j: int, planes: Planes) -> FloatArray:
+    """Return the cosines of the angles between the normals of planes and their rays to photograph j, (k,)."""
+    ray = estimate.position[j] - planes.points
+    return np.asarray(np.sum(ray * planes.normal, axis=1) / np.linalg.norm(ray, axis=1))
 
 
 def _visible(
@@ -303,14 +311,16 @@ def match_squares(
         step = np.linalg.norm(changed - before, axis=1) * window_px / 2
         coarse = np.zeros(k, dtype=bool)
         for rays in matched:
-            parallax = np.linalg.norm(rays.windows.parallax, axis=1)
-            coarse[rays.seen.point[parallax * step[rays.seen.point] > COARSE_STEP]] = True
+            coarse[rays.seen.point[rays.border_step(step) > COARSE_STEP]] = True
         coarse &= np.isfinite(points).all(axis=1)
         if not coarse.any():
             break
     matched = measure(visible & np.isfinite(points).all(axis=1), planes, LATER_SHIFT_PX)
     equations = slope_equations([rays.windows for rays in matched], k)
     slopes = estimate_slopes(equations, of_planes, unknown, changed)
+    # matches are linear functions of slopes for short steps only
+    step = np.linalg.norm(slopes.slope - changed, axis=1) * window_px / 2
+    matched = [rays.select(rays.border_step(step) <= COARSE_STEP) for rays in matched]
     number, in_reference = np.zeros(k), np.zeros((k, 2, 2))
     seen, of_slopes = [reference], [np.zeros((k, 2, 2))]
     for rays in matched:
@@ -372,9 +382,7 @@ class _Placed:
     at: FloatArray  # where, px, (k, 2)
     warp: FloatArray  # homographies of the windows, relative to both points, (k, 3, 3)
     scale: FloatArray  # of the windows relative to the reference, (k,)
-    parallax: (
-        FloatArray  # displacement in the reference for a relative change of inverse depth by 1, px, (k, 2)
-    )
+    parallax: FloatArray  # shift in the reference for a relative change of inverse depth by 1, px, (k, 2)
 
 
 def _placed(
@@ -385,8 +393,9 @@ def _placed(
     at = project_points(estimate, camera, np.full(len(rows), j), planes.points)
     warp = plane_warps(estimate, camera, i, j, xy, planes.points, planes.normal, reach_px)
     with np.errstate(invalid="ignore"):  # for planes that the photograph does not see
-        scale = np.sqrt(np.abs(np.linalg.det(warp[:, :2, :2])))
-    fits = np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
+        scale = np.sqrt(np.maximum(np.linalg.det(warp[:, :2, :2]), 0.0))
+        fits = _cosines(estimate, j, planes) > MIN_COSINE
+    fits &= np.isfinite(at).all(axis=1) & (scale > SCALES[0]) & (scale < SCALES[1])
     parallax = _parallaxes(estimate, camera, i, j, planes.points[fits], warp[fits])
     return _Placed(rows[fits], at[fits], warp[fits], scale[fits], parallax)
 
@@ -426,11 +435,14 @@ def _affine_slopes(
         return rows, placed.parallax[good], turned
 
     others = np.flatnonzero(which.any(axis=1))
-    products, squares_of = np.zeros((k, 2)), np.zeros(k)
+    products, squares_of_parallax = np.zeros((k, 2)), np.zeros(k)
     for rows, parallax, turned in in_threads(matched, others[others != i].tolist(), threads):
         products[rows] += np.einsum("ka,kab->kb", parallax, turned)
-        squares_of[rows] += np.einsum("ka,ka->k", parallax, parallax)
-    return products / np.where(squares_of > 0, squares_of, 1.0)[:, None]
+        squares_of_parallax[rows] += np.einsum("ka,ka->k", parallax, parallax)
+    slope = products / np.where(squares_of_parallax > 0, squares_of_parallax, 1.0)[:, None]
+    # a plane seen at grazing incidence at most: beyond, the affine matches are wrong
+    possible = np.linalg.norm(slope, axis=1) * estimate.cameras[camera[i]].c_px < 1 / MIN_COSINE
+    return np.where(possible[:, None], slope, 0.0)
 
 
 def _parallaxes(

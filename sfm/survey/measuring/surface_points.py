@@ -190,12 +190,18 @@ def _with_common_part(
     images, rays = np.ones(len(network.images), dtype=bool), np.ones(len(seen), dtype=bool)
     part, start = reduce_network(without_given(network), estimate, images, chosen, rays)
 
+    before: Adjustment | None = None
+
     def adjust_with(covariance: FloatArray) -> Adjustment:
-        nonlocal start
+        nonlocal before
         weighted = replace(part, image_points=replace(part.image_points, covariance=covariance))
-        adjustment = adjust(weighted, start, false_alarm=settings.false_alarm)
-        start = adjustment.estimate
-        return adjustment
+        before = adjust(
+            weighted,
+            start if before is None else before.estimate,
+            false_alarm=settings.false_alarm,
+            rejected=None if before is None else before.rejected,
+        )
+        return before
 
     try:
         factor, common_px = estimate_common_part(adjust_with, matching[chosen[seen.point]], settings.sigma_px)
@@ -337,8 +343,8 @@ def _best_window(
     """Return the side of TRIED_WINDOWS_PX whose rays together have the smallest standard deviation, px."""
     most = np.argsort(-np.bincount(surface.image_points.image, minlength=len(photographs)), kind="stable")
     costs: list[tuple[int, float]] = []
-    given = (settings.window_px,) if "window_px" in settings.model_fields_set else TRIED_WINDOWS_PX
-    for window_px in given:
+    sides_px = (settings.window_px,) if "window_px" in settings.model_fields_set else TRIED_WINDOWS_PX
+    for window_px in sides_px:
         side = _side(estimate, window_px, settings.max_points)
         trial_side = max(TRIAL_SIDES * window_px + 1, side)
         trial = find_covering_points(

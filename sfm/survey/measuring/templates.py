@@ -72,9 +72,7 @@ class _Candidates:
     """Places of templates."""
 
     template: IntArray  # of each candidate, (c,)
-    across: (
-        BoolArray  # whether its plane is across the axis of the photograph, and not that of neighbours, (c,)
-    )
+    across: BoolArray  # whether its plane is across the axis, and not that of neighbours, (c,)
     stated: BoolArray  # whether it started from the approximate position of the point, (c,)
     points: FloatArray  # object points, (c, 3)
 
@@ -220,18 +218,17 @@ def _matched(
             jobs,
             both_ways=needed == 2,
         )
-        here = measured.image_points.image != scene.earlier
-        seen = measured.image_points
-        seen = replace(seen, covariance=covariance_with_slopes(seen, measured.of_slopes))
-        rays, r = seen.select(here), measured.correlation[here]
+        kept = np.flatnonzero(measured.image_points.image != scene.earlier)
+        rays = measured.image_points.select(kept)
         met = intersect_image_points(rays, camera, estimate, n_points=len(numbers), tolerance_px=TOLERANCE_PX)
-        kept = met.used & scene.visible(rays.image, rays.xy)
-        rays, r = rays.select(kept), r[kept]
+        kept = kept[met.used & scene.visible(rays.image, rays.xy)]
+        rays = measured.image_points.select(kept)
         enough = np.bincount(rays.point, minlength=len(numbers)) >= needed
         if i != scene.earlier:  # the ray of the template is the point
             enough &= np.bincount(rays.point[rays.image == i], minlength=len(numbers)) > 0
-        good = enough[rays.point]
-        rays, r = rays.select(good), r[good]
+        kept = kept[enough[rays.point]]
+        rays, r = measured.image_points.select(kept), measured.correlation[kept]
+        rays = replace(rays, covariance=covariance_with_slopes(rays, measured.of_slopes[kept]))
         others = rays.image != i
         points[numbers] = met.points
         z[numbers] = np.bincount(
@@ -275,9 +272,11 @@ def _most_alike(candidates: _Matched, pixels: FloatArray, levels: Levels) -> tup
         quantile = -float(normal_ppf(levels.of_each(len(rivals))))
         doubt = ambiguous(r, candidates.r[rivals], independent, quantile)
         if (doubt | (candidates.count[rivals] > candidates.count[most])).any():
-            by_marks = numbers[candidates.stated[numbers]]
-            chosen += by_marks.tolist()
-            doubtful += [] if len(by_marks) else [template]
+            by_marks = numbers[candidates.stated[numbers]].tolist()
+            if by_marks and all(_same_place(candidates.rays, by_marks[0], k) for k in by_marks[1:]):
+                chosen.append(max(by_marks, key=lambda k: candidates.count[k]))
+            else:
+                doubtful.append(template)
         else:
             chosen.append(most)
     kept = np.isin(candidates.rays.point, chosen)
