@@ -253,6 +253,8 @@ def test_bad_input_is_refused_in_one_line() -> None:
         GeometryError, match="score of a linear part with model 'affine', needed model 'shift'"
     ):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(linear=True))
+    with pytest.raises(GeometryError, match="window of 3 px with a linear part, expected more than 11"):
+        match_lsm(photograph, photograph, at, at, LsmSettings("shift", window_px=3, blur=True, linear=True))
     with pytest.raises(GeometryError, match="interpolation 'sinc', expected one of"):
         match_lsm(photograph, photograph, at, at, settings=LsmSettings(interpolation="sinc"))
     with pytest.raises(GeometryError, match="1 point in the left photograph, 2 in the right"):

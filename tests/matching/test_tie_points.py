@@ -26,7 +26,7 @@ from sfm.matching.lsm.coverage import (
     plane_warps,
     points_apart,
 )
-from sfm.matching.lsm.surface_planes import planes_at
+from sfm.matching.lsm.surface_planes import Planes, planes_at, tilted_planes
 from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.radiometry import GreyPhotographs, grey_of
 from sfm.matching.tracks import feature_tracks, interest
@@ -55,6 +55,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
 from sfm.model.remarks.remark import kinds_of
 from sfm.model.similarity import fit_similarity
+from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.relative import relative_orientations
 from sfm.pipeline import run_survey
 from sfm.products.batch.run import run_batch
@@ -63,10 +64,16 @@ from sfm.products.refining.refinement import RefineSettings, refine_model, refin
 from sfm.report.output import read_log
 from sfm.survey.assembly import OtherPrograms
 from sfm.survey.inputs.survey import read_survey
-from sfm.survey.measuring.covering_points import _returning, find_covering_points
+from sfm.survey.measuring.covering_points import (
+    Squares,
+    _returning,
+    find_covering_points,
+    match_squares,
+)
 from sfm.survey.measuring.surface_points import remarks_on_disagreement
 from sfm.textbook.matching import match_along_line
 from tests.engines import ALONE, HERE, Notes
+from tests.synthetic import seed_of
 from tests.tables import rows_of
 from tests.textures import random_texture, with_noise
 
@@ -332,6 +339,32 @@ def test_covering_points_cover_photographs_that_are_oriented() -> None:
     (found_wrong,) = remarks_on_disagreement(wrong)
     assert found_wrong.number("share") == pytest.approx(1 - len(wrong.residuals) / wrong.matched)
     assert found_wrong.severity == "error"
+
+
+@pytest.mark.parametrize("tilt", [0.1, 0.3])
+def test_planes_with_wrong_slopes_give_the_same_depths(tilt: float) -> None:
+    photographs, truth, _ = _scene()
+    lens, camera = truth.cameras[0], np.zeros(3, dtype=np.int64)
+    grey = GreyPhotographs(photographs.__getitem__)
+    xy = textured_squares(grey[0].pixels, 15, np.ones(photographs[0].shape[:2], dtype=bool), border_px=60)
+    planes = planes_at(truth, camera, 0, xy, np.arange(len(truth.points)))
+    known = np.isfinite(planes.slope_covariance).all(axis=(1, 2))
+    xy, planes = xy[known], planes.select(known)
+    sigma = tilt / lens.c_px
+    slope = seed_of("wrong slopes").normal(size=(len(xy), 2)) * sigma
+    tilted = tilted_planes(truth, camera, 0, xy, planes, slope)
+    tilted = replace(tilted, slope_covariance=planes.slope_covariance + sigma**2 * np.eye(2))
+
+    def height_error(on: Planes) -> FloatArray:
+        squares, shown = Squares(0, xy, on), np.ones((3, len(xy)), dtype=bool)
+        rays = match_squares(grey, truth, camera, squares, shown, 15, 1, both_ways=False)
+        met = intersect_image_points(rays.image_points, camera, truth, n_points=len(xy), tolerance_px=1.0)
+        X, Y, Z = met.points[np.isfinite(met.points).all(axis=1)].T
+        return np.asarray(Z - render.height(X, Y))
+
+    right, corrected = height_error(planes), height_error(tilted)
+    assert len(right) > 300 and len(corrected) >= 0.98 * len(right)
+    assert np.sqrt((corrected**2).mean()) < 1.1 * np.sqrt((right**2).mean()) < 6e-5
 
 
 def test_pairs_whose_matches_are_known_are_not_matched_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,6 +119,20 @@ def test_without_texture_or_matches_the_plane_stays_as_it_is() -> None:
     assert np.isfinite(exact.N).all() and np.isfinite(exact.right).all()
 
 
+def test_stripes_without_noise_have_a_singular_spread() -> None:
+    """Rounding leaves eigenvalues of either sign where the texture shows nothing."""
+    matches = _matches(np.full((WINDOWS, 2), 1e-6), [(300.0, 0.0), (-100.0, 200.0)])
+    for match in matches:
+        values, vectors = np.linalg.eigh(match.linear.spread)
+        values[:, :2] = 0.0
+        values[:, 0] = np.where(np.arange(WINDOWS) % 2 == 0, -1.1e-6, 1.1e-6) * values.sum(axis=1)
+        match.linear.spread[:] = vectors @ (values[:, :, None] * vectors.transpose(0, 2, 1))
+        match.linear.derivative[:] = match.linear.spread
+    equations = slope_equations(matches, WINDOWS)
+    assert np.isfinite(equations.N).all() and np.isfinite(equations.right).all()
+    assert np.linalg.eigvalsh(equations.N).min() > -1e-9 * np.abs(equations.N).max()
+
+
 def _inverse_depths(truth: Estimate, planes: Planes, xy: FloatArray, beside: FloatArray) -> FloatArray:
     """Return the inverse depths of planes beside their positions in photograph 0, relative to those there."""
     lens, R = truth.cameras[0], truth.rotation[0]

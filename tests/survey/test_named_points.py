@@ -14,13 +14,15 @@ import pytest
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import project
 from sfm.model.conventions import AnyArray, FloatArray
-from sfm.model.distributions import chi2_ppf
+from sfm.model.distributions import Levels, chi2_ppf
 from sfm.model.errors import SurveyFileError
+from sfm.model.network import ImagePoints
 from sfm.model.similarity import fit_similarity
 from sfm.pipeline import run_survey
 from sfm.products.rendering.render import render_photographs
 from sfm.products.rendering.scene import Optics, join_marks, rectangles
 from sfm.survey.inputs.survey import read_survey
+from sfm.survey.measuring.templates import _Matched, _most_alike
 from tests.surveys import SIZE_PX, SURVEY, camera, code_centres, plates, stations
 from tests.synthetic import seed_of
 
@@ -178,6 +180,31 @@ def test_a_place_that_nothing_matches_is_named(tmp_path: Path) -> None:
     (said,) = [one for one in result.verdict.remarks if one.kind == "marks_unmatched"]
     assert said.names("points") == ("beside",) and "beside" not in result.network.points
     assert said.text == "1 named point was found in too few other photographs: beside."
+
+
+def _candidates(at: list[list[float]], r: list[float]) -> _Matched:
+    """Return candidates of a template with rays in photographs 0 to 2; the last was not stated."""
+    n = len(at)
+    image, point = np.tile(np.arange(3), n), np.repeat(np.arange(n), 3)
+    xy = np.repeat(np.array(at), 3, axis=0)
+    rays = ImagePoints(image, point, xy, np.tile(np.eye(2), (3 * n, 1, 1)))
+    stated = np.arange(n) < n - 1
+    return _Matched(
+        np.zeros(n, dtype=int), ~stated, stated, np.zeros((n, 3)), rays, np.array(r), np.full(n, 3)
+    )
+
+
+def test_a_doubtful_point_is_where_it_was_marked_once() -> None:
+    """A place is tried with two planes, which may lead to the same place."""
+    pixels, levels = np.array([100.0]), Levels(0.05)
+    rays, doubtful = _most_alike(
+        _candidates([[50, 50], [50.1, 50], [90, 90]], [0.9, 0.89, 0.901]), pixels, levels
+    )
+    assert rays.image.tolist() == [0, 1, 2] and (rays.point == 0).all() and not len(doubtful)
+    rays, doubtful = _most_alike(
+        _candidates([[50, 50], [70, 50], [90, 90]], [0.9, 0.89, 0.901]), pixels, levels
+    )
+    assert not len(rays) and doubtful.tolist() == [0]
 
 
 @pytest.mark.sweep(0)
