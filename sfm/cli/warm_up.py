@@ -20,6 +20,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
+from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.matching.conjugate import match_points
 from sfm.matching.conjugate_patches import METHODS, MatchSettings
 from sfm.matching.lsm.coverage import points_apart
@@ -89,10 +90,11 @@ def compile_orientation() -> None:
 
 
 def compile_adjustment() -> None:
-    """Adjust networks in all the ways that a survey uses, and prepare a comparison."""
+    """Adjust networks in all the ways that a survey uses, judge one, and prepare a comparison."""
     network, truth = made_up_network()
     adjust(network, truth, datum=Datum("free"), reject="huber", covariance=False)
     adjustment = adjust(network, truth, datum=Datum("free"), reject="tau")
+    judge_alternatives(adjustment)
     part, start, _, _ = common_problem(adjustment)
     compared = adjust(part, start, datum=Datum("free"), reject="none")
     reprojection(part, compared.estimate)

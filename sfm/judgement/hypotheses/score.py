@@ -170,7 +170,8 @@ class Reduced:
         """Return L B'D (3 n, u f), and A'D (a, u f) reduced by the object points."""
         n, m, f, count = len(self.L), self.photographs, D.shape[2], int(run.max()) + 1
         by_points, K = np.zeros((n, 3, count, f)), np.zeros((len(self.t), count, f))
-        _sum_products(self.B, self.A, D, self.image, self.point, run[self.image], by_points, K, m)
+        B, A, D = (np.ascontiguousarray(array) for array in (self.B, self.A, D))
+        _sum_products(B, A, D, self.image, self.point, run[self.image], by_points, K, m)
         C = (self.L @ by_points.reshape(n, 3, count * f)).reshape(3 * n, count * f)
         return C, K.reshape(len(self.t), count * f) - self.W.reshape(3 * n, -1).T @ C
 
