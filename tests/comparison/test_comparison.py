@@ -22,6 +22,7 @@ from sfm.comparison.two_adjusters.adjusters import common_problem, compare_adjus
 from sfm.model.camera import camera_from_values
 from sfm.model.conventions import rotation_from_vector
 from sfm.model.distortion.models import MODELS as CAMERA_MODELS
+from sfm.model.distortion.models import Role
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
@@ -161,6 +162,30 @@ def test_common_problem_drops_what_does_not_take_part() -> None:
     assert start.cameras[0].model == "full_opencv"
     assert conversions[0].max_px < 0.06
     assert freed == ()
+
+
+@pytest.mark.parametrize(
+    ("K1", "free", "model"),
+    [
+        (2e-6, ("c", "K1", "K2"), "opencv"),  # 0.04 % at the edge
+        (2e-6, ("c", "K1", "K2", "K3"), "full_opencv"),  # a coefficient more than opencv has
+        (2e-3, ("c", "K1", "K2"), "full_opencv"),  # 40 %: its inverse has further terms
+    ],
+)
+def test_the_common_camera_is_the_plainest_that_is_as_good(
+    K1: float, free: tuple[str, ...], model: str
+) -> None:
+    network, truth = make_network(seed_of("plainest"), model="brown", points=30, images=6, noise_px=0.1)
+    camera = truth.cameras[0]
+    values = np.where([name == "K1" for name in camera.names], K1, 0.0)
+    values[camera.plays(Role.FOCAL)] = camera.parameters[camera.plays(Role.FOCAL)]
+    plain = replace(camera.with_parameters(values), free=np.isin(camera.names, free))
+    adjustment = adjust(network, truth, datum=Datum("free"), reject="none")
+    adjustment = replace(adjustment, estimate=replace(adjustment.estimate, cameras=(plain,)))
+    _, start, conversions, _ = common_problem(adjustment)
+    assert start.cameras[0].model == model
+    if model == "opencv":
+        assert conversions[0].max_px < 0.1 * adjustment.sigma0_px
 
 
 @pytest.mark.parametrize("model", ["opencv", "full_opencv", "brown"])

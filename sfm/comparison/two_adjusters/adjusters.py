@@ -1,9 +1,9 @@
 """Comparison of two adjusters on one network, with a camera model that both can estimate.
 
 Both adjusters get a problem that both can solve: the accepted image points with equal weights, without
-control or scale bars, and with one functional model. For a survey in `brown` this model is `full_opencv`. If
-cameras share only some of their parameters, the shared parameters are held, since COLMAP cannot share single
-parameters.
+control or scale bars, and with one functional model. For a survey in `brown` this model is `opencv` where two
+radial coefficients are enough, else `full_opencv`. If cameras share only some of their parameters, the shared
+parameters are held, since COLMAP cannot share single parameters.
 
 With all twelve parameters free, full_opencv is nearly singular: a common factor of the numerator and the
 denominator of its radial term changes nothing. COLMAP frees the distortion as a whole or not at all. If the
@@ -47,6 +47,10 @@ MIN_RAYS, MIN_POINTS = 2, 3  # photographs that determine a point, points that d
 # thousandfold, they may still converge: of 32 random networks that had not converged after 40 steps, 25 did
 # so by step 200.
 MAX_ITERATIONS = 200
+OPENCV_RADIAL = 2  # coefficients
+# Misfit of a model, over the standard deviation of an image coordinate, up to which it is that of the survey:
+# it adds half a per cent to residuals.
+MAX_MISFIT = 0.1
 Outcome = Literal["agrees", "fits alike", "differs"]
 MIN_RMS_RATIO = 1.1  # of residuals; a smaller ratio has no visible effect on the coordinates
 
@@ -148,7 +152,7 @@ def compare_adjusters(
         adjustment: adjustment of the survey.
         backend: the other adjuster, a function of network and start values.
         name: name of the backend.
-        model: functional model of both; if not given, that of the survey if COLMAP has it, else full_opencv.
+        model: functional model of both; if not given, as for `common_problem`.
 
     Raises:
         GeometryError: nothing is left to compare.
@@ -254,17 +258,15 @@ def common_problem(
 
     Args:
         adjustment: adjustment of the survey.
-        model: functional model; if not given, that of the survey if COLMAP has it, else full_opencv.
+        model: functional model; if not given, that of the survey if COLMAP has it, else opencv if its cameras
+            are as good with two radial coefficients, else full_opencv.
 
     Raises:
         GeometryError: fewer than two photographs with accepted image points.
     """
     estimate = adjustment.estimate
     cameras = estimate.cameras
-    if model is None:
-        models = {camera.model for camera in cameras}
-        model = models.pop() if len(models) == 1 and models <= OF_COLMAP else "full_opencv"
-    conversions = tuple(convert_camera(camera, model) for camera in cameras)
+    conversions = _converted(cameras, adjustment.sigma0_px, model)
     converted = tuple(conversion.camera for conversion in conversions)
     grouped = grouped_free(converted)
     freed = tuple(
@@ -292,6 +294,23 @@ def common_problem(
         moment=network.moment,
     )
     return network, start, conversions, freed
+
+
+def _converted(cameras: tuple[Camera, ...], sigma_px: float, model: str | None) -> tuple[Conversion, ...]:
+    """Return the cameras in one model: the given one, or the plainest that COLMAP has and that fits them."""
+    models = {camera.model for camera in cameras}
+    if model is None and len(models) == 1 and models <= OF_COLMAP:
+        model = models.pop()
+    if model is not None:
+        return tuple(convert_camera(camera, model) for camera in cameras)
+    if all((camera.free & camera.plays(Role.RADIAL)).sum() <= OPENCV_RADIAL for camera in cameras):
+        try:
+            plain = tuple(convert_camera(camera, "opencv") for camera in cameras)
+        except GeometryError:  # it folds over inside a photograph
+            plain = ()
+        if plain and max(conversion.max_px for conversion in plain) <= MAX_MISFIT * sigma_px:
+            return plain
+    return tuple(convert_camera(camera, "full_opencv") for camera in cameras)
 
 
 def grouped_free(cameras: tuple[Camera, ...]) -> tuple[Camera, ...]:
