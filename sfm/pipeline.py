@@ -15,7 +15,6 @@ from pathlib import Path
 
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.errors import GeometryError
-from sfm.photographs.masks import Masks
 from sfm.runtime.progress import SILENT, Progress, StageClock
 from sfm.runtime.threads import own_threads
 from sfm.survey.adjusting.choices import solve_survey
@@ -25,6 +24,7 @@ from sfm.survey.inputs.measurements import (
     NO_PHOTOGRAPHS,
     Measurements,
     find_photographs,
+    masks_of,
     refuse_incomplete_cameras,
 )
 from sfm.survey.inputs.photograph_names import name_photographs
@@ -98,7 +98,9 @@ def _measure(
     survey, clocks = moments_from_exif(named.survey, files)
     survey, positions = exterior_from_exif(survey, files)
     refuse_unknown_photographs(survey, files.names)
-    Masks(survey.masks).refuse_wrong(files.path_of())
+    masks = masks_of(survey, images_dir=images_dir)
+    masks.refuse_wrong(files.path_of())
+    survey = replace(survey, masks=masks.folder)
     sizes = separate_sizes(survey, files)
     survey = sizes.survey
     if survey.start_cameras is None:

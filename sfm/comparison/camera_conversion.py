@@ -21,15 +21,15 @@ from sfm.model.camera import (
     camera_from_values,
     pixel_from_tangents,
     pixel_jacobian,
+    residuals_of_rays,
     tangents_from_pixel,
 )
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.display import counted
-from sfm.model.distortion.models import CONVERTIBLE, MAX_PARAMETERS, MODELS, Model, Role, observe
+from sfm.model.distortion.models import CONVERTIBLE, MODELS, Model, Role
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of
-from sfm.runtime.compiling import compiled
 
 PINHOLE = (Role.FOCAL, Role.X0, Role.Y0)  # parts of a camera without distortion
 GRID_STEPS = 32  # fit points along the longer side: four per period of a misfit that varies as r^9 at most
@@ -99,7 +99,7 @@ def convert_camera(
     from scipy.optimize import least_squares  # importing takes half a second, and most commands never need it
 
     def rows(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        residuals, jacobian = _residuals(start.index, start.linear_frame, _padded(p, fitted), xy, uv)
+        residuals, jacobian = residuals_of_rays(start.index, start.linear_frame, _padded(p, fitted), xy, uv)
         return residuals.ravel(), jacobian.reshape(2 * len(xy), -1)[:, fitted]
 
     effect_px = np.linalg.norm(rows(start.parameters[fitted])[1], axis=0)
@@ -278,21 +278,6 @@ def _as_full_opencv(camera: Camera) -> dict[str, float]:
     """Return the parameters of full_opencv, 0 for those that the camera's model does not have."""
     values = {_OF_ONE.get(name, name): camera.value(name) for name in camera.names}
     return dict.fromkeys(MODELS["full_opencv"].names, 0.0) | values
-
-
-@compiled
-def _residuals(
-    model: int, frame: FloatArray, p: FloatArray, xy: FloatArray, uv: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return residuals, (k, 2), and their derivatives by the parameters, (k, 2, n), at pixels and rays."""
-    r, Ju, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
-    residuals = np.empty((len(xy), 2))
-    jacobian = np.empty((len(xy), 2, len(p)))
-    for i in range(len(xy)):
-        observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], r, Ju, Jp)
-        residuals[i] = r
-        jacobian[i] = Jp[:, : len(p)]
-    return residuals, jacobian
 
 
 def undistort(network: Network, estimate: Estimate, models: tuple[str, ...]) -> tuple[Network, Estimate]:

@@ -326,9 +326,16 @@ def parameter_jacobian(camera: Camera, uv: FloatArray) -> FloatArray:
         Derivatives, shape (k, 2, n), px per unit of the parameter; NaN where the distortion folds over.
     """
     rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
-    corrects = MODELS[camera.model].corrects
-    xy = pixel_from_tangents(camera, rays)
-    return _by_parameters(camera.index, camera.linear_frame, camera.parameters, corrects, xy, rays)
+    xy, frame = pixel_from_tangents(camera, rays), camera.linear_frame
+    Jp = residuals_of_rays(camera.index, frame, camera.parameters, xy, rays)[1]
+    if not MODELS[camera.model].corrects:
+        return np.asarray(np.where(np.isfinite(xy)[:, :, None], Jp, np.nan))
+    # of correction models, the residual stays 0 if the measured point moves; it does against x0 and y0
+    by_x, by_y = -Jp[:, :, 1:2] * frame[2], Jp[:, :, 2:3] * frame[3]
+    det = by_x[:, :1] * by_y[:, 1:] - by_y[:, :1] * by_x[:, 1:]
+    x = by_y[:, :1] * Jp[:, 1:] - by_y[:, 1:] * Jp[:, :1]
+    y = by_x[:, 1:] * Jp[:, :1] - by_x[:, :1] * Jp[:, 1:]
+    return np.asarray(np.concatenate([x, y], axis=1) / det)
 
 
 def ray_directions(uv: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -451,27 +458,26 @@ def _pixels(model: int, frame: FloatArray, p: FloatArray, corrects: bool, uv: Fl
 
 
 @compiled
-def _by_parameters(
-    model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: FloatArray, uv: FloatArray
-) -> FloatArray:
-    """Return the derivatives of pixels by the parameters, at given rays, (k, 2, n)."""
-    residual, J, Jp = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS))
-    n = len(p)
-    jacobian = np.full((len(xy), 2, n), np.nan)
+def residuals_of_rays(
+    model: int, frame: FloatArray, p: FloatArray, xy: FloatArray, uv: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals, (k, 2), and their derivatives by the parameters, (k, 2, n), at pixels and rays.
+
+    Args:
+        model: index of the distortion model.
+        frame: linear frame of the camera.
+        p: its parameters, (n,).
+        xy: pixel coordinates, px, (k, 2).
+        uv: tangents of the rays, (k, 2).
+    """
+    residual, J, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
+    residuals = np.empty((len(xy), 2))
+    jacobian = np.empty((len(xy), 2, len(p)))
     for i in range(len(xy)):
-        if not (np.isfinite(xy[i, 0]) and np.isfinite(xy[i, 1])):
-            continue
-        if not corrects:
-            observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], residual, J, Jp)
-            jacobian[i] = Jp[:, :n]
-            continue
-        # the residual stays 0 if the measured point moves
-        _linearise(model, frame, p, True, uv[i], xy[i, 0], xy[i, 1], residual, J, Jp)
-        det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
-        for s in range(n):
-            jacobian[i, 0, s] = (J[0, 1] * Jp[1, s] - J[1, 1] * Jp[0, s]) / det
-            jacobian[i, 1, s] = (J[1, 0] * Jp[0, s] - J[0, 0] * Jp[1, s]) / det
-    return jacobian
+        observe(model, frame, p, xy[i, 0], xy[i, 1], uv[i, 0], uv[i, 1], residual, J, Jp)
+        residuals[i] = residual
+        jacobian[i] = Jp[:, : len(p)]
+    return residuals, jacobian
 
 
 @kernel

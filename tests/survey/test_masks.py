@@ -51,6 +51,26 @@ def test_nothing_is_measured_under_black(tmp_path: Path) -> None:
     assert len(seen) < len(whole)
 
 
+def test_masks_are_among_the_photographs_if_these_are_elsewhere(tmp_path: Path) -> None:
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    file = masked(photographs)
+    moved = tmp_path / "survey.toml"
+    text = file.read_text("utf-8").replace('masks = "masks"', 'masks = "./masks"')
+    moved.write_text(text, "utf-8")
+    (photographs / "corners.csv").rename(tmp_path / "corners.csv")
+    result = run_survey(read_survey(moved), images_dir=photographs)
+    assert (result.adjustment.network.image_points.xy[:, 0] > BLACK.stop - 1).all()
+    (photographs / "masks").rename(tmp_path / "masks")  # beside the survey file
+    again = run_survey(read_survey(moved), images_dir=photographs)
+    np.testing.assert_array_equal(
+        again.adjustment.network.image_points.xy, result.adjustment.network.image_points.xy
+    )
+    (tmp_path / "masks").rename(tmp_path / "hidden")
+    with pytest.raises(SurveyFileError, match="needed the folder of the masks"):
+        run_survey(read_survey(moved), images_dir=photographs)
+
+
 def test_a_mask_is_decoded_once_in_a_survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Targets, tie points, given image points and windows all ask for it; it is read again if it changes."""
     read: list[str] = []

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, Protocol
@@ -304,12 +305,14 @@ def _converted(cameras: tuple[Camera, ...], sigma_px: float, model: str | None) 
     if model is not None:
         return tuple(convert_camera(camera, model) for camera in cameras)
     if all((camera.free & camera.plays(Role.RADIAL)).sum() <= OPENCV_RADIAL for camera in cameras):
-        try:
-            plain = tuple(convert_camera(camera, "opencv") for camera in cameras)
-        except GeometryError:  # it folds over inside a photograph
-            plain = ()
-        if plain and max(conversion.max_px for conversion in plain) <= MAX_MISFIT * sigma_px:
-            return plain
+        plain = list[Conversion]()
+        with suppress(GeometryError):  # it folds over inside a photograph
+            for camera in cameras:
+                plain.append(convert_camera(camera, "opencv"))
+                if plain[-1].max_px > MAX_MISFIT * sigma_px:
+                    break
+            else:
+                return tuple(plain)
     return tuple(convert_camera(camera, "full_opencv") for camera in cameras)
 
 

@@ -210,13 +210,27 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
                     "characters; rename the file"
                 )
         owner += [(path.relative_to(folder).as_posix(), path, index) for path in matched]
-    masks = Masks(survey.masks).beside([name for name, _, _ in owner])
+    masks = masks_of(survey, images_dir=images_dir).beside([name for name, _, _ in owner])
     owner = [(name, path, index) for name, path, index in owner if path.resolve() not in masks]
     names, paths, cameras = zip(*owner, strict=True)
     _refuse_two_cameras(survey, names, cameras)
     refuse_many(survey.source, names)
     refuse_ungrouped(survey.cameras, names, cameras, survey.source)
     return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
+
+
+def masks_of(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> Masks:
+    """Return the masks of a survey: those in the folder of the photographs, else beside the survey file.
+
+    Args:
+        survey: a survey with photographs, or its file.
+        images_dir: folder of the photographs in place of the survey's folder.
+    """
+    folder = survey.masks
+    if folder is not None and images_dir is not None and folder.is_relative_to(survey.folder):
+        among = Path(images_dir) / folder.relative_to(survey.folder)
+        folder = among if among.is_dir() else folder
+    return Masks(folder)
 
 
 def _refuse_two_cameras(survey: Survey | SurveyFile, names: Sequence[str], cameras: Sequence[int]) -> None:

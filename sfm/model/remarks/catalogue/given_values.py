@@ -27,7 +27,8 @@ DATUM = (
         "Of {of:@}, {names} {names:is|are} not in the result.",
         "names that no measured point or target has, or points with too few rays: a plane needs 4, a line "
         "3, a rigid frame 2, a station 2 targets",
-        "Correct the names: those of points.csv; coded targets have their numbers.",
+        "Mark a point that is in one photograph in another one; correct the names of all others: those of "
+        "points.csv, and coded targets have their numbers.",
     ),
     Kind(
         "exif_positions_far",

@@ -30,8 +30,8 @@ ADJUSTMENT = (
         "error",
         "The rank defect is {defect}, expected {expected}[[; not determined ({undetermined})]].",
         "some unknowns have no observation that determines them",
-        "Hold the undetermined parameters fixed, or add photographs: of points with few rays, or tilted "
-        "ones.",
+        "Give more control or a scale bar where position, rotation or scale are not determined; else hold "
+        "the undetermined parameters fixed, or add photographs: of points with few rays, or tilted ones.",
     ),
     Kind(
         "sigma0_high",
