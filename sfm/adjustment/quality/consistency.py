@@ -56,8 +56,8 @@ class Change:
     next: str  # first photograph of the second part
     points: int  # that both parts determine
     times: float  # RMS difference over its standard deviation
-    # largest difference of a coordinate of the result, the weighted mean of both parts, from those of the
-    # nearer part, over its standard deviation
+    # largest expected difference of a coordinate of the result, the weighted mean of both parts, from those
+    # of the nearer part, over its standard deviation
     shift: float
 
 
@@ -162,7 +162,7 @@ def _change(adjustment: Adjustment, parts: PointNormals, level: float) -> tuple[
             scale = np.where(sigma[known] > 0, sigma[known], np.inf)
             nearest = min(float((np.abs(away) / scale).max()) for away in (from_first, d - from_first))
             names = a.network.images[end], a.network.images[end + 1]
-            best = Change(*names, int(known.sum()), float(np.sqrt(F)), nearest)
+            best = Change(*names, int(known.sum()), float(np.sqrt(F)), max(1 - 1 / F, 0.0) * nearest)
             least = probability
     return len(ends), best
 
