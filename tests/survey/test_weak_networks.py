@@ -118,6 +118,12 @@ def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:
     assert outcome_of(918).over_sigma < 2
 
 
+def test_another_start_is_without_the_points_that_the_final_adjustment_lost() -> None:
+    """Points were lost after the network had settled, and then another solution was better."""
+    found = outcome_of(12195)
+    assert {"better_solution_taken", "points_not_determined"} <= set(found.kinds) and found.over_sigma < 2
+
+
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
     cause = remark("held_parameter", parameters="K1", camera="A", photographs=(), shift=8.0, rms=2.0)
     (found,) = remarks_on_held_c(("A",), (cause,))

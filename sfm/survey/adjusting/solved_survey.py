@@ -423,8 +423,9 @@ def _finish_from_best_start(start: _Prepared, settled: StableAdjustment) -> _Fin
     """Return the final adjustment, from another solution if that is likelier."""
 
     def settle_again(before: _Final) -> _Final:
-        estimate = merge_estimate(before.others[0].estimate, settled.images, settled.points)
-        again = settle(settled.task, estimate).after(settled)
+        last = before.settled  # without the points that the final adjustment lost
+        estimate = merge_estimate(before.others[0].estimate, last.images, last.points)
+        again = settle(last.task, estimate).after(last)
         return _finish(start, again, before=before.adjustment)
 
     return choose(_finish(start, settled), (BETTER_START,), settle_again)
