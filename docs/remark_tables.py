@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from sfm.model.remarks.catalogue import SUBJECTS, TESTS
-from sfm.model.remarks.remark import FIELD, Grade, Kind, Unless
+from sfm.model.remarks.row import FIELD, Grade, Kind, Unless
 
 BEGIN, END = "<!-- remarks: written by docs/remark_tables.py -->", "<!-- end of remarks -->"
 VARIES = "…"

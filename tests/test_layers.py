@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -183,6 +184,15 @@ def test_no_two_rooms_import_one_another() -> None:
     for (a, b), words in arrows.items():
         if "sfm" not in (a, b) and a != b and (b, a) in arrows and not belongs(a, b) and not belongs(b, a):
             raise AssertionError(f"{words}, and {arrows[b, a]}")
+
+
+def test_no_modules_import_one_another_in_a_circle() -> None:
+    """Not even in functions or for type checking."""
+    arrows = {name: {other for other in imported(path) & MODULES.keys()} for name, path in MODULES.items()}
+    for name, others in arrows.items():
+        packages = {other for other in others if any(belongs(inner, other) for inner in others - {other})}
+        others -= packages | {name}  # a package is named with its modules
+    TopologicalSorter(arrows).prepare()
 
 
 def room_of(name: str) -> str:

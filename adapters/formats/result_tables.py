@@ -38,7 +38,8 @@ from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, InteriorObservations, Network, Source
 from sfm.model.reduced_network import CORRELATION_LIMIT
-from sfm.model.remarks.remark import Quantity, Remark
+from sfm.model.remarks.remark import Remark
+from sfm.model.remarks.row import Quantity
 from sfm.model.remarks.verdict import Verdict
 from sfm.model.solution import MEASURED, SeenTargets, Solution
 

@@ -9,6 +9,7 @@ from typing import Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
+from sfm.adjustment.engine.unknowns import scaled_covariance
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted, html_table, text_table
 from sfm.model.distributions import FALSE_ALARM, LEVEL, Levels
@@ -17,7 +18,7 @@ from sfm.model.network import Network
 from sfm.model.observations.kind import Group
 from sfm.model.remarks.remark import Remark
 from sfm.model.remarks.verdict import Verdict
-from sfm.model.solution import NO_SCALE, OBJECT_UNITS, Solution, mount_blocks
+from sfm.model.solution import NO_SCALE, OBJECT_UNITS, JointCovariance, Solution, mount_blocks
 
 # Relative rounding of an image coordinate. Computed coordinates are exact to about 1e-15, or to 1e-10 if
 # errors of control strain their network; measured coordinates are exact to 1e-7 at best.
@@ -151,6 +152,9 @@ class Adjustment:
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation
     judge: Callable[[Adjustment], Verdict] | None = None  # judges it when its verdict is asked for
+    joint: Callable[[Adjustment], JointCovariance] | None = (
+        None  # gives its joint covariances when asked
+    )
 
     @cached_property
     def verdict(self) -> Verdict | None:
@@ -167,8 +171,6 @@ class Adjustment:
     @cached_property
     def solution(self) -> Solution:
         """The accepted image points, with their solution and covariance."""
-        from sfm.adjustment.covariance import JointOnDemand
-
         exterior = self.covariance.exterior
         return Solution(
             "adjustment",
@@ -183,7 +185,7 @@ class Adjustment:
             exterior_covariance=exterior,
             interior_covariance=self.covariance.interior,
             rig_covariance=self.covariance.rigs if len(self.covariance.rigs) else None,
-            joint=JointOnDemand(self),
+            joint=None if self.joint is None else self.joint(self),
             sigma0=self.sigma0 if self.sigma0 > 0 else 1.0,
             judged=self._judged,
         )
@@ -356,16 +358,6 @@ def computed_once(
         return computed
 
     return figure
-
-
-def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
-    """Return covariances after multiplying standard deviations by a factor.
-
-    Args:
-        covariance: covariances, (k, 2, 2).
-        sigma_factor: factor on the standard deviations of each, (k,).
-    """
-    return np.asarray(covariance * sigma_factor[:, None, None] ** 2)
 
 
 def _median_sigma(covariance: FloatArray) -> float:

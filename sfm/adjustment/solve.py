@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm.adjustment.covariance import LocalNetwork, local_of
+from sfm.adjustment.covariance import JointOnDemand, LocalNetwork, local_of
 from sfm.adjustment.datum import Datum, without_far_points
 from sfm.adjustment.engine.cofactors import (
     Cofactors,
@@ -390,4 +390,5 @@ def _result(
         datum_points=run.problem.datum.points,
         remarks=(*run.remarks, *_small_weight_remarks(layout, weight, network)),
         start_sigma0=float(np.sqrt(run.start_vPv / redundancy)) if redundancy > 0 else float("nan"),
+        joint=JointOnDemand,
     )

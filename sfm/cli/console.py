@@ -13,7 +13,7 @@ from rich.text import Text
 from sfm.cli.process import FAILED
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.display import MAX_LISTED, counted, listed, program_name, wrapped
-from sfm.model.remarks.remark import Severity
+from sfm.model.remarks.row import Severity
 from sfm.model.remarks.verdict import Line, Verdict
 from sfm.report.findings import Findings
 from sfm.report.page import Banner

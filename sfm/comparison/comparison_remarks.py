@@ -8,7 +8,8 @@ import numpy as np
 
 from sfm.comparison.causes import Cause
 from sfm.comparison.significance import ResultComparison
-from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.row import WRONG_SIGMAS
 from sfm.model.remarks.verdict import Level, Verdict, judge
 from sfm.model.solution import MAX_POINTS
 

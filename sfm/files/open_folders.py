@@ -80,6 +80,49 @@ def open_regular_file(path: Path, flags: int) -> int:
     raise OutputError(f"{path}: is not a regular file with one name, and is left alone")
 
 
+def path_inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
+    """Return the path of a file in a folder; symbolic links are followed for the check.
+
+    Args:
+        folder: the folder.
+        name: path relative to the folder.
+        where: file that states the path, for error messages.
+        allow_outside: whether the path may leave the folder.
+
+    Raises:
+        SurveyFileError: the path leaves the folder, or is not a valid path.
+    """
+    try:
+        path = folder / name
+        path.is_file()  # raises if a name is too long for the disk
+        left = not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # circular links, a null byte
+        raise SurveyFileError(f"{where}: {name!r:.100} is not the path of a file") from error
+    if left and not allow_outside:
+        raise SurveyFileError(
+            f"{where}: {name!r:.100} leaves the survey's folder; --allow-outside allows that, "
+            "for survey files that you trust"
+        )
+    return path
+
+
+def is_home_file(path: Path) -> bool:
+    """Return whether a link leads to a file in the user's home folder outside hidden folders.
+
+    People use links to collect photographs in a folder, so these links are not an attack.
+
+    Args:
+        path: path of the link.
+    """
+    try:
+        target, home = path.resolve(), Path.home().resolve()
+    except (OSError, RuntimeError):
+        return False
+    if not (target.is_file() and target.is_relative_to(home)):
+        return False
+    return not any(part.startswith(".") for part in target.relative_to(home).parts)
+
+
 def make_folder(path: Path) -> None:
     """Make a folder and the folders above it, if they do not exist.
 

@@ -13,7 +13,8 @@ from sfm.judgement.calibrated_cameras import CALIBRATION_FAILED, CalibratedCamer
 from sfm.judgement.survey_result import PhotographTargets, SurveyResult
 from sfm.model.conventions import FloatArray
 from sfm.model.distortion.models import Role
-from sfm.model.remarks.remark import EXPECTED_SIGMAS, Quantity, Remark, remark, unless_note
+from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.model.remarks.row import EXPECTED_SIGMAS, Quantity
 
 DECENTRING_FRACTION = 0.02  # of the diagonal: decentring of a lens or sensor to be expected
 

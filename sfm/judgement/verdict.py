@@ -44,7 +44,8 @@ from sfm.model.display import counted, program_name
 from sfm.model.distributions import binomial_sf, normal_ppf
 from sfm.model.network import rows_of
 from sfm.model.observation_residuals import GivenResiduals, GivenValue
-from sfm.model.remarks.remark import Grade, Remark, remark, unless_note
+from sfm.model.remarks.remark import Remark, remark, unless_note
+from sfm.model.remarks.row import Grade
 from sfm.model.remarks.verdict import Level, Verdict, judge
 
 MM = 1e-3  # m

@@ -19,8 +19,8 @@ from sfm.model.conventions import SUPERSCRIPTS, FloatArray
 from sfm.model.conventions import finer_unit as finer_unit
 from sfm.model.display import NO_BREAK, counted, listed
 from sfm.model.distributions import normal_ppf
-from sfm.model.remarks.remark import probability as probability
-from sfm.model.remarks.remark import significant as significant
+from sfm.model.remarks.row import probability as probability
+from sfm.model.remarks.row import significant as significant
 from sfm.report.findings import Findings
 
 MIN_PLAIN_VALUE = 1e-3  # parameters below it are written with an exponent

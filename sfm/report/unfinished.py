@@ -8,7 +8,7 @@ from importlib.metadata import version
 import numpy as np
 
 from sfm.model.display import counted
-from sfm.model.remarks.remark import SEVERITIES
+from sfm.model.remarks.row import SEVERITIES
 from sfm.model.remarks.verdict import Verdict
 from sfm.report.figures.overlays import Overlay
 from sfm.report.page import Column, Note, Page, Part, Section, Table, Tile, facts, values_of

@@ -36,7 +36,8 @@ from sfm.model.conventions import rotation_from_vector
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import InteriorObservations, Network, ObjectPoints
-from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, kinds_of
+from sfm.model.remarks.remark import Remark, kinds_of
+from sfm.model.remarks.row import WRONG_SIGMAS
 from sfm.model.similarity import fit_similarity
 from sfm.products.planning.stations import aim_camera
 from tests.survey.faults import EVERY, FAULTS, planted

@@ -17,7 +17,6 @@ from scipy.linalg import block_diag
 
 from sfm.adjustment.engine.collinearity import CAMERA_UNKNOWNS, Observations, State, behind_camera
 from sfm.adjustment.engine.ordering import by_point, whitening_of
-from sfm.adjustment.result import scaled_covariance
 from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.display import counted
@@ -512,3 +511,13 @@ def _derived(
     return State(
         position, M, parameters, points, pose_position, rig_from_object, mount_position, camera_from_rig
     )
+
+
+def scaled_covariance(covariance: FloatArray, sigma_factor: FloatArray) -> FloatArray:
+    """Return covariances after multiplying standard deviations by a factor.
+
+    Args:
+        covariance: covariances, (k, 2, 2).
+        sigma_factor: factor on the standard deviations of each, (k,).
+    """
+    return np.asarray(covariance * sigma_factor[:, None, None] ** 2)

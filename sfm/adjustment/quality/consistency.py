@@ -29,7 +29,7 @@ from sfm.model.camera import pixel_jacobian, project
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
 from sfm.model.network import rows_of
-from sfm.model.remarks.remark import EXPECTED_SIGMAS
+from sfm.model.remarks.row import EXPECTED_SIGMAS
 
 # Ratio r of the largest component of a photograph to the median, or of the differences between two parts to
 # their standard deviations, below which it does not matter: equal weights of two groups cost at most

@@ -66,7 +66,7 @@ def _check_adjustment() -> str:
     """Compare the adjustment of a synthetic network with the true values."""
     import numpy as np
 
-    from sfm.model.remarks.remark import WRONG_SIGMAS
+    from sfm.model.remarks.row import WRONG_SIGMAS
 
     adjusted, truth = _tested_network()
     if not adjusted.converged:

@@ -24,7 +24,8 @@ from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.distributions import FALSE_ALARM, Levels
 from sfm.model.network import Network
 from sfm.model.observations.kind import CoordinateKind, Kind
-from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.row import WRONG_SIGMAS
 from sfm.model.similarity import extended_axes
 
 K = TypeVar("K", bound=Kind)

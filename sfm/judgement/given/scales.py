@@ -31,7 +31,8 @@ from sfm.model.conventions import FloatArray, IntArray, find_unit
 from sfm.model.distributions import chi2_isf
 from sfm.model.network import ScaleBars
 from sfm.model.observations.kind import Kind
-from sfm.model.remarks.remark import Remark, remark, significant
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.row import significant
 from sfm.model.similarity import Similarity
 
 TABLE = "the table of distances"

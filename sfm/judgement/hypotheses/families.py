@@ -37,7 +37,7 @@ from sfm.judgement.hypotheses.score import (
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.likelihood import price_of
-from sfm.model.remarks.remark import Quantity
+from sfm.model.remarks.row import Quantity
 from sfm.model.similarity import without_motions
 
 SEEN_PX = 1e-3  # change of an image coordinate below which no measurement shows it

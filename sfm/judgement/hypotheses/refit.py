@@ -55,7 +55,8 @@ from sfm.model.distributions import POWER
 from sfm.model.errors import GeometryError
 from sfm.model.likelihood import areas_of_photographs, log_likelihood
 from sfm.model.network import Network
-from sfm.model.remarks.remark import WRONG_SIGMAS, Remark, remark
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.row import WRONG_SIGMAS
 from sfm.model.similarity import fit_similarity, without_motions
 
 ROUNDS = 6

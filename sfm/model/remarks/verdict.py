@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sfm.model.display import MAX_LISTED, counted
-from sfm.model.remarks.remark import SEVERITIES, Remark, Severity
+from sfm.model.remarks.remark import Remark
+from sfm.model.remarks.row import SEVERITIES, Severity
 
 Level = Literal["good", "fair", "bad"]
 EFFECT: Mapping[Severity, Level] = {"note": "good", "warning": "fair", "error": "bad"}

@@ -16,6 +16,7 @@ from typing import NoReturn
 import numpy as np
 
 from sfm.files.globs import find_files, why_no_folder
+from sfm.files.open_folders import is_home_file
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.model.display import agreeing, counted
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
@@ -38,7 +39,6 @@ from sfm.products.drafting.ringed_dots import picture_of_rings
 from sfm.products.drafting.target_trial import MIN_TARGETS, TargetTrial, try_targets
 from sfm.runtime.progress import SILENT, Progress
 from sfm.survey.inputs.sources import TARGETS
-from sfm.survey.inputs.survey_file import is_home_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 from sfm.survey.orientation import FISHEYE
 from sfm.targets.codes.plates import BOARDS, FAMILIES, GRIDS, PLATES, PlateFamily

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationError
 
+from sfm.files.open_folders import path_inside
 from sfm.files.plain_text import read_toml
 from sfm.model.errors import SurveyFileError
 from sfm.products.geometry.shapes.kinds import KINDS
 from sfm.survey.inputs.settings import LARGEST, Length, Name, Section, Value, first_error
-from sfm.survey.inputs.survey_file import path_inside
 
 MAX_ENTRIES = 10_000  # of one kind
 

@@ -19,7 +19,8 @@ from sfm.judgement.verdict import judge_adjustment
 from sfm.model.camera import base_name
 from sfm.model.conventions import IntArray
 from sfm.model.estimate import Mounts
-from sfm.model.remarks.remark import Quantity, of_kind, remark
+from sfm.model.remarks.remark import of_kind, remark
+from sfm.model.remarks.row import Quantity
 from sfm.runtime.progress import report_step
 from sfm.survey.adjusting.solved_survey import (
     SolvedSurvey,

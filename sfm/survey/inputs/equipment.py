@@ -25,6 +25,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from sfm.files.csv_tables import CsvTable, array_table, read_table
+from sfm.files.open_folders import path_inside
 from sfm.files.plain_text import read_toml
 from sfm.judgement.survey_result import PlacedEquipment
 from sfm.model.conventions import METRES, FloatArray
@@ -130,8 +131,6 @@ def read_equipment(path: Path, *, allow_outside: bool = False) -> Equipment:
             bounds, a calibration in the future, a duplicate name, or a table that is outside its folder or
             unreadable.
     """
-    from sfm.survey.inputs.survey_file import path_inside
-
     text, table = read_toml(path, "an equipment file", repeated=("bar", "frame"))
     try:
         content = EquipmentFile.model_validate(table)

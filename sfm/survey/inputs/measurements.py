@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sfm.files.globs import find_files, why_no_folder
+from sfm.files.open_folders import is_home_file, path_inside
 from sfm.files.plain_text import as_plain, is_plain
 from sfm.judgement.survey_result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.model.camera import Camera
@@ -23,7 +24,7 @@ from sfm.photographs.exif import Metadata, read_metadata
 from sfm.photographs.masks import Masks
 from sfm.survey.inputs.cameras import refuse_ungrouped
 from sfm.survey.inputs.settings import CameraSettings
-from sfm.survey.inputs.survey_file import SurveyFile, is_home_file, path_inside
+from sfm.survey.inputs.survey_file import SurveyFile
 from sfm.targets.codes.tags import CORNERS
 from sfm.targets.detect import Targets
 

@@ -20,6 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from sfm.files.open_folders import path_inside
 from sfm.model.display import listed
 from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
@@ -31,7 +32,6 @@ from sfm.survey.inputs.measurements import PhotographList
 from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import given_tables, with_each_table
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.inputs.survey_file import path_inside
 
 T = TypeVar("T", ObservedExterior, StartOrientations)
 

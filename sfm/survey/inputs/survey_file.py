@@ -10,6 +10,7 @@ from typing import Annotated, get_origin
 
 from pydantic import Field, PrivateAttr, ValidationError
 
+from sfm.files.open_folders import path_inside
 from sfm.files.plain_text import as_plain, is_plain, read_toml
 from sfm.model.errors import SurveyFileError
 from sfm.survey.inputs.calibration import TABLES
@@ -164,49 +165,6 @@ class SurveyFile(Section):
             if camera.calibration is not None:
                 names += [f"{camera.calibration}/{name}" for name in TABLES]
         return tuple(self.beside(name) for name in names)
-
-
-def path_inside(folder: Path, name: str, where: str, *, allow_outside: bool = False) -> Path:
-    """Return the path of a file in a folder; symbolic links are followed for the check.
-
-    Args:
-        folder: the folder.
-        name: path relative to the folder.
-        where: file that states the path, for error messages.
-        allow_outside: whether the path may leave the folder.
-
-    Raises:
-        SurveyFileError: the path leaves the folder, or is not a valid path.
-    """
-    try:
-        path = folder / name
-        path.is_file()  # raises if a name is too long for the disk
-        left = not path.resolve().is_relative_to(folder.resolve())
-    except (OSError, ValueError, RuntimeError) as error:  # circular links, a null byte
-        raise SurveyFileError(f"{where}: {name!r:.100} is not the path of a file") from error
-    if left and not allow_outside:
-        raise SurveyFileError(
-            f"{where}: {name!r:.100} leaves the survey's folder; --allow-outside allows that, "
-            "for survey files that you trust"
-        )
-    return path
-
-
-def is_home_file(path: Path) -> bool:
-    """Return whether a link leads to a file in the user's home folder outside hidden folders.
-
-    People use links to collect photographs in a folder, so these links are not an attack.
-
-    Args:
-        path: path of the link.
-    """
-    try:
-        target, home = path.resolve(), Path.home().resolve()
-    except (OSError, RuntimeError):
-        return False
-    if not (target.is_file() and target.is_relative_to(home)):
-        return False
-    return not any(part.startswith(".") for part in target.relative_to(home).parts)
 
 
 def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:

@@ -24,6 +24,7 @@ from typing import cast
 
 import numpy as np
 
+from sfm.files.open_folders import path_inside
 from sfm.judgement.survey_result import LeftOutPoint
 from sfm.matching.conjugate import match_points
 from sfm.matching.lsm.coverage import project_points
@@ -46,7 +47,6 @@ from sfm.survey.inputs.settings import PointSettings
 from sfm.survey.inputs.sources import GIVEN, MARKS
 from sfm.survey.inputs.start import network_of
 from sfm.survey.inputs.survey import Survey
-from sfm.survey.inputs.survey_file import path_inside
 from sfm.survey.measuring.covering_points import FIRST_PHOTOGRAPHS, TOLERANCE_PX
 from sfm.survey.measuring.surface_points import masked_pixels
 from sfm.survey.measuring.templates import NONE, TemplateRays, TemplateScene, match_templates

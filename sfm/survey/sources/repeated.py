@@ -17,7 +17,8 @@ from sfm.judgement.given.values import MAX_FACTOR
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.model.distributions import LEVEL, chi2_isf, chi2_ppf
 from sfm.model.network import ImagePoints, Source, rows_of
-from sfm.model.remarks.remark import Quantity, Remark, remark
+from sfm.model.remarks.remark import Remark, remark
+from sfm.model.remarks.row import Quantity
 
 FEWEST_COMMON = 4  # image points of two sources that show an offset between them
 

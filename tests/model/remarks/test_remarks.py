@@ -12,19 +12,8 @@ import pytest
 from sfm.model.display import MAX_LISTED
 from sfm.model.remarks.catalogue import KINDS, SUBJECTS, TESTS
 from sfm.model.remarks.catalogue.hypotheses import SHIFT
-from sfm.model.remarks.remark import (
-    FIELD,
-    OPTIONAL,
-    Grade,
-    Kind,
-    Quantity,
-    Remark,
-    kinds_of,
-    of_kind,
-    remark,
-    significant,
-    unless_note,
-)
+from sfm.model.remarks.remark import Remark, kinds_of, of_kind, remark, unless_note
+from sfm.model.remarks.row import FIELD, OPTIONAL, Grade, Kind, Quantity, significant
 from sfm.model.remarks.verdict import judge, lines_of
 from tests.places import ROOT
 

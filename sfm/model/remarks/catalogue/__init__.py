@@ -18,7 +18,7 @@ from sfm.model.remarks.catalogue import (
     plans,
     tested,
 )
-from sfm.model.remarks.remark import Kind, Tested
+from sfm.model.remarks.row import Kind, Tested
 
 SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
     {

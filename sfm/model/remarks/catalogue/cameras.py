@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.remark import WRONG_SIGMAS, Grade, Kind, Unless
+from sfm.model.remarks.row import WRONG_SIGMAS, Grade, Kind, Unless
 
 # A warning if the 95 % value reaches one pixel, which no one expects of a calibrated camera. An error if the
 # standard deviation reaches one pixel and is large compared with the image points of the calibration, so that

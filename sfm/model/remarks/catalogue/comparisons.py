@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.remark import Grade, Kind
+from sfm.model.remarks.row import Grade, Kind
 
 OTHER_PROGRAMS = (
     Kind(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sfm.model.conventions import SWELLING
-from sfm.model.remarks.remark import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
+from sfm.model.remarks.row import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
 
 DATUM = (
     Kind(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sfm.model.remarks.remark import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind
+from sfm.model.remarks.row import HARMLESS_SIGMAS, WRONG_SIGMAS, Grade, Kind
 
 # sigma_px is a rough guess, so the global test alone says little. Of the planted faults of
 # tests/survey/faults.py, three of each kind, a coordinate was wrong by more than WRONG_SIGMAS in 7 of 95 with

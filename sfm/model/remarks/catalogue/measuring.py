@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.remark import Grade, Kind, Unless
+from sfm.model.remarks.row import Grade, Kind, Unless
 
 POINTS = (
     Kind(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.remark import Kind
+from sfm.model.remarks.row import Kind
 
 BATCHES = (
     Kind(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.remark import Tested
+from sfm.model.remarks.row import Tested
 
 UNDETECTED = (
     "weak: {what}may shift coordinates[[ of the network without {{without:@}}]] by up to {{sigmas}} standard "
