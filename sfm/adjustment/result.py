@@ -152,9 +152,7 @@ class Adjustment:
     error_correlation: ErrorCorrelation | None = None  # correlation of neighbours included in the covariance
     independent: Covariance | None = None  # covariance without that correlation, None without correlation
     judge: Callable[[Adjustment], Verdict] | None = None  # judges it when its verdict is asked for
-    joint: Callable[[Adjustment], JointCovariance] | None = (
-        None  # gives its joint covariances when asked
-    )
+    joint: Callable[[Adjustment], JointCovariance] | None = None  # gives its joint covariances when asked
 
     @cached_property
     def verdict(self) -> Verdict | None:

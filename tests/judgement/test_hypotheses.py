@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -414,8 +415,44 @@ def test_a_step_is_halved_three_times(clean: Adjustment, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(refitting, "adjust", refuse)
     D = np.ones((len(clean.rejected), 2, 1))
-    assert refitting._stepped(clean, D, clean, np.zeros(1), np.ones(1)) is None
+    assert refitting._stepped(clean, D, clean, np.zeros(1), np.ones(1), least=-np.inf) is None
     assert tried == pytest.approx([1.0, 0.5, 0.25, 0.125])
+
+
+@pytest.mark.parametrize(("below", "taken"), [(1.0, 1), (-1.0, refitting.HALVINGS)])
+def test_a_step_is_whole_unless_its_half_is_asked_for(clean: Adjustment, below: float, taken: int) -> None:
+    """A step may lose what the round before it gained; a half that is not good enough either is not taken."""
+    D, half_px = np.zeros((len(clean.rejected), 2, 1)), np.full(1, 0.5 * clean.sigma_px)
+    D[0, 0] = 1.0
+    whole = replace(clean.network.image_points, xy=clean.network.image_points.xy - D @ half_px)
+    adjusted = refitting.readjusted(clean, replace(clean.network, image_points=whole), clean)
+    assert adjusted is not None
+    least = refitting.log_likelihood_of(adjusted)
+    least += -below if below > 0 else 1e3
+    stepped = refitting._stepped(clean, D, clean, np.zeros(1), half_px, least=least)
+    assert stepped is not None and stepped[2] == taken
+    np.testing.assert_array_equal(stepped[1], half_px)
+    np.testing.assert_array_equal(stepped[0].residuals, adjusted.residuals)
+
+
+def test_rounds_end_when_the_gain_that_is_asked_for_is_out_of_reach(
+    clean: Adjustment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reduced, calls = reduce_adjustment(clean, columns_of(clean)), []
+    alternative = next(iter(interiors(clean, reduced, HELD)))
+    far = replace(alternative, gain=replace(alternative.gain, beta=alternative.gain.beta + 1.0))
+    stepped = refitting._stepped
+
+    def counted(*arguments: Any, **options: Any) -> Any:
+        calls.append(options["least"])
+        return stepped(*arguments, **options)
+
+    monkeypatch.setattr(refitting, "_stepped", counted)
+    assert refitting.refit(clean, far, clean, least=1e9) is not None
+    assert len(calls) == 1
+    calls.clear()
+    assert refitting.refit(clean, far, clean, least=-np.inf) is not None
+    assert len(calls) > 1 and calls[:2] == [-np.inf, -np.inf] and np.isfinite(calls[2:]).all()
 
 
 def test_two_causes_are_adjusted_together() -> None:

@@ -413,7 +413,7 @@ def _still_needed(plain: Adjustment, causes: tuple[Cause, ...], latest: Cause) -
         before = [(known, beta) for known, beta in joint if known is not cause]
         new = replace(latest.alternative, gain=replace(latest.alternative.gain, beta=latest.refit.beta))
         others = [(known.alternative, beta) for known, beta in before]
-        alone = refit(plain, new, latest.refit.adjustment, others)
+        alone = refit(plain, new, latest.refit.adjustment, others, least=-np.inf)  # it loses
         if alone is None:
             continue
         gain = cause.alternative.deflated(-alone.gain, plain.redundancy)

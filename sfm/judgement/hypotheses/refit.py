@@ -60,6 +60,7 @@ from sfm.model.remarks.row import WRONG_SIGMAS
 from sfm.model.similarity import fit_similarity, without_motions
 
 ROUNDS = 6
+MEMORY = 2  # rounds whose smallest ln likelihood the next one must exceed
 HALVINGS = 4  # most halvings of a step, because a linear step may go too far for a large error
 MAX_ITERATIONS = 15  # the start is near the optimum; half of the adjustments that converge need 3
 LAST_GAIN = 0.01  # gain of v'Pv over the variance factor below which the rounds end
@@ -84,6 +85,7 @@ def refit(
     start: Adjustment,
     before: Sequence[tuple[Alternative, FloatArray]] = (),
     *,
+    least: float = 0.0,
     most: int = ROUNDS * HALVINGS,
 ) -> Refit | None:
     """Adjust with an alternative; None if the adjustment does not converge.
@@ -93,6 +95,7 @@ def refit(
         alternative: what is adjusted in addition.
         start: adjustment to start from, of image points without the effect of earlier alternatives.
         before: earlier alternatives with their parameters, which are adjusted jointly.
+        least: gain of ln likelihood that is asked for; the rounds end when it is out of reach.
         most: number of adjustments after which no further round begins.
     """
     every = [other for other, _ in before] + [alternative]
@@ -100,12 +103,14 @@ def refit(
     ends, beta = np.cumsum([0] + [len(beta) for beta in betas]), np.concatenate(betas)
     current, step = start, np.concatenate([np.zeros(int(ends[-2])), alternative.gain.beta])
     D = _side_by_side(every, current, columns_of(current))
-    taken, finished = 0, True
+    before_all = log_likelihood_of(start)
+    taken, finished, likelihoods = 0, True, [before_all + least]
     for number in range(ROUNDS):
-        stepped = _stepped(plain, D, current, beta - step, step)
+        stepped = _stepped(plain, D, current, beta - step, step, least=min(likelihoods[-MEMORY:]))
         if stepped is None:
             return None
         current, beta, adjustments = stepped
+        likelihoods.append(log_likelihood_of(current))
         taken += adjustments
         columns = columns_of(current)
         D = _side_by_side(every, current, columns)
@@ -114,31 +119,38 @@ def refit(
         except np.linalg.LinAlgError:
             return None
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
-        finished = gain.value < LAST_GAIN or number == ROUNDS - 1
+        out_of_reach = likelihoods[-1] + gain.value < before_all + least  # even with the next step
+        finished = out_of_reach or gain.value < LAST_GAIN or number == ROUNDS - 1
         if finished or taken >= most:
             break
         step = gain.beta
         beta = beta + step
-    gained = log_likelihood_of(current) - log_likelihood_of(start)
+    gained = likelihoods[-1] - before_all
     parts = [beta[ends[k] : ends[k + 1]] for k in range(len(every))]
     shift, rms = shifts_of(plain, start, current, alternative, parts[-1])
     return Refit(current, parts[-1], gained, shift, rms, tuple(parts[:-1]), finished)
 
 
 def _stepped(
-    plain: Adjustment, D: FloatArray, start: Adjustment, beta: FloatArray, step: FloatArray
+    plain: Adjustment, D: FloatArray, start: Adjustment, beta: FloatArray, step: FloatArray, *, least: float
 ) -> tuple[Adjustment, FloatArray, int] | None:
-    """Return the adjustment after a step, halved while v'Pv grows, the parameters, and how many it took."""
-    xy, best = plain.network.image_points.xy, None
+    """Return the adjustment after a step, the parameters, and how many adjustments it took.
+
+    The step is halved until ln likelihood is above `least`, and whole if no part of it is so good. As image
+    points are rejected and return, ln likelihood may fall in a round before it rises in the next.
+
+    Source: Grippo, Lampariello and Lucidi (1986), SIAM J. Numer. Anal. 23(4) (nonmonotone line search).
+    """
+    xy, whole = plain.network.image_points.xy, None
     for taken in range(1, HALVINGS + 1):
         points = replace(plain.network.image_points, xy=xy - D @ (beta + step))
         adjusted = readjusted(plain, replace(plain.network, image_points=points), start)
         if adjusted is not None:
-            if log_likelihood_of(adjusted) > log_likelihood_of(start) - LAST_GAIN:
+            if log_likelihood_of(adjusted) > least - LAST_GAIN:
                 return adjusted, beta + step, taken
-            best = best or (adjusted, beta + step)
+            whole = whole or (adjusted, beta + step)
         step = step / 2
-    return None if best is None else (*best, HALVINGS)
+    return None if whole is None else (*whole, HALVINGS)
 
 
 def readjusted(plain: Adjustment, network: Network, start: Adjustment) -> Adjustment | None:
