@@ -57,6 +57,7 @@ class FreeParameters:
     cameras: tuple[CameraSettings, ...]  # each states its free parameters, and whether c is observed
     estimate: Estimate  # with the same parameters free in its cameras; observed ones keep their values
     remarks: tuple[Remark, ...]  # on each camera whose free parameters the survey does not state
+    accepted: BoolArray | None = None  # image points that the last adjustment accepted, (k,)
 
 
 def choose_free_parameters(
@@ -91,6 +92,7 @@ def choose_free_parameters(
     )  # fmt: skip
     settings = list(survey.cameras)
     determined: list[Chosen] = []
+    accepted: BoolArray | None = None
     if images.sum() >= FEWEST_PHOTOGRAPHS.get(datum, MIN_PHOTOGRAPHS):
         part, start = reduce_network(network, estimate, images, points, everything)
         trials = []
@@ -110,7 +112,12 @@ def choose_free_parameters(
             trials.append((part, datum))
         alarm = survey.adjust.false_alarm
         for tried, kind in trials:
-            determined.append(_determined_parameters(tried, start, names, kind, alarm, extend=extend))
+            chosen_names, adjusted = _determined_parameters(tried, start, names, kind, alarm, extend=extend)
+            determined.append(chosen_names)
+            if adjusted is not None and kind == "free":
+                accepted = everything.copy()
+                rows = images[network.image_points.image] & points[network.image_points.point]
+                accepted[rows] = ~adjusted.rejected
             if _has_each_c(start, names, determined[-1]):
                 break
         else:
@@ -126,7 +133,7 @@ def choose_free_parameters(
         for a in silent
         for said in _remarks(settings[a], estimate.cameras[a].units, int(images[network.camera == a].sum()))
     ]
-    return FreeParameters(tuple(settings), _with_free(estimate, names), tuple(remarks))
+    return FreeParameters(tuple(settings), _with_free(estimate, names), tuple(remarks), accepted)
 
 
 def _with_observed_c(settings: CameraSettings, camera: Camera) -> CameraSettings:
@@ -156,8 +163,11 @@ def _has_each_c(start: Estimate, asked: Chosen, chosen: Chosen) -> bool:
 
 def _determined_parameters(
     part: Network, start: Estimate, names: Chosen, datum: str, false_alarm: float, *, extend: bool
-) -> Chosen:
-    """Return the candidates that a network determines, and other parameters that its image points demand."""
+) -> tuple[Chosen, Adjustment | None]:
+    """Return the candidates that a network determines, with others that its image points demand.
+
+    The last adjustment is returned too.
+    """
     names, adjusted = _hold_undetermined(part, start, names, datum, false_alarm)
     index = {camera.name: a for a, camera in enumerate(start.cameras) if names[a]}
     for _ in range(ROUNDS if extend else 0):
@@ -174,7 +184,7 @@ def _determined_parameters(
         if adjusted is None or tried == names:
             break
         names = tried
-    return names
+    return names, adjusted
 
 
 def _hold_undetermined(

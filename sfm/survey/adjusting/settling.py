@@ -169,15 +169,18 @@ def settle(task: Task, estimate: Estimate, accepted: BoolArray | None = None) ->
         images, points = left_images, left_points
 
 
-def settle_by_photograph(task: Task, estimate: Estimate) -> StableAdjustment:
+def settle_by_photograph(
+    task: Task, estimate: Estimate, accepted: BoolArray | None = None
+) -> StableAdjustment:
     """Adjust, then again with per-photograph cameras where these fit, and without misfitting photographs.
 
     Args:
         task: the adjustment to perform; without outlier tests there is only one adjustment.
         estimate: approximate values; photographs and points removed from the first adjustment start from
             these again.
+        accepted: image points that an earlier adjustment accepted, (k,), as in `settle`.
     """
-    settled = settle(task, estimate)
+    settled = settle(task, estimate, accepted)
     if task.survey.reject == "none" or task.network.moment is not None:  # a camera on a rig has one mount
         return settled
 

@@ -187,6 +187,7 @@ class _Prepared:
     of_its_own: IntArray  # image points that each photograph would need without its rig, (m,)
     frame: Estimate | None  # given coordinates that carry a free datum; None without any
     remarks: tuple[Remark, ...]  # on observed exterior orientation and on freed parameters
+    accepted: BoolArray | None = None  # image points without gross errors so far, (k,); None if not known
 
 
 def log_likelihood_of_all(
@@ -270,6 +271,7 @@ def _prepare(survey: Survey, matched: Correspondences, varying: frozenset[str]) 
         of_its_own,
         frame,
         (*unused, *chosen.remarks),
+        chosen.accepted if survey.reject == "tau" else None,
     )
 
 
@@ -308,7 +310,7 @@ def _free_network(start: _Prepared) -> StableAdjustment | None:
     report_step("adjusting the image points alone")
     network = task.network.with_given(ExteriorObservations(), ScaleBars(), further=())
     try:
-        return settle_by_photograph(replace(task.in_free_datum, network=network), estimate)
+        return settle_by_photograph(replace(task.in_free_datum, network=network), estimate, start.accepted)
     except GeometryError:
         if task.datum.kind != "control":
             raise

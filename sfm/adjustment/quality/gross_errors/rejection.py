@@ -20,6 +20,7 @@ from sfm.adjustment.engine.iterate import Optimum, Problem, iterate, optimum_at
 from sfm.adjustment.engine.observed import count_of
 from sfm.adjustment.engine.unknowns import start_weights
 from sfm.adjustment.quality.gross_errors.robust import (
+    RETURN_FRACTION,
     huber_weights,
     least_sigma,
     residual_lengths,
@@ -324,13 +325,12 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         )
         back = would_pass(seen, v, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha)
         back &= layout.active & ~returned & ~loose
+        if out.any():
+            back &= _stays_right(layout.observations, v, complement, out, vPv=vPv, redundancy=redundancy)
         if not (out.any() or back.any()):
             break
-        if out.any():
-            changed = np.where(out, 0.0, weight)
-        else:  # reinstate only when no large residual remains
-            changed = np.where(back, 1.0, weight)
-            returned |= back
+        changed = np.where(out, 0.0, np.where(back, 1.0, weight))
+        returned |= back
         loose |= _without_angle(run.problem, optimum.state, changed > 0, out | back)
         changed = np.where(loose, 0.0, changed)
         try:
@@ -340,6 +340,35 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
             run.remarks = (remark("rejection_not_converging", more=more, rejected=rejected),)
             break
     return optimum, weight
+
+
+def _stays_right(
+    observations: Observations,
+    v: FloatArray,
+    complement: FloatArray,
+    out: BoolArray,
+    *,
+    vPv: float,
+    redundancy: float,
+) -> BoolArray:
+    """Return of which image points a test that they pass is not changed by rejecting others, (k,).
+
+    It is changed if sigma0 falls by more than the margin of the test, or if a ray of the same point is out.
+
+    Args:
+        observations: image points.
+        v: residuals of all image points, px, (k, 2).
+        complement: whitened cofactors of the residuals, (k, 2, 2).
+        out: image points to reject, (k,).
+        vPv: weighted sum of squares of the image points in the adjustment.
+        redundancy: redundancy of these image points.
+    """
+    lost, of_lost = sum_of_squares(observations, v, complement, out)
+    left = (vPv - lost) / max(redundancy - of_lost, 1.0)
+    if left < RETURN_FRACTION**2 * vPv / redundancy:
+        return np.zeros(len(out), dtype=bool)
+    touched = np.bincount(observations.point[out], minlength=len(observations.start) - 1) > 0
+    return np.asarray(~touched[observations.point])
 
 
 def _without_angle(problem: Problem, state: State, used: BoolArray, changed: BoolArray) -> BoolArray:
