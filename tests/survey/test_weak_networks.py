@@ -9,10 +9,14 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.other_solutions import other_solutions
+from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.camera import camera_from_values, project
+from sfm.model.conventions import BoolArray
 from sfm.model.remarks.remark import remark
 from sfm.pipeline import run_survey
+from sfm.survey.adjusting import solved_survey
+from sfm.survey.adjusting.settling import StableAdjustment
 from sfm.survey.adjusting.solution_remarks import remarks_on_held_c
 from sfm.survey.inputs.survey import CameraSetup
 from tests.findings import findings_of
@@ -118,10 +122,22 @@ def test_a_valley_whose_floor_cannot_be_solved_ends_the_step() -> None:
     assert outcome_of(918).over_sigma < 2
 
 
-def test_another_start_is_without_the_points_that_the_final_adjustment_lost() -> None:
-    """Points were lost after the network had settled, and then another solution was better."""
-    found = outcome_of(12195)
+def test_another_start_is_without_the_points_that_the_final_adjustment_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A point is lost after the network has settled, and then another solution is better."""
+    calls = []
+
+    def lost_points(settled: StableAdjustment, _: Adjustment) -> BoolArray:
+        lost = np.zeros(len(settled.points), dtype=bool)
+        lost[np.flatnonzero(settled.points)[:1]] = not calls
+        calls.append(settled.points.sum())
+        return lost
+
+    monkeypatch.setattr(solved_survey, "_lost_points", lost_points)
+    found = outcome_of(10800)
     assert {"better_solution_taken", "points_not_determined"} <= set(found.kinds) and found.over_sigma < 2
+    assert len(calls) > 2 and calls[1] == calls[0] - 1
 
 
 def test_residuals_with_a_cause_contradict_a_camera_that_had_to_be_held() -> None:
