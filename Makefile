@@ -1,14 +1,13 @@
 # make demo   set up, render a small survey, run it, say where the report is
 # make test   set up, run the tests, the linter and the type checker
 # make docs   build the documentation in build/docs, warnings are errors
-# make study  the longer studies        make bench  the timings        make mutate  what the tests hold
+# make study  the longer studies        make bench [QUICK=1]  the timings        make mutate  what the tests hold
 # On Windows, or without make, see README.md.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-TIMED := adjustment matching resection stereo textured viewer_page wide_matching
 
 .PHONY: demo test docs study bench mutate setup clean
 
@@ -32,7 +31,7 @@ study: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 bench: $(READY)
-	@for name in $(TIMED); do echo "== $$name"; $(BIN)/python -m "benchmarks.$$name" || exit 1; done
+	$(BIN)/python -m benchmarks.table $(if $(QUICK),--quick)
 
 mutate: $(READY)
 	$(BIN)/python -m tests.mutate

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import table
 from tests.places import ROOT
 
 CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -105,17 +106,21 @@ def test_metadata_are_complete_and_name_no_place_that_does_not_exist() -> None:
     assert "urls" not in PROJECT, "then CITATION.cff and SECURITY.md can name them, too"
 
 
-def test_every_timing_runs_with_make_bench() -> None:
-    """Each as a module of this tree, which finds `tests`, `datasets` and its siblings."""
+def test_make_bench_prints_the_table_of_timings() -> None:
+    """As a module of this tree, which finds `tests`, `datasets` and its siblings."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    timed = re.search(r"^TIMED := (.*)$", makefile, re.M)
-    assert timed and '-m "benchmarks.$$name"' in makefile
+    assert "-m benchmarks.table $(if $(QUICK),--quick)" in makefile
     files = {path.stem: path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py")}
-    asks = {"halves", "validation"}  # for a result; for no time
-    assert {*timed[1].split(), *asks} == {name for name, text in files.items() if "\ndef main()" in text}
     for name, text in files.items():
         own = re.findall(r"^(?:from|import) (\w+)", text, re.M)
         assert not set(own) & set(files), f"{name}: a sibling is benchmarks.NAME"
+
+
+def test_a_row_of_timings_has_its_ratios() -> None:
+    assert table.Row("survey", 2.0, 1.5, before=4.0, rival=7.0).cells() == [
+        *("survey", "2", "1.5", "4", "7", "2", "3.5"),
+    ]
+    assert table.Row("survey", 2.0).cells() == ["survey", "2", "", "", "", "", ""]
 
 
 def test_the_source_distribution_names_files_that_are_there() -> None:
