@@ -23,6 +23,7 @@ from sfm.cli.commands.convert import convert
 from sfm.cli.commands.doctor import doctor
 from sfm.cli.commands.epochs import epochs
 from sfm.cli.commands.init import init
+from sfm.cli.commands.mark import mark
 from sfm.cli.commands.match import match
 from sfm.cli.commands.measure import measure
 from sfm.cli.commands.plan_more import plan_more
@@ -56,6 +57,7 @@ COMMANDS = (
     Command("plan more", plan_more, "RESULT", "photographs to add to a survey"),
     Command("plan target-size", plan_target_size, "--distance D ...", "how large targets must be"),
     Command("resect", resect, "POINTS.csv --c MM", "one photograph on known points"),
+    Command("mark", mark, "PHOTOS|SURVEY|RESULT", "measure points by hand, in the browser"),
     Command("match", match, "LEFT RIGHT", "conjugate points of two photographs"),
     Command("compare", compare, "A B", "two results: differences and their significance"),
     Command("epochs", epochs, "FIRST SECOND", "what moved between surveys of one object"),

@@ -30,6 +30,7 @@ COLOURS = ("red", "green", "blue")
 MAX_TABLE_BYTES = 2_000_000_000
 MAX_ROWS = 20_000_000
 MAX_LINE = 10_000  # characters
+COMMENT = "# "  # begins a line above the header
 MAX_NUMBER = 1e12  # no length, angle or pixel is larger; squares and products of larger numbers overflow
 
 
@@ -140,8 +141,9 @@ def read_table(
     aliases: tuple[tuple[str, str], ...] = (),
     ignored: tuple[str, ...] | None = (),
     blank: tuple[str, ...] = (),
+    may_be_empty: bool = False,
 ) -> CsvTable:
-    """Read a CSV file with a header of column names.
+    """Read a CSV file with a header of column names, below comments if it begins with them.
 
     Args:
         path: the file, UTF-8, comma separated, with a decimal point.
@@ -151,6 +153,7 @@ def read_table(
         aliases: (other name, name) of columns.
         ignored: further columns that may be present; None for any.
         blank: columns of numbers whose cells may be empty, which gives NaN.
+        may_be_empty: whether there may be no rows below the header.
 
     Raises:
         SurveyFileError: the file is unreadable, too large or has wrong columns, or a number is not finite or
@@ -172,7 +175,7 @@ def read_table(
             empty = name in blank and not row[at].strip()
             values.append(math.nan if empty else _number(row[at], f"{where}: column {name}"))
         lines.append(line)
-    if not lines:
+    if not lines and not may_be_empty:
         raise SurveyFileError(f"{path}: no rows below the header, at least one is needed")
     return CsvTable(
         path,
@@ -262,32 +265,41 @@ def _rows(path: Path, columns: int) -> Iterator[tuple[int, list[str]]]:
                     continue
                 if len(row) != columns:
                     raise SurveyFileError(
-                        f"{path}, line {reader.line_num}: {counted(len(row), 'column')}, the header has "
+                        f"{path}, line {lines.number}: {counted(len(row), 'column')}, the header has "
                         f"{columns}"
                     )
-                yield reader.line_num, row
+                yield lines.number, row
         except UnicodeDecodeError as error:
             raise SurveyFileError(
-                f"{path}: not a text file in UTF-8 (after line {reader.line_num}); save it as such"
+                f"{path}: not a text file in UTF-8 (after line {lines.number}); save it as such"
             ) from error
         except csv.Error as error:
-            raise SurveyFileError(f"{path}, line {reader.line_num}: not a CSV table: {error}") from error
+            raise SurveyFileError(f"{path}, line {lines.number}: not a CSV table: {error}") from error
         except OSError as error:
             raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
 
 
 class _Lines:
-    """The lines of a file, with limits on the length of a row and the number of lines."""
+    """The lines of a file below its comments, with limits on the length of a row and the number of lines."""
 
     def __init__(self, path: Path, file: TextIO) -> None:
         self.path, self.file = path, file
         self.number = 0
+        self.in_table = False  # below the comments
         self.characters = 0  # of the row so far; quoted cells may span several lines
 
     def __iter__(self) -> _Lines:
         return self
 
     def __next__(self) -> str:
+        line = self.read()
+        while not self.in_table and line.startswith(COMMENT):
+            line, self.characters = self.read(), 0
+        self.in_table = True
+        return line
+
+    def read(self) -> str:
+        """Return the next line, comments included."""
         line = self.file.readline(MAX_LINE + 1)
         if not line:
             raise StopIteration
@@ -300,6 +312,28 @@ class _Lines:
                 f"{self.path}, line {self.number}: more than {MAX_LINE} characters, not a CSV table"
             )
         return line
+
+
+def read_comments(path: Path) -> tuple[tuple[int, str], ...]:
+    """Return the comments above the header of a table: line and text of each, without the sign.
+
+    Raises:
+        SurveyFileError: the file cannot be read.
+    """
+    comments = []
+    with _opened(path) as file:
+        lines = _Lines(path, file)
+        try:
+            while (line := lines.read()).startswith(COMMENT):
+                comments.append((lines.number, line.removeprefix(COMMENT).rstrip("\r\n")))
+                lines.characters = 0
+        except StopIteration:
+            pass
+        except UnicodeDecodeError as error:
+            raise SurveyFileError(f"{path}: not a text file in UTF-8; save it as such") from error
+        except OSError as error:
+            raise SurveyFileError(f"{path}: the table cannot be read: {error.strerror}") from error
+    return tuple(comments)
 
 
 def read_header(path: Path) -> tuple[str, ...]:

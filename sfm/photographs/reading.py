@@ -92,6 +92,39 @@ def read_mask(path: Path) -> AnyArray:
     return _decode(path, "luminance", may_be_plain=True)
 
 
+def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
+    """Read a photograph as a screen shows it, in colour and as stored; see `read_photograph`.
+
+    Args:
+        path: JPEG, TIFF, PNG or another format that OpenCV reads.
+        shrink: 1, 2, 4 or 8: the sides are divided by it. A JPEG is decoded at that size, which saves most of
+            the time.
+
+    Returns:
+        Blue, green and red, (H, W, 3), uint8.
+
+    Raises:
+        PhotographError: as `read_photograph`.
+    """
+    flags = {
+        1: cv2.IMREAD_COLOR,
+        2: cv2.IMREAD_REDUCED_COLOR_2,
+        4: cv2.IMREAD_REDUCED_COLOR_4,
+        8: cv2.IMREAD_REDUCED_COLOR_8,
+    }
+    data = read_bytes(path)
+    with opened_header(path, io.BytesIO(data)) as header:
+        size = header.size
+    refuse_bomb(path, size, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags[shrink] | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
+    return image
+
+
 def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray:
     """Return the pixels of a file, as `read_photograph` does.
 

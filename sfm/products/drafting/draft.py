@@ -97,7 +97,7 @@ def draft_survey(
         SurveyFileError: the folder does not exist or has no photographs.
         GeometryError: fewer than two readable photographs.
     """
-    metadata, unreadable = _metadata(folder)
+    metadata, unreadable = metadata_of_folder(folder)
     masks, masked = find_masks(folder, tuple(metadata))
     unused = "" if masked == MASKS else OUTSIDE
     try:
@@ -149,7 +149,7 @@ class _Content:
         return FREE_BY_TARGETS if self.trial.codes != "none" else ()
 
 
-def _metadata(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
+def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
     """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")

@@ -1,0 +1,117 @@
+"""The command `mark`: measure points by hand in the browser, with the program's help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.process import loading
+from sfm.model.errors import KolinearError, MissingLibraryError
+from sfm.runtime.faults import working_on
+
+if TYPE_CHECKING:
+    from sfm.products.marking.project import MarkedProject
+
+MARKS = "-marks.csv"  # after the name of a survey file or of a folder of photographs
+
+
+def mark(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PHOTOS|SURVEY|RESULT", help="Folder of photographs, survey file, or result folder."
+        ),
+    ],
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Folder of the photographs.  [default: that of the survey file]",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="MARKS.csv",
+            help="Marks file; an earlier one is continued.  [default: that of the survey file, or "
+            "SURVEY-marks.csv beside it, or out/NAME-marks.csv]",
+        ),
+    ] = None,
+    port: Annotated[
+        int,
+        typer.Option("--port", metavar="N", min=0, max=65535, help="Port of the page.  [default: a free one]"),
+    ] = 0,
+    browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+    allow_outside: Annotated[
+        bool,
+        typer.Option(
+            "--allow-outside",
+            help="Let the survey file refer to files outside its folder; only for survey files that you trust.",
+        ),
+    ] = False,
+) -> None:
+    """Mark points in photographs in the browser: a click measures, and the program says what comes next.
+
+    The page is served on this computer only, until Ctrl-C. Every mark is saved at once.
+    """
+    with loading():
+        import webbrowser
+
+        try:
+            from sfm.products.marking.server import MarkingServer
+        except ModuleNotFoundError as error:
+            if error.name not in ("starlette", "uvicorn"):
+                raise
+            raise MissingLibraryError(
+                f"mark: {error.name} is not installed; install it with: pip install 'kolinear[mark]'"
+            ) from None
+        from sfm.products.marking.session import MarkingSession
+
+    with working_on(str(source)):
+        project, marks = _project(source, images, allow_outside=allow_outside)
+        session = MarkingSession(project, out or marks)
+    try:
+        server = MarkingServer(session, port)
+        print(f"Marks: {out or marks}")
+        print(f"Page: {server.address.url}", flush=True)
+        if browser and not webbrowser.open(server.address.url):
+            print("No browser could be opened; open the page yourself.", flush=True)
+        print("Ctrl-C ends it; every mark is saved.", flush=True)
+        server.serve()
+    finally:
+        session.close()
+
+
+def _project(source: Path, images: Path | None, *, allow_outside: bool) -> tuple[MarkedProject, Path]:
+    """Return what is marked, and its marks file if none is named."""
+    from adapters.formats.result_tables import read_result
+    from sfm.cli.survey_runs import SURVEY_FILE
+    from sfm.files.globs import nearest_name
+    from sfm.products.marking.project import project_of_folder, project_of_survey
+    from sfm.products.public_functions import sensor_widths
+    from sfm.report.output import folder_name, read_origin
+    from sfm.survey.inputs.survey import survey_of_file
+    from sfm.survey.inputs.survey_file import read_survey_file
+
+    if not source.exists():
+        raise KolinearError(f"{source}: neither a survey file nor a folder{nearest_name(source)}")
+    solution, survey_file = None, source
+    if source.is_dir() and (source / "cameras.csv").is_file():
+        origin = read_origin(source)
+        if origin is None:
+            raise KolinearError(f"{source}: does not state the survey that it is the result of")
+        solution, survey_file, images = read_result(source), origin.file, images or origin.images
+    elif source.is_dir() and (source / SURVEY_FILE).is_file():
+        survey_file = source / SURVEY_FILE
+    elif source.is_dir():
+        name = folder_name(source.resolve().name)
+        return project_of_folder(source, sensor_widths(lambda _: None)), Path("out") / f"{name}{MARKS}"
+    described = read_survey_file(survey_file, allow_outside=allow_outside)
+    project = project_of_survey(
+        survey_of_file(described), images_dir=images, survey_file=survey_file, solution=solution
+    )
+    return project, survey_file.with_name(f"{survey_file.stem}{MARKS}")

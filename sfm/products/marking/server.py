@@ -1,0 +1,342 @@
+"""The server of the marking page: on this computer only, under an address with a secret.
+
+A request needs the secret in its path, and the host and port of this server, so that no other page or user of the
+computer gets an answer. A request that changes something is a POST of JSON with the secret in a header, which
+pages of other sites cannot send. Everything else is refused. Nothing is written but the marks file and the survey.
+
+Source: OWASP Cheat Sheet Series, Cross-Site Request Forgery Prevention; Jackson et al., Protecting Browsers from
+DNS Rebinding Attacks (2007).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import secrets
+import socket
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import uvicorn
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from sfm.files.plain_text import MAX_NAME
+from sfm.model.errors import GeometryError, KolinearError, OutputError, PhotographError
+from sfm.products.marking.session import MarkError, MarkingSession
+from sfm.survey.inputs.given_values import ScaleBar
+from sfm.survey.inputs.marks_file import Kind, StatedPoint
+
+HOST = "127.0.0.1"
+HEADER = "x-kolinear"  # carries the secret in requests that change something
+PAGE = Path(__file__).with_name("page")
+FILES = {"": ("mark.html", "text/html"), "mark.js": ("mark.js", "text/javascript"), "mark.css": ("mark.css", "text/css")}
+MAX_BODY = 100_000  # bytes of a request
+POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+SAFE = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+KEPT = {"Cache-Control": "private, max-age=3600"}  # of tiles, which do not change
+Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME)]
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Sigma = Annotated[float, Field(ge=0, le=1e12)]
+Positive = Annotated[float, Field(ge=1e-9, le=1e12)]
+Index = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+class Body(BaseModel):
+    """What a request states; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Click(Body):
+    """A click in a photograph."""
+
+    image: Index
+    x: Number
+    y: Number
+    point: Name | None = None
+    kind: Kind | None = None
+    sigma_px: Positive | None = None
+
+
+class Chosen(Body):
+    """A point in a photograph, a point, or everything."""
+
+    image: Index | None = None
+    point: Name | None = None
+
+
+class Deleted(Body):
+    """A point in a photograph, or a point."""
+
+    point: Name
+    image: Index | None = None
+
+
+class Renamed(Body):
+    """A point and its new name."""
+
+    point: Name
+    name: Name
+
+
+class Control(Body):
+    """Stated coordinates of a point, object unit."""
+
+    point: Name
+    X: Number = 0.0
+    Y: Number = 0.0
+    Z: Number = 0.0
+    sigma: tuple[Sigma, Sigma, Sigma] = (0.0, 0.0, 0.0)
+    remove: bool = False
+
+
+class Bar(Body):
+    """Stated distance of two points, object unit."""
+
+    start: Name
+    end: Name
+    length: Positive = 1.0
+    sigma: Positive = 1.0
+    remove: bool = False
+
+
+class Nothing(Body):
+    """A request without content."""
+
+
+def _control(session: MarkingSession, body: Control) -> dict[str, Any]:
+    stated = None if body.remove else StatedPoint((body.X, body.Y, body.Z), body.sigma)
+    return session.set_control(body.point, stated)
+
+
+def _bar(session: MarkingSession, body: Bar) -> dict[str, Any]:
+    bar = None if body.remove else ScaleBar(body.start, body.end, body.length, body.sigma)
+    return session.set_bar(body.start, body.end, bar)
+
+
+CHANGES: dict[str, tuple[type[Body], Callable[[MarkingSession, Any], dict[str, Any]]]] = {
+    "click": (
+        Click,
+        lambda session, b: session.click(
+            b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px
+        ),
+    ),
+    "accept": (Chosen, lambda session, b: session.accept(b.image, b.point)),
+    "refuse": (Chosen, lambda session, b: session.refuse(b.image, b.point)),
+    "delete": (Deleted, lambda session, b: session.delete(b.point, b.image)),
+    "rename": (Renamed, lambda session, b: session.rename(b.point, b.name)),
+    "control": (Control, _control),
+    "bar": (Bar, _bar),
+    "undo": (Nothing, lambda session, b: session.undo()),
+    "redo": (Nothing, lambda session, b: session.redo()),
+}
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where the server listens."""
+
+    port: int
+    secret: str
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{HOST}:{self.port}/{self.secret}/"
+
+    @property
+    def hosts(self) -> tuple[str, str]:
+        """What a browser may state as host."""
+        return f"{HOST}:{self.port}", f"localhost:{self.port}"
+
+
+def application(session: MarkingSession, address: Address) -> Starlette:
+    """Return the application.
+
+    Args:
+        session: the session that answers.
+        address: port and secret.
+    """
+
+    def refusal(request: Request) -> Response | None:
+        """Return the answer to a request that is refused, before anything is read from it."""
+        host = request.headers.get("host", "")
+        if host not in address.hosts:
+            return _refused(403)
+        given = request.path_params.get("secret", "")
+        if not hmac.compare_digest(given.encode(), address.secret.encode()):
+            return _refused(404)
+        origin = request.headers.get("origin")
+        if origin is not None and origin != f"http://{host}":
+            return _refused(403)
+        if request.headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+            return _refused(403)
+        if request.method == "POST":
+            stated = request.headers.get(HEADER, "")
+            kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+            if not hmac.compare_digest(stated.encode(), address.secret.encode()):
+                return _refused(403)
+            if kind != "application/json":
+                return _refused(403)
+        return None
+
+    def guarded(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+        async def guarded_answer(request: Request) -> Response:
+            refused = refusal(request)
+            if refused is not None:
+                return refused
+            try:
+                return await answer(request)
+            except (MarkError, GeometryError, PhotographError, OutputError) as error:
+                return _json({"error": str(error)}, 422)
+            except KolinearError as error:
+                return _json({"error": str(error)}, 422)
+
+        return guarded_answer
+
+    async def page(request: Request) -> Response:
+        name, kind = FILES[request.path_params.get("file", "")]
+        return Response((PAGE / name).read_bytes(), media_type=f"{kind}; charset=utf-8", headers=SAFE)
+
+    async def state(request: Request) -> Response:
+        after = request.query_params.get("after", "")
+        version = int(after) if after.isascii() and after.isdecimal() and len(after) < 16 else None
+        return _json(await run_in_threadpool(session.state, version))
+
+    async def descriptor(request: Request) -> Response:
+        i = request.path_params["image"]
+        if i >= len(session.project.photographs):
+            return _refused(404)
+        return Response(session.pixels.descriptor(i), media_type="application/xml", headers=SAFE)
+
+    async def tile(request: Request) -> Response:
+        at = request.path_params
+        data = await run_in_threadpool(
+            session.pixels.tile, at["image"], at["level"], at["column"], at["row"]
+        )
+        if data is None:
+            return _refused(404)
+        return Response(data, media_type="image/jpeg", headers={**SAFE, **KEPT})
+
+    async def fit(request: Request) -> Response:
+        at = request.path_params
+        data = await run_in_threadpool(session.fit_picture, at["image"], at["point"])
+        return _refused(404) if data is None else Response(data, media_type="image/png", headers=SAFE)
+
+    async def change(request: Request) -> Response:
+        row = CHANGES.get(request.path_params["change"])
+        if row is None:
+            return _refused(404)
+        data = bytearray()
+        async for chunk in request.stream():
+            data += chunk
+            if len(data) > MAX_BODY:
+                return _json({"error": f"a request of more than {MAX_BODY} bytes"}, 413)
+        kind, change_session = row
+        try:
+            body = kind.model_validate_json(bytes(data) or b"{}")
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            where = ".".join(map(str, first["loc"]))
+            return _json({"error": f"{where}: {first['msg']}"[:300]}, 422)
+        return _json(await run_in_threadpool(change_session, session, body))
+
+    routes = [
+        Route("/{secret}/", guarded(page)),
+        Route("/{secret}/{file:str}", guarded(_only(page, FILES))),
+        Route("/{secret}/state", guarded(state)),
+        Route("/{secret}/tiles/{image:int}.dzi", guarded(descriptor)),
+        Route("/{secret}/tiles/{image:int}_files/{level:int}/{column:int}_{row:int}.jpg", guarded(tile)),
+        Route("/{secret}/fit/{image:int}/{point:str}.png", guarded(fit)),
+        Route("/{secret}/{change:str}", guarded(change), methods=["POST"]),
+    ]
+    routes.insert(1, routes.pop(2))
+    return Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})
+
+
+def _only(
+    answer: Callable[[Request], Awaitable[Response]], names: Mapping[str, object]
+) -> Callable[[Request], Awaitable[Response]]:
+    async def known(request: Request) -> Response:
+        return await answer(request) if request.path_params["file"] in names else _refused(404)
+
+    return known
+
+
+def _json(content: dict[str, Any], status: int = 200) -> JSONResponse:
+    return JSONResponse(content, status, headers=SAFE)
+
+
+def _refused(status: int) -> Response:
+    return Response(status_code=status, headers=SAFE)
+
+
+async def _not_there(request: Request, error: Exception) -> Response:
+    return _refused(404)
+
+
+async def _failed(request: Request, error: Exception) -> Response:
+    return _json({"error": f"the server failed: {type(error).__name__}"}, 500)
+
+
+class MarkingServer:
+    """The page of a session, served until it is stopped."""
+
+    def __init__(self, session: MarkingSession, port: int = 0) -> None:
+        """Listen on a port of this computer.
+
+        Args:
+            session: the session that answers.
+            port: the port; 0 for any free one.
+
+        Raises:
+            OutputError: another program has the port.
+        """
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            self.socket.bind((HOST, port))
+        except OSError as error:
+            self.socket.close()
+            raise OutputError(
+                f"port {port}: another program has it ({error.strerror}); leave --port out for a free one"
+            ) from error
+        self.session = session
+        self.address = Address(self.socket.getsockname()[1], secrets.token_urlsafe(24))
+        config = uvicorn.Config(
+            application(session, self.address),
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            server_header=False,
+            timeout_graceful_shutdown=1,
+        )
+        self._server = uvicorn.Server(config)
+
+    def serve(self) -> None:
+        """Answer requests until `stop` or Ctrl-C."""
+        try:
+            self._server.run(sockets=[self.socket])
+        finally:
+            self.socket.close()
+
+    def stop(self) -> None:
+        """End `serve`."""
+        self._server.should_exit = True
