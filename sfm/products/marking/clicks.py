@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from sfm.matching.conjugate import match_points
+from sfm.matching.conjugate_patches import MatchSettings
 from sfm.matching.lsm.two_photo import LsmSettings, match_lsm
 from sfm.matching.tracks.interest import foerstner_points
 from sfm.model.conventions import AnyArray, FloatArray
@@ -41,7 +43,8 @@ ANGLES = 128  # samples of a circle
 AGREEMENT_SIGMAS, AGREEMENT_PX = 4.0, 0.1  # of one feature measured in windows of two sizes
 MIN_WEDGE, MAX_WEDGE = math.radians(20), math.radians(160)  # between the edges of a corner
 MIN_SYMMETRY = 0.7  # correlation of the intensities on a circle with those half a turn on
-DISTINCT = 2.0  # weight of a natural point over that of the next one within reach
+DISTINCT = 2.0  # weight of a natural point over that of another one that the click may have meant
+SHARP_PX = 0.15  # largest standard deviation of a natural point that attracts a click
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,15 @@ class Measured:
         """Return the measurement in the whole photograph, of which the measured part begins at `origin`."""
         outline = self.outline + origin
         return replace(self, x=self.x + float(origin[0]), y=self.y + float(origin[1]), outline=outline)
+
+
+@dataclass(frozen=True)
+class Template:
+    """The window of a natural point, in the photograph in which it was marked first."""
+
+    photograph: AnyArray  # intensities, (H, W)
+    x: float  # px
+    y: float  # px
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,8 @@ def measure_click(
     kind: Kind | None = None,
     *,
     family: TargetFamily | None = None,
-    window_px: int = 15,
+    template: Template | None = None,
+    window_px: int = 21,
     reach_px: float = REACH_PX,
 ) -> Measured:
     """Measure the feature at a click.
@@ -97,6 +110,7 @@ def measure_click(
         y: row of the click, px.
         kind: what to measure; None for the first of target, saddle, cross, corner and window that fits.
         family: codes of rings.
+        template: window of a natural point, which is searched for around the click.
         window_px: odd side of the windows of natural points.
         reach_px: largest distance from the click to the feature, px.
 
@@ -108,6 +122,8 @@ def measure_click(
         raise GeometryError(
             f"mark: {x:.1f}, {y:.1f} px is outside the photograph of {width} x {height} px"
         )
+    if template is not None:
+        return _matched(photograph, np.array([x, y]), template, window_px, reach_px)
     kinds = tuple(METHODS) if kind is None else (kind,)
     for name in kinds:
         measured = METHODS[name](photograph, np.array([x, y]), family, window_px, reach_px)
@@ -311,8 +327,10 @@ def _window(
     part = _part(photograph, at, int(within) + 2 * window_px + 20)
     points = foerstner_points(part.pixels, min_distance_px=3.0)
     near = np.flatnonzero(np.hypot(*(points.xy - part.at).T) <= within)
+    around = np.flatnonzero(np.hypot(*(points.xy - part.at).T) <= 2 * within)  # another click would reach these
     half, xy, note = window_px // 2, part.at, ""
-    if len(near) and (len(near) == 1 or points.weight[near[0]] >= DISTINCT * points.weight[near[1]]):
+    alone = len(near) and points.weight[near[0]] >= DISTINCT * points.weight[around[around != near[0]]].max(initial=0)
+    if alone and np.linalg.eigvalsh(points.covariance[near[0]])[1] <= SHARP_PX**2:
         xy, C = points.xy[near[0]], points.covariance[near[0]]
     else:
         note = f"no distinct place within {within:.0f} px: the place itself is the point"
@@ -321,6 +339,28 @@ def _window(
             return None
     box = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     return Measured(float(xy[0]), float(xy[1]), C, "window", xy + box, note=note).moved(part.origin)
+
+
+def _matched(
+    photograph: AnyArray, at: FloatArray, template: Template, window_px: int, reach: float
+) -> Measured:
+    """Return the place near a click that looks like the window of a point."""
+    place = np.array([template.x, template.y])
+    left = _part(template.photograph, place, 3 * window_px)
+    right = _part(photograph, at, 3 * window_px + int(reach))
+    settings = MatchSettings(template_px=window_px, search_px=window_px + 2 * int(reach))
+    match = match_points(left.pixels, right.pixels, left.at[None], settings, xy_right=right.at[None])
+    if not match.good[0]:
+        raise GeometryError(
+            f"mark: the window of the point is not matched within {reach:.0f} px of {at[0]:.1f}, {at[1]:.1f} px "
+            f"({match.reason[0]})"
+        )
+    half, xy = window_px // 2, match.right[0]
+    box = half * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    turned = box @ match.warp[0, :2, :2].T
+    return Measured(float(xy[0]), float(xy[1]), match.covariance[0] / 2, "window", xy + turned).moved(
+        right.origin
+    )
 
 
 def _window_covariance(part: _Part, xy: FloatArray, half: int) -> FloatArray | None:
