@@ -143,6 +143,36 @@ def relative_orientations(
     return (spatial, *planar)
 
 
+@checked_arguments(first="5 2", second="5 2")
+def five_point_orientations(first: FloatArray, second: FloatArray) -> tuple[RelativeOrientation, ...]:
+    """Return all spatial orientations that fit five conjugate rays, with the points before both photographs.
+
+    Five pairs have no redundancy: up to ten orientations fit them exactly, and other knowledge decides.
+
+    Args:
+        first: tangents u = -U/W, v = -V/W of rays of photograph 1, shape (5, 2).
+        second: the conjugate rays of photograph 2, shape (5, 2).
+
+    Source: Nister (2004), IEEE PAMI 26(6) (cv2.findEssentialMat).
+    """
+    down = np.array([1.0, -1.0])
+    uv1, uv2 = np.ascontiguousarray(first, dtype=float), np.ascontiguousarray(second, dtype=float)
+    E, _ = cv2.findEssentialMat(uv1 * down, uv2 * down, np.eye(3), method=cv2.RANSAC)
+    every = np.ones(len(uv1), dtype=bool)
+    orientations = []
+    for matrix in np.zeros((0, 3, 3)) if E is None else E.reshape(-1, 3, 3):
+        count, R, t, _ = cv2.recoverPose(matrix, uv1 * down, uv2 * down, np.eye(3))[:4]
+        if count < len(uv1):
+            continue
+        D = _IMAGE_FROM_VISION
+        rotation = (D @ np.asarray(R, dtype=np.float64) @ D).T
+        base = -rotation @ D @ np.asarray(t, dtype=np.float64).ravel()
+        orientations.append(
+            _evaluate("spatial", base / np.linalg.norm(base), rotation, _NAN, uv1, uv2, every)
+        )
+    return tuple(orientations)
+
+
 def model_points(first: FloatArray, second: FloatArray, pair: RelativeOrientation) -> FloatArray:
     """Return the intersections of the fitting pairs in the frame of photograph 1, NaN elsewhere, (n, 3).
 

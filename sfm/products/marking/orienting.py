@@ -1,0 +1,388 @@
+"""Orientation by hand: from three marks of known points in a photograph, or five common points of two.
+
+Marks are few and precise. Four or more known points orient a photograph by the robust resection of surveys; three
+by the closed form, whose up to four solutions the photographs decide. Where nothing is known, five or more points
+that two photographs share orient them relative to one another; again the photographs decide between the
+solutions. What is oriented gives points, which orient further photographs. The result starts the adjustment.
+
+Source: Fischler and Bolles (1981), Comm. ACM 24(6); Nister (2004), IEEE PAMI 26(6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Protocol
+
+import numpy as np
+
+from sfm.adjustment.solve import AdjustmentOptions, adjust
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.reduced_network import merge_estimate, reduce_network
+from sfm.model.similarity import fit_similarity
+from sfm.orientation.image_rays import image_tangents, intersect_image_points
+from sfm.orientation.incremental.sequence import FINAL_TOLERANCE_PX, START_TOLERANCE
+from sfm.orientation.relative import (
+    RelativeOrientation,
+    five_point_orientations,
+    model_points,
+    relative_orientations,
+)
+from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
+from sfm.orientation.resection.ransac import resect_robust
+from sfm.products.marking.evidence import Pose
+from sfm.survey.placing import object_scale
+
+MIN_KNOWN, MIN_COMMON = 3, 5  # marks of known points that orient a photograph, and common points of a pair
+MIN_SHARE = 0.6  # of the known points of a photograph that must fit; a few marks may be wrong
+CLEAR, LEAD = 0.25, 2.0  # part of its support, and features, by which the best orientation leads if it is clear
+ALIKE_DEG = 15.0  # between orientations that are no rivals, but one with and without further features
+
+
+class Evidence(Protocol):
+    """What the photographs say of the orientations of two of them."""
+
+    def support(self, i: int, j: int, first: Pose, second: Pose) -> float:
+        """Return the number of features that support two orientations."""
+        ...
+
+    def matches(self, i: int, j: int) -> tuple[FloatArray, FloatArray]:
+        """Return the tangents of features of two photographs that look alike, (k, 2) each."""
+        ...
+
+    def places(self, i: int, pose: Pose, points: FloatArray) -> float:
+        """Return the number of points that are seen where an orientation predicts them."""
+        ...
+
+
+@dataclass(frozen=True)
+class HandOrientation:
+    """Photographs and points that marks determine."""
+
+    estimate: Estimate  # NaN where nothing is determined
+    open: tuple[int, ...] = ()  # photographs with several orientations of which none is clearly better
+    contradicting: tuple[int, ...] = ()  # photographs whose marks fit no orientation
+
+
+def orient_by_hand(network: Network, start: Estimate, evidence: Evidence) -> HandOrientation:
+    """Return the orientation of the photographs that have enough marks, and the points that follow.
+
+    Args:
+        network: marks of m photographs and n points, with control and scale bars.
+        start: cameras, and what is oriented already; NaN elsewhere.
+        evidence: decides between orientations that fit the marks.
+    """
+    work = _Work(network, start, evidence)
+    if not work.estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
+        work.orient_pair()
+    while True:
+        while work.resect_next():
+            work.intersect()
+            work.adjust()
+        if not (work.estimate.oriented.any() and work.attach_pair()):
+            break
+        work.intersect()
+    if not work.estimate.oriented.any():
+        work.orient_pair()
+        while work.resect_next():
+            work.intersect()
+            work.adjust()
+    work.place()
+    return HandOrientation(work.estimate, tuple(sorted(work.open)), tuple(sorted(work.contradicting)))
+
+
+class _Work:
+    """An orientation that grows."""
+
+    def __init__(self, network: Network, start: Estimate, evidence: Evidence) -> None:
+        self.network, self.evidence = network, evidence
+        control = network.control.complete
+        points = start.points.copy()
+        self.known = np.zeros(len(network.points), dtype=bool)  # whose coordinates are given
+        if start.oriented.any() or len(control) >= MIN_KNOWN:
+            points[control.point] = control.xyz
+            self.known[control.point] = True
+        self.estimate = replace(start, points=points)
+        self.given = start.oriented
+        self.uv = image_tangents(network.image_points, network.camera, start.cameras)
+        self.open: set[int] = set()
+        self.contradicting: set[int] = set()
+        self.intersect()
+
+    def tolerance(self, i: int) -> float:
+        """Return the largest residual of a fitting mark, tangents: distortion is not known yet."""
+        camera = self.estimate.cameras[self.network.camera[i]]
+        return START_TOLERANCE * float(np.hypot(*camera.size_px)) / camera.c_px
+
+    def rows(self, i: int) -> IntArray:
+        """Return the marks of determined points in a photograph."""
+        seen = self.network.image_points
+        good = self.estimate.determined[seen.point] & np.isfinite(self.uv).all(axis=1)
+        return np.flatnonzero((seen.image == i) & good)
+
+    def resect_next(self) -> int:
+        """Orient the photographs with the most marks of determined points; return their number."""
+        seen = self.network.image_points
+        waiting = [i for i in np.flatnonzero(~self.estimate.oriented).tolist() if i not in self.contradicting]
+        rows = {i: self.rows(i) for i in waiting}
+        most = max((len(k) for k in rows.values()), default=0)
+        if most > MIN_KNOWN:
+            for i in sorted(waiting, key=lambda i: -len(rows[i])):
+                if len(rows[i]) <= MIN_KNOWN:
+                    break
+                k = rows[i]
+                resection = resect_robust(
+                    self.uv[k],
+                    self.estimate.points[seen.point[k]],
+                    tolerance=self.tolerance(i),
+                    min_inliers=max(MIN_KNOWN + 1, int(np.ceil(MIN_SHARE * len(k)))),
+                )
+                if resection.found:
+                    self.put(i, (resection.position, resection.rotation))
+                    return 1
+                self.contradicting.add(i)
+            return self.resect_next()
+        if most < MIN_KNOWN:
+            return 0
+        return self.resect_threes({i: k for i, k in rows.items() if len(k) == MIN_KNOWN})
+
+    def resect_threes(self, rows: dict[int, IntArray]) -> int:
+        """Orient the photographs with three known points, all at once: each supports the others."""
+        seen = self.network.image_points
+        poses: dict[int, list[Pose]] = {
+            i: [(self.estimate.position[i], self.estimate.rotation[i])]
+            for i in np.flatnonzero(self.estimate.oriented).tolist()
+        }
+        for i, k in rows.items():
+            found = resect_triples(
+                rays_from_tangents(self.uv[k])[None], self.estimate.points[seen.point[k]][None]
+            )
+            poses[i] = [(found.position[0, s], found.rotation[0, s]) for s in range(found.count[0])]
+            if not poses[i]:
+                self.contradicting.add(i)
+                del poses[i]
+        new = [i for i in rows if i in poses]
+        while any(len(poses[i]) > 1 for i in new):
+            self.decide(poses)
+        for i in new:
+            self.put(i, poses[i][0])
+        return len(new)
+
+    def decide(self, poses: dict[int, list[Pose]]) -> None:
+        """Keep one pose of the photograph, or of the two photographs, that the others support most clearly."""
+        best: tuple[float, float, dict[int, int]] | None = None
+        for i in [i for i in poses if len(poses[i]) > 1]:
+            own = np.array([self.evidence.places(i, p, self.estimate.points) for p in poses[i]])
+            for j in [j for j in poses if j != i]:
+                support = own[:, None] + [
+                    [self.evidence.support(j, i, q, p) for q in poses[j]] for p in poses[i]
+                ]
+                k, l = np.unravel_index(int(np.argmax(support)), support.shape)
+                rival = max((float(support[a].max()) for a in range(len(support)) if a != k), default=0.0)
+                row = float(support[k, l]) - rival, float(support[k, l]), {i: int(k), j: int(l)}
+                best = row if best is None or row[0] > best[0] else best
+            if len(poses) == 1:
+                k = int(np.argmax(own))
+                best = float(own[k] - np.sort(own)[-2]), float(own[k]), {i: k}
+        assert best is not None
+        lead, support_of_best, chosen = best
+        for i, k in chosen.items():
+            if len(poses[i]) > 1 and not _is_clear(lead, support_of_best):
+                self.open.add(i)
+            poses[i] = [poses[i][k]]
+
+    def orient_pair(self) -> None:
+        """Orient the two photographs with the best common points, in the frame of the first."""
+        candidates = [
+            (support, i, j, points, solution)
+            for i, j in self.pairs()[:3]
+            for support, points, solution in self.solutions(i, j)
+        ]
+        if not candidates:
+            return
+        support, i, j, points, solution = max(candidates, key=lambda row: row[0])
+        rivals = [
+            row[0]
+            for row in candidates
+            if row[1:3] == (i, j) and _angle_deg(row[4].rotation, solution.rotation) > ALIKE_DEG
+        ]
+        if rivals and not _is_clear(support - max(rivals), support):
+            self.open |= {i, j}
+        self.known[:] = False
+        self.estimate = replace(self.estimate, points=np.full_like(self.estimate.points, np.nan))
+        self.put(i, (np.zeros(3), np.eye(3)))
+        self.put(j, (solution.base, solution.rotation))
+        self.intersect()
+        self.adjust()
+
+    def attach_pair(self) -> bool:
+        """Orient a photograph on one that is oriented, by common points some of which are known."""
+        seen = self.network.image_points
+        for i, j in self.pairs():
+            if self.estimate.oriented[i] == self.estimate.oriented[j]:
+                continue
+            i, j = (i, j) if self.estimate.oriented[i] else (j, i)
+            best: tuple[float, Pose] | None = None
+            for support, points, solution in self.solutions(i, j):
+                a, b = (self.tangents_of(k, points) for k in (i, j))
+                model = model_points(a, b, solution)
+                X0, R = self.estimate.position[i], self.estimate.rotation[i]
+                away = np.linalg.norm(self.estimate.points[points] - X0, axis=1)
+                scale = np.nanmedian(away / np.linalg.norm(model, axis=1)) if np.isfinite(away).any() else np.nan
+                if scale > 0 and (best is None or support > best[0]):
+                    best = support, (X0 + scale * R @ solution.base, R @ solution.rotation)
+            if best is not None and seen is not None:
+                self.put(j, best[1])
+                return True
+        return False
+
+    def pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs with enough common points, those with most of them first."""
+        seen = self.network.image_points
+        marked = np.zeros((len(self.network.images), len(self.network.points)), dtype=np.int64)
+        marked[seen.image, seen.point] = 1
+        common = marked @ marked.T
+        pairs = [(i, j) for i, j in combinations(range(len(common)), 2) if common[i, j] >= MIN_COMMON]
+        return sorted(pairs, key=lambda pair: -common[pair])
+
+    def tangents_of(self, i: int, points: IntArray) -> FloatArray:
+        """Return the tangents of marks of points in a photograph, (k, 2)."""
+        seen = self.network.image_points
+        row = {int(seen.point[k]): k for k in np.flatnonzero(seen.image == i)}
+        return self.uv[[row[int(j)] for j in points]]
+
+    def solutions(self, i: int, j: int) -> Iterator[tuple[float, IntArray, RelativeOrientation]]:
+        """Yield the relative orientations of two photographs: their support, the common points, and each."""
+        seen = self.network.image_points
+        points = np.intersect1d(seen.point[seen.image == i], seen.point[seen.image == j])
+        a, b = self.tangents_of(i, points), self.tangents_of(j, points)
+        good = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+        points, a, b = points[good], a[good], b[good]
+        if len(points) < MIN_COMMON:
+            return
+        tolerance = FINAL_TOLERANCE_PX / self.estimate.cameras[self.network.camera[i]].c_px
+        solutions: list[RelativeOrientation] = []
+        if len(points) == MIN_COMMON:
+            solutions += five_point_orientations(a, b)
+        with suppress(GeometryError):
+            solutions += relative_orientations(a, b, tolerance=tolerance)
+        alike = self.evidence.matches(i, j)
+        if len(alike[0]):  # few marks may determine the orientation badly
+            with suppress(GeometryError):
+                of_all = relative_orientations(
+                    np.vstack([a, alike[0]]), np.vstack([b, alike[1]]), tolerance=tolerance
+                )
+                rows = slice(0, len(points))
+                solutions += [
+                    replace(s, inliers=s.inliers[rows], residuals=s.residuals[rows])
+                    for s in of_all
+                    if s.inliers[rows].sum() >= MIN_SHARE * len(points)
+                ]
+        for solution in solutions:
+            if solution.kind != "infinite" and np.isfinite(model_points(a, b, solution)).all(axis=1).sum() > 3:
+                pose = solution.base, solution.rotation
+                yield self.evidence.support(i, j, (np.zeros(3), np.eye(3)), pose), points, solution
+
+    def put(self, i: int, pose: Pose) -> None:
+        """Orient a photograph."""
+        position, rotation = self.estimate.position.copy(), self.estimate.rotation.copy()
+        position[i], rotation[i] = pose
+        self.estimate = replace(self.estimate, position=position, rotation=rotation)
+
+    def intersect(self) -> None:
+        """Intersect the points that are not given."""
+        seen = self.network.image_points
+        met = intersect_image_points(
+            seen,
+            self.network.camera,
+            self.estimate,
+            n_points=len(self.network.points),
+            tolerance_px=max(self.tolerance(i) for i in range(len(self.network.images)))
+            * min(camera.c_px for camera in self.estimate.cameras),
+        )
+        points = np.where(self.known[:, None], self.estimate.points, met.points)
+        kept = np.isnan(points).any(axis=1) & self.estimate.determined & self.given.any()
+        points[kept] = self.estimate.points[kept]
+        self.estimate = replace(self.estimate, points=points)
+
+    def adjust(self) -> None:
+        """Adjust what is determined, with held cameras; keep the result if it is one."""
+        images, points, used = determined_part(self.network, self.estimate)
+        given = int(self.known[points].sum())
+        control = given >= MIN_KNOWN
+        unknowns = 6 * images.sum() + 3 * (points.sum() - given) - (0 if control else 7)
+        if images.sum() < 2 or 2 * used.sum() <= unknowns:
+            return
+        held = tuple(
+            replace(camera, free=np.zeros_like(camera.free)) for camera in self.estimate.cameras
+        )
+        part, start = reduce_network(self.network, replace(self.estimate, cameras=held), images, points, used)
+        if not control:
+            part = part.with_given(type(part.scale_bars)())
+        with suppress(GeometryError, np.linalg.LinAlgError):
+            adjusted = adjust(
+                part,
+                start,
+                datum="control" if control else "free",
+                reject="huber",
+                covariance=False,
+                options=AdjustmentOptions(redundancy_numbers=False, max_iterations=30),
+            ).estimate
+            if adjusted.oriented.all():
+                whole = merge_estimate(adjusted, images, points)
+                self.estimate = Estimate(
+                    self.estimate.cameras,
+                    np.where(images[:, None], whole.position, self.estimate.position),
+                    np.where(images[:, None, None], whole.rotation, self.estimate.rotation),
+                    np.where(points[:, None], whole.points, self.estimate.points),
+                )
+
+    def place(self) -> None:
+        """Bring a free orientation to its control, or to the scale of its bars."""
+        if self.known.any() or self.given.any() or not self.estimate.oriented.any():
+            return
+        control = self.network.control.complete
+        determined = self.estimate.determined[control.point]
+        if determined.sum() >= MIN_KNOWN:
+            with suppress(GeometryError):
+                points = self.estimate.points[control.point[determined]]
+                self.estimate = fit_similarity(points, control.xyz[determined]).apply_estimate(self.estimate)
+                return
+        scale = object_scale(self.network, self.estimate)
+        if scale > 0:
+            self.estimate = replace(
+                self.estimate, position=scale * self.estimate.position, points=scale * self.estimate.points
+            )
+
+
+def _is_clear(lead: float, support: float) -> bool:
+    return lead >= max(LEAD, CLEAR * support)
+
+
+def _angle_deg(a: FloatArray, b: FloatArray) -> float:
+    """Return the angle of the rotation between two attitudes, degrees."""
+    return float(np.degrees(np.arccos(np.clip((np.trace(a.T @ b) - 1) / 2, -1.0, 1.0))))
+
+
+def determined_part(network: Network, estimate: Estimate) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Return the photographs (m,), points (n,) and image points (k,) that can be adjusted together.
+
+    A point needs two rays or coordinates, and a photograph three points.
+    """
+    seen = network.image_points
+    control = np.zeros(len(network.points), dtype=bool)
+    control[network.control.complete.point] = True
+    images, points = estimate.oriented.copy(), estimate.determined.copy()
+    while True:
+        used = images[seen.image] & points[seen.point]
+        rays = np.bincount(seen.point[used], minlength=len(points))
+        count = np.bincount(seen.image[used], minlength=len(images))
+        fewer = points & (rays >= np.where(control, 1, 2)), images & (count >= MIN_KNOWN)
+        if np.array_equal(fewer[0], points) and np.array_equal(fewer[1], images):
+            return images, points, used
+        points, images = fewer
