@@ -43,7 +43,9 @@ def mark(
     ] = None,
     port: Annotated[
         int,
-        typer.Option("--port", metavar="N", min=0, max=65535, help="Port of the page.  [default: a free one]"),
+        typer.Option(
+            "--port", metavar="N", min=0, max=65535, help="Port of the page.  [default: a free one]"
+        ),
     ] = 0,
     browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
     allow_outside: Annotated[

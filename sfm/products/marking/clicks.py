@@ -42,6 +42,7 @@ CROSS_RADII_PX = (7.0, 10.0, 14.0, 20.0, 28.0)  # of the circles that cut the ar
 ANGLES = 128  # samples of a circle
 AGREEMENT_SIGMAS, AGREEMENT_PX = 4.0, 0.1  # of one feature measured in windows of two sizes
 MIN_WEDGE, MAX_WEDGE = math.radians(20), math.radians(160)  # between the edges of a corner
+REACH_SIZES = 2.5  # half side of the part in which a target of known size is found, in its sizes
 MIN_SYMMETRY = 0.7  # correlation of the intensities on a circle with those half a turn on
 DISTINCT = 2.0  # weight of a natural point over that of another one that the click may have meant
 SHARP_PX = 0.15  # largest standard deviation of a natural point that attracts a click
@@ -59,6 +60,11 @@ class Measured:
     code: int | None = None  # of a ring
     note: str = ""  # what a person should know
 
+    @property
+    def size_px(self) -> float:
+        """Half side of what was fitted, px."""
+        return float(np.abs(self.outline - (self.x, self.y)).max()) if len(self.outline) else 0.0
+
     def moved(self, origin: FloatArray) -> Measured:
         """Return the measurement in the whole photograph, of which the measured part begins at `origin`."""
         outline = self.outline + origin
@@ -72,6 +78,17 @@ class Template:
     photograph: AnyArray  # intensities, (H, W)
     x: float  # px
     y: float  # px
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What is to be measured."""
+
+    at: FloatArray  # click, px, (2,)
+    family: TargetFamily | None
+    window_px: int
+    reach: float  # px
+    size: float  # half side of a target, 0 if not known, px
 
 
 @dataclass(frozen=True)
@@ -101,6 +118,7 @@ def measure_click(
     template: Template | None = None,
     window_px: int = 21,
     reach_px: float = REACH_PX,
+    size_px: float = 0.0,
 ) -> Measured:
     """Measure the feature at a click.
 
@@ -113,20 +131,20 @@ def measure_click(
         template: window of a natural point, which is searched for around the click.
         window_px: odd side of the windows of natural points.
         reach_px: largest distance from the click to the feature, px.
+        size_px: half side of a target, if it is known from other photographs, px.
 
     Raises:
         GeometryError: the click is outside the photograph, or nothing of this kind is there.
     """
     height, width = photograph.shape
     if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-        raise GeometryError(
-            f"mark: {x:.1f}, {y:.1f} px is outside the photograph of {width} x {height} px"
-        )
+        raise GeometryError(f"mark: {x:.1f}, {y:.1f} px is outside the photograph of {width} x {height} px")
     if template is not None:
         return _matched(photograph, np.array([x, y]), template, window_px, reach_px)
     kinds = tuple(METHODS) if kind is None else (kind,)
+    asked = _Asked(np.array([x, y]), family, window_px, reach_px, size_px)
     for name in kinds:
-        measured = METHODS[name](photograph, np.array([x, y]), family, window_px, reach_px)
+        measured = METHODS[name](photograph, asked)
         if measured is not None and (kind != "ring" or measured.kind == "ring"):
             return measured
     what = "nothing" if kind is None else f"no {kind}"
@@ -142,11 +160,11 @@ def _part(photograph: AnyArray, at: FloatArray, half: int) -> _Part:
     return _Part(pixels, as_grey(pixels), at - origin, origin, estimate_noise(pixels), scale_of(pixels))
 
 
-def _target(
-    photograph: AnyArray, at: FloatArray, family: TargetFamily | None, window_px: int, reach: float
-) -> Measured | None:
+def _target(photograph: AnyArray, asked: _Asked) -> Measured | None:
     """Return the target whose outline contains the click or is nearest to it."""
-    for half in TARGET_HALVES_PX:
+    at, family, reach = asked.at, asked.family, asked.reach
+    known = (int(reach + REACH_SIZES * asked.size) + 8,) if asked.size > 0 else ()
+    for half in known or TARGET_HALVES_PX:
         part = _part(photograph, at, half)
         targets = find_targets(part.pixels, codes="none" if family is None else family)
         circles = np.flatnonzero(targets.is_circle)
@@ -177,11 +195,10 @@ def _target(
     return None
 
 
-def _saddle(
-    photograph: AnyArray, at: FloatArray, family: TargetFamily | None, window_px: int, reach: float
-) -> Measured | None:
+def _saddle(photograph: AnyArray, asked: _Asked) -> Measured | None:
     """Return the crossing of two edges between squares of alternating brightness."""
-    part = _part(photograph, at, int(reach) + 3 * SADDLE_HALVES_PX[-1])
+    reach = asked.reach
+    part = _part(photograph, asked.at, int(reach) + 3 * SADDLE_HALVES_PX[-1])
     smooth = cv2.GaussianBlur(part.grey, (0, 0), 1.5)
     xx, yy, xy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
     for start in _peaks(np.asarray(xy * xy - xx * yy), part.at, reach):
@@ -203,11 +220,10 @@ def _saddle(
     return None
 
 
-def _cross(
-    photograph: AnyArray, at: FloatArray, family: TargetFamily | None, window_px: int, reach: float
-) -> Measured | None:
+def _cross(photograph: AnyArray, asked: _Asked) -> Measured | None:
     """Return the centre of two bars that cross."""
-    part = _part(photograph, at, int(reach) + 2 * int(CROSS_RADII_PX[-1]))
+    reach = asked.reach
+    part = _part(photograph, asked.at, int(reach) + 2 * int(CROSS_RADII_PX[-1]))
     centre, radius = part.at, 0.0
     for r in CROSS_RADII_PX:
         place = _cross_start(part, part.at, r)
@@ -224,7 +240,12 @@ def _cross(
             continue
         xy, C = matched
         runs = _runs(part, xy, 0.8 * r)
-        if np.hypot(*(xy - centre)) > 3.0 or runs is None or runs.changes != 8 or runs.symmetry < MIN_SYMMETRY:
+        if (
+            np.hypot(*(xy - centre)) > 3.0
+            or runs is None
+            or runs.changes != 8
+            or runs.symmetry < MIN_SYMMETRY
+        ):
             if last is not None:
                 break
             continue
@@ -275,11 +296,10 @@ def _half_turn(part: _Part, centre: FloatArray, half: int) -> tuple[FloatArray, 
     return xy, match.covariance[0] / 2
 
 
-def _corner(
-    photograph: AnyArray, at: FloatArray, family: TargetFamily | None, window_px: int, reach: float
-) -> Measured | None:
+def _corner(photograph: AnyArray, asked: _Asked) -> Measured | None:
     """Return the corner where two edges of one surface meet."""
-    part = _part(photograph, at, int(reach) + 3 * int(CORNER_REACHES_PX[-1]))
+    reach = asked.reach
+    part = _part(photograph, asked.at, int(reach) + 3 * int(CORNER_REACHES_PX[-1]))
     response = cv2.cornerMinEigenVal(cv2.GaussianBlur(part.grey, (0, 0), 1.0), 5)
     for start in _peaks(np.asarray(response), part.at, reach):
 
@@ -319,17 +339,19 @@ def _fit_corner(part: _Part, start: FloatArray, length: float) -> tuple[FloatArr
     return (xy, C) if after is not None and after.changes == 2 else None
 
 
-def _window(
-    photograph: AnyArray, at: FloatArray, family: TargetFamily | None, window_px: int, reach: float
-) -> Measured | None:
+def _window(photograph: AnyArray, asked: _Asked) -> Measured | None:
     """Return the natural point near the click, or the place itself where several or none are distinct."""
-    within = min(reach, WINDOW_REACH_PX)
-    part = _part(photograph, at, int(within) + 2 * window_px + 20)
+    within, window_px = min(asked.reach, WINDOW_REACH_PX), asked.window_px
+    part = _part(photograph, asked.at, int(within) + 2 * window_px + 20)
     points = foerstner_points(part.pixels, min_distance_px=3.0)
     near = np.flatnonzero(np.hypot(*(points.xy - part.at).T) <= within)
-    around = np.flatnonzero(np.hypot(*(points.xy - part.at).T) <= 2 * within)  # another click would reach these
+    around = np.flatnonzero(
+        np.hypot(*(points.xy - part.at).T) <= 2 * within
+    )  # another click would reach these
     half, xy, note = window_px // 2, part.at, ""
-    alone = len(near) and points.weight[near[0]] >= DISTINCT * points.weight[around[around != near[0]]].max(initial=0)
+    alone = len(near) and points.weight[near[0]] >= DISTINCT * points.weight[around[around != near[0]]].max(
+        initial=0
+    )
     if alone and np.linalg.eigvalsh(points.covariance[near[0]])[1] <= SHARP_PX**2:
         xy, C = points.xy[near[0]], points.covariance[near[0]]
     else:

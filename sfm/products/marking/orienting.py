@@ -40,7 +40,11 @@ from sfm.survey.placing import object_scale
 
 MIN_KNOWN, MIN_COMMON = 3, 5  # marks of known points that orient a photograph, and common points of a pair
 MIN_SHARE = 0.6  # of the known points of a photograph that must fit; a few marks may be wrong
-CLEAR, LEAD = 0.25, 2.0  # part of its support, and features, by which the best orientation leads if it is clear
+AGAIN = 1.3  # photographs over those of the last adjustment, from which all are adjusted again
+CLEAR, LEAD = (
+    0.25,
+    2.0,
+)  # part of its support, and features, by which the best orientation leads if it is clear
 ALIKE_DEG = 15.0  # between orientations that are no rivals, but one with and without further features
 
 
@@ -67,52 +71,66 @@ class HandOrientation:
     estimate: Estimate  # NaN where nothing is determined
     open: tuple[int, ...] = ()  # photographs with several orientations of which none is clearly better
     contradicting: tuple[int, ...] = ()  # photographs whose marks fit no orientation
+    in_control: bool = False  # whether the frame is that of the control
 
 
-def orient_by_hand(network: Network, start: Estimate, evidence: Evidence) -> HandOrientation:
+def orient_by_hand(
+    network: Network, start: Estimate, evidence: Evidence, *, in_control: bool = False
+) -> HandOrientation:
     """Return the orientation of the photographs that have enough marks, and the points that follow.
 
     Args:
         network: marks of m photographs and n points, with control and scale bars.
         start: cameras, and what is oriented already; NaN elsewhere.
         evidence: decides between orientations that fit the marks.
+        in_control: whether what is oriented already is in the frame of the control.
     """
-    work = _Work(network, start, evidence)
+    work = _Work(network, start, evidence, in_control=in_control)
     if not work.estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
         work.orient_pair()
-    while True:
-        while work.resect_next():
-            work.intersect()
-            work.adjust()
-        if not (work.estimate.oriented.any() and work.attach_pair()):
-            break
-        work.intersect()
+    work.grow()
     if not work.estimate.oriented.any():
         work.orient_pair()
-        while work.resect_next():
-            work.intersect()
-            work.adjust()
+        work.grow()
     work.place()
-    return HandOrientation(work.estimate, tuple(sorted(work.open)), tuple(sorted(work.contradicting)))
+    if work.in_control:
+        work.grow()  # on the other known points
+    return HandOrientation(
+        work.estimate, tuple(sorted(work.open)), tuple(sorted(work.contradicting)), work.in_control
+    )
 
 
 class _Work:
     """An orientation that grows."""
 
-    def __init__(self, network: Network, start: Estimate, evidence: Evidence) -> None:
-        self.network, self.evidence = network, evidence
-        control = network.control.complete
-        points = start.points.copy()
+    def __init__(self, network: Network, start: Estimate, evidence: Evidence, *, in_control: bool) -> None:
+        self.network, self.evidence, self.estimate = network, evidence, start
         self.known = np.zeros(len(network.points), dtype=bool)  # whose coordinates are given
-        if start.oriented.any() or len(control) >= MIN_KNOWN:
-            points[control.point] = control.xyz
-            self.known[control.point] = True
-        self.estimate = replace(start, points=points)
-        self.given = start.oriented
+        self.in_control = in_control and bool(start.oriented.any())
+        self.given, self.adjusted = start.oriented, 0
+        if self.in_control or (not start.oriented.any() and len(network.control.complete) >= MIN_KNOWN):
+            self.use_control()
         self.uv = image_tangents(network.image_points, network.camera, start.cameras)
         self.open: set[int] = set()
         self.contradicting: set[int] = set()
         self.intersect()
+
+    def use_control(self) -> None:
+        """Give the points of the control their coordinates."""
+        control, points = self.network.control.complete, self.estimate.points.copy()
+        points[control.point] = control.xyz
+        self.known[control.point] = True
+        self.estimate, self.in_control = replace(self.estimate, points=points), True
+
+    def grow(self) -> None:
+        """Orient all photographs that have enough points, and determine the points that follow."""
+        while True:
+            while self.resect_next():
+                self.intersect()
+                self.adjust()
+            if not (self.estimate.oriented.any() and self.attach_pair()):
+                break
+            self.intersect()
 
     def tolerance(self, i: int) -> float:
         """Return the largest residual of a fitting mark, tangents: distortion is not known yet."""
@@ -213,7 +231,7 @@ class _Work:
         ]
         if rivals and not _is_clear(support - max(rivals), support):
             self.open |= {i, j}
-        self.known[:] = False
+        self.known[:], self.in_control = False, False
         self.estimate = replace(self.estimate, points=np.full_like(self.estimate.points, np.nan))
         self.put(i, (np.zeros(3), np.eye(3)))
         self.put(j, (solution.base, solution.rotation))
@@ -233,7 +251,9 @@ class _Work:
                 model = model_points(a, b, solution)
                 X0, R = self.estimate.position[i], self.estimate.rotation[i]
                 away = np.linalg.norm(self.estimate.points[points] - X0, axis=1)
-                scale = np.nanmedian(away / np.linalg.norm(model, axis=1)) if np.isfinite(away).any() else np.nan
+                scale = (
+                    np.nanmedian(away / np.linalg.norm(model, axis=1)) if np.isfinite(away).any() else np.nan
+                )
                 if scale > 0 and (best is None or support > best[0]):
                     best = support, (X0 + scale * R @ solution.base, R @ solution.rotation)
             if best is not None and seen is not None:
@@ -284,7 +304,10 @@ class _Work:
                     if s.inliers[rows].sum() >= MIN_SHARE * len(points)
                 ]
         for solution in solutions:
-            if solution.kind != "infinite" and np.isfinite(model_points(a, b, solution)).all(axis=1).sum() > 3:
+            if (
+                solution.kind != "infinite"
+                and np.isfinite(model_points(a, b, solution)).all(axis=1).sum() > 3
+            ):
                 pose = solution.base, solution.rotation
                 yield self.evidence.support(i, j, (np.zeros(3), np.eye(3)), pose), points, solution
 
@@ -312,15 +335,16 @@ class _Work:
 
     def adjust(self) -> None:
         """Adjust what is determined, with held cameras; keep the result if it is one."""
+        if self.estimate.oriented.sum() < AGAIN * self.adjusted:
+            return
         images, points, used = determined_part(self.network, self.estimate)
         given = int(self.known[points].sum())
-        control = given >= MIN_KNOWN
+        control = self.in_control and given >= MIN_KNOWN
         unknowns = 6 * images.sum() + 3 * (points.sum() - given) - (0 if control else 7)
         if images.sum() < 2 or 2 * used.sum() <= unknowns:
             return
-        held = tuple(
-            replace(camera, free=np.zeros_like(camera.free)) for camera in self.estimate.cameras
-        )
+        self.adjusted = int(images.sum())
+        held = tuple(replace(camera, free=np.zeros_like(camera.free)) for camera in self.estimate.cameras)
         part, start = reduce_network(self.network, replace(self.estimate, cameras=held), images, points, used)
         if not control:
             part = part.with_given(type(part.scale_bars)())
@@ -344,7 +368,7 @@ class _Work:
 
     def place(self) -> None:
         """Bring a free orientation to its control, or to the scale of its bars."""
-        if self.known.any() or self.given.any() or not self.estimate.oriented.any():
+        if self.in_control or not self.estimate.oriented.any():
             return
         control = self.network.control.complete
         determined = self.estimate.determined[control.point]
@@ -352,7 +376,10 @@ class _Work:
             with suppress(GeometryError):
                 points = self.estimate.points[control.point[determined]]
                 self.estimate = fit_similarity(points, control.xyz[determined]).apply_estimate(self.estimate)
+                self.use_control()
                 return
+        if self.given.any():
+            return
         scale = object_scale(self.network, self.estimate)
         if scale > 0:
             self.estimate = replace(

@@ -108,9 +108,7 @@ def _cameras_of(
     network = solution.network
     index = {name: int(network.camera[i]) for i, name in enumerate(network.images)}
     solved = solution.estimate.cameras
-    owner = [
-        index.get(name, len(solved) + int(k)) for name, k in zip(files.names, files.camera, strict=True)
-    ]
+    owner = [index.get(name, len(solved) + int(k)) for name, k in zip(files.names, files.camera, strict=True)]
     return (*solved, *cameras), PhotographList(
         files.names, files.paths, np.array(owner, dtype=np.int64), files.folder
     )

@@ -10,9 +10,8 @@ DNS Rebinding Attacks (2007).
 
 from __future__ import annotations
 
-import asyncio
 import hmac
-import json
+import math
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
@@ -37,7 +36,11 @@ from sfm.survey.inputs.marks_file import Kind, StatedPoint
 HOST = "127.0.0.1"
 HEADER = "x-kolinear"  # carries the secret in requests that change something
 PAGE = Path(__file__).with_name("page")
-FILES = {"": ("mark.html", "text/html"), "mark.js": ("mark.js", "text/javascript"), "mark.css": ("mark.css", "text/css")}
+FILES = {
+    "": ("mark.html", "text/html"),
+    "mark.js": ("mark.js", "text/javascript"),
+    "mark.css": ("mark.css", "text/css"),
+}
 MAX_BODY = 100_000  # bytes of a request
 POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; "
@@ -135,9 +138,7 @@ def _bar(session: MarkingSession, body: Bar) -> dict[str, Any]:
 CHANGES: dict[str, tuple[type[Body], Callable[[MarkingSession, Any], dict[str, Any]]]] = {
     "click": (
         Click,
-        lambda session, b: session.click(
-            b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px
-        ),
+        lambda session, b: session.click(b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px),
     ),
     "accept": (Chosen, lambda session, b: session.accept(b.image, b.point)),
     "refuse": (Chosen, lambda session, b: session.refuse(b.image, b.point)),
@@ -229,9 +230,7 @@ def application(session: MarkingSession, address: Address) -> Starlette:
 
     async def tile(request: Request) -> Response:
         at = request.path_params
-        data = await run_in_threadpool(
-            session.pixels.tile, at["image"], at["level"], at["column"], at["row"]
-        )
+        data = await run_in_threadpool(session.pixels.tile, at["image"], at["level"], at["column"], at["row"])
         if data is None:
             return _refused(404)
         return Response(data, media_type="image/jpeg", headers={**SAFE, **KEPT})
@@ -240,6 +239,16 @@ def application(session: MarkingSession, address: Address) -> Starlette:
         at = request.path_params
         data = await run_in_threadpool(session.fit_picture, at["image"], at["point"])
         return _refused(404) if data is None else Response(data, media_type="image/png", headers=SAFE)
+
+    async def sight(request: Request) -> Response:
+        try:
+            image = int(request.query_params["image"])
+            x, y = (float(request.query_params[name]) for name in ("x", "y"))
+        except (KeyError, ValueError):
+            return _refused(422)
+        if not (math.isfinite(x) and math.isfinite(y)):
+            return _refused(422)
+        return _json({"lines": await run_in_threadpool(session.sight, image, x, y)})
 
     async def change(request: Request) -> Response:
         row = CHANGES.get(request.path_params["change"])
@@ -261,14 +270,14 @@ def application(session: MarkingSession, address: Address) -> Starlette:
 
     routes = [
         Route("/{secret}/", guarded(page)),
-        Route("/{secret}/{file:str}", guarded(_only(page, FILES))),
         Route("/{secret}/state", guarded(state)),
+        Route("/{secret}/sight", guarded(sight)),
+        Route("/{secret}/{file:str}", guarded(_only(page, FILES))),
         Route("/{secret}/tiles/{image:int}.dzi", guarded(descriptor)),
         Route("/{secret}/tiles/{image:int}_files/{level:int}/{column:int}_{row:int}.jpg", guarded(tile)),
         Route("/{secret}/fit/{image:int}/{point:str}.png", guarded(fit)),
         Route("/{secret}/{change:str}", guarded(change), methods=["POST"]),
     ]
-    routes.insert(1, routes.pop(2))
     return Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})
 
 

@@ -6,21 +6,34 @@ adjustment in a thread of its own; each new result has a version, for which page
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from sfm.files.plain_text import is_name, or_none
-from sfm.model.conventions import FloatArray
-from sfm.model.errors import KolinearError, SurveyFileError
+from sfm.model.errors import KolinearError, PhotographError
 from sfm.products.marking.clicks import Measured, measure_click
+from sfm.products.marking.evidence import PictureEvidence
 from sfm.products.marking.fit_picture import picture_of_mark
+from sfm.products.marking.following import (
+    Following,
+    Proposal,
+    automatic_marks,
+    follow,
+    marks_needed,
+    propose,
+    scale_bars,
+    sentence_of,
+    stated_points,
+    template_of,
+    without_moved,
+)
+from sfm.products.marking.guidance import Guide
 from sfm.products.marking.marks import SavedMarks
 from sfm.products.marking.pixels import PhotographPixels
 from sfm.products.marking.project import MarkedProject
@@ -67,8 +80,20 @@ class MarkingSession:
         self._version = 1
         self._closed = False
         self._fits: dict[tuple[str, str], Measured] = {}
-        self._hashes: dict[str, str | None] = {}
+        self._hashes: dict[str, str] = {}
+        self._changed_files: dict[str, str] = {}
         self._run: Run | None = None
+        self._evidence = PictureEvidence(
+            self.pixels.grey, [project.cameras[k] for k in project.photographs.camera]
+        )
+        self._automatic = automatic_marks(project)
+        self._following: Following | None = None
+        self._proposals: dict[tuple[str, str], Proposal] = {}
+        self._changes = 1  # of the marks, since the beginning
+        self._followed = 0  # changes that the orientation follows
+        self._failed = ""  # why the orientation failed
+        self._worker = threading.Thread(target=self._follow_changes, name="marks", daemon=True)
+        self._worker.start()
 
     # --- what the page asks for --------------------------------------------------------------------
 
@@ -147,12 +172,72 @@ class MarkingSession:
             return {"mark": self._shown_mark(mark), "note": measured.note, "state": self._state()}
 
     def accept(self, image: int | None = None, point: str | None = None) -> dict[str, Any]:
-        """Turn proposals into marks: one, all of a point, or all."""
-        return self.state()
+        """Turn measured proposals into marks: one, all of a point, or all."""
+        with self._changed:
+            chosen = self._chosen(image, point)
+            measured = {key: proposal.measured for key, proposal in chosen.items() if proposal.measured}
+            if not measured:
+                raise MarkError("nothing was measured there: click it")
+            marking = self._marking
+            for (photograph, name), fit in measured.items():
+                self._fits[photograph, name] = fit
+                marking = self._with_hash(
+                    marking.with_mark(self._mark_of(photograph, name, fit)), self._index[photograph]
+                )
+            self._change(marking)
+            return self._state()
 
     def refuse(self, image: int | None = None, point: str | None = None) -> dict[str, Any]:
-        """Refuse proposals: one, all of a point, or all; they are not proposed again."""
-        return self.state()
+        """Refuse proposals: one, all of a point, or all; they are not proposed again.
+
+        An image point that was measured automatically is refused too, by its photograph and point.
+        """
+        with self._changed:
+            refused: list[Mark] = []
+            if image is not None and point is not None:
+                key = self._photograph(image), point
+                if key in self._automatic and key not in self._marking.marks:
+                    x, y, C = self._automatic[key]
+                    refused.append(self._mark_of(*key, Measured(x, y, C, "target", np.zeros((0, 2)))))
+            if not refused:
+                for (photograph, name), proposal in self._chosen(image, point).items():
+                    place = proposal.measured or Measured(
+                        float(proposal.predicted.xy[0]),
+                        float(proposal.predicted.xy[1]),
+                        np.eye(2),
+                        "hand",
+                        np.zeros((0, 2)),
+                    )
+                    refused.append(self._mark_of(photograph, name, place))
+            if not refused:
+                raise MarkError("nothing is proposed there")
+            marking = self._marking
+            for mark in refused:
+                marking = marking.with_refused(mark)
+            self._change(marking)
+            return self._state()
+
+    def _chosen(self, image: int | None, point: str | None) -> dict[tuple[str, str], Proposal]:
+        """Return the proposals of a photograph and point, of a point, or all."""
+        photograph = None if image is None else self._photograph(image)
+        return {
+            key: proposal
+            for key, proposal in self._proposals.items()
+            if photograph in (None, key[0]) and point in (None, key[1])
+        }
+
+    def sight(self, image: int, x: float, y: float) -> list[dict[str, Any]]:
+        """Return the ray of sight through a place of a photograph, in all other oriented photographs."""
+        self._photograph(image)
+        with self._changed:
+            guide = self._guide()
+        if guide is None:
+            return []
+        lines = guide.lines(image, np.array([x, y]))
+        return [{"image": j, "xy": np.round(path, 2).tolist()} for j, path in lines]
+
+    def _guide(self) -> Guide | None:
+        return None if self._following is None else self._following.guide
 
     def delete(self, point: str, image: int | None = None) -> dict[str, Any]:
         """Delete the mark of a point in a photograph, or all of the point."""
@@ -171,7 +256,8 @@ class MarkingSession:
             marking = self._marking
             if not is_name(name) or name != name.strip():
                 raise MarkError("a name of plain text is needed for the point")
-            if point not in marking.points and point not in marking.control:
+            automatic = [key for key in self._automatic if key[1] == point and key not in marking.refused]
+            if point not in marking.points and point not in marking.control and not automatic:
                 raise MarkError(f"there is no point '{point}'")
             both = sorted(
                 photograph for photograph, marked in marking.marks if marked == point
@@ -181,7 +267,17 @@ class MarkingSession:
                 raise MarkError(f"'{name}' has a mark in {both[0]} already, a point has one there")
             if point in marking.control and name in marking.control and name != point:
                 raise MarkError(f"'{name}' has stated coordinates already")
-            self._change(marking.renamed(point, name))
+            for key in automatic:  # the new name is a mark, and the old one is left out
+                if key not in marking.marks:
+                    x, y, C = self._automatic[key]
+                    mark = self._mark_of(*key, Measured(x, y, C, "target", np.zeros((0, 2))))
+                    marking = self._with_hash(marking.with_mark(mark), self._index[key[0]])
+            renamed = marking.renamed(point, name)
+            for key in automatic:
+                old = marking.marks[key]
+                renamed = replace(renamed, refused={**renamed.refused, key: replace(old, state="refused")})
+            self._fits |= {(photo, name): fit for (photo, old), fit in self._fits.items() if old == point}
+            self._change(renamed)
             return self._state()
 
     def set_control(self, point: str, stated: StatedPoint | None) -> dict[str, Any]:
@@ -219,6 +315,7 @@ class MarkingSession:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+        self._worker.join()
         self._saved.close()
 
     # --- inside ------------------------------------------------------------------------------------
@@ -236,14 +333,24 @@ class MarkingSession:
     def _measure(self, image: int, x: float, y: float, point: str | None, kind: Kind | None) -> Measured:
         """Measure at a click, first what the point is in other photographs."""
         pixels = self.pixels.grey(image)
-        options: dict[str, Any] = {"family": self.project.survey.family}
+        family, name = self.project.survey.family, self._photograph(image)
         with self._changed:
-            kinds = [mark.kind for mark in self._marking.marks.values() if mark.point == point]
-        usual = max(set(kinds), key=kinds.count) if kinds else None
-        if kind is None and usual not in (None, "hand"):
+            marks = [
+                mark
+                for mark in self._marking.marks.values()
+                if mark.point == point and mark.by == "measured" and mark.photograph != name
+            ]
+        kinds = [mark.kind for mark in marks]
+        usual = max(dict.fromkeys(kinds), key=kinds.count) if kinds else None
+        if usual == "window" and kind in (None, "window"):
+            first = next(mark for mark in marks if mark.kind == "window")
+            template = template_of(first, self.pixels.grey, self.project)
+            if template is not None:
+                return measure_click(pixels, x, y, "window", template=template)
+        if kind is None and usual is not None:
             with suppress(KolinearError):
-                return measure_click(pixels, x, y, usual, **options)
-        return measure_click(pixels, x, y, kind, **options)
+                return measure_click(pixels, x, y, usual, family=family)
+        return measure_click(pixels, x, y, kind, family=family)
 
     def _new_name(self, marking: Marking, photograph: str, measured: Measured) -> str:
         """Return the code of a ring, or the next free name."""
@@ -283,84 +390,180 @@ class MarkingSession:
 
     def _step(self, step: Callable[[], bool]) -> dict[str, Any]:
         with self._changed:
+            before = self._marking
             if step():
-                self._follow()
+                self._follow(before)
             return self._state()
 
     def _change(self, marking: Marking) -> None:
+        before = self._marking
         self._saved.change(marking)
-        self._follow()
+        self._follow(before)
 
-    def _follow(self) -> None:
-        """Let everything follow from the marks after a change."""
+    def _follow(self, before: Marking) -> None:
+        """Let what is known at once follow from a change, and the rest in the background.
+
+        The points that changed get new proposals from the orientation so far.
+        """
+        marking = self._marking
         self._version += 1
+        self._changes += 1
+        gone = marking.marks.keys() | marking.refused.keys()
+        self._proposals = {key: old for key, old in self._proposals.items() if key not in gone}
+        changed = {
+            key[1]
+            for key in marking.marks.keys() | before.marks.keys()
+            if marking.marks.get(key) is not before.marks.get(key)
+        }
+        last = self._following
+        now_following = None if last is None else without_moved(last, marking, self.project)
+        if now_following is not None and len(changed) == 1:
+            self._propose_again(now_following, changed)
         self._changed.notify_all()
+
+    def _propose_again(self, following: Following, changed: set[str]) -> None:
+        """Propose the places of points from their rays and the orientation so far."""
+        points, guide, number = following.estimate.points.copy(), following.guide, following.marked.point
+        adjustment = following.adjustment
+        for name in changed & number.keys():
+            j = number[name]
+            if adjustment is None or j >= len(adjustment.points) or not adjustment.points[j]:
+                if name not in following.marked.control:
+                    points[j] = guide.with_rays(j)
+        following = replace(following, estimate=replace(following.estimate, points=points))
+        kept = {key: old for key, old in self._proposals.items() if key[1] not in changed}
+        with suppress(KolinearError):
+            new = propose(following, self._marking, self.pixels.grey, self.project, self._fits, changed)
+            self._proposals = {**kept, **new}
+
+    def _follow_changes(self) -> None:
+        """Compute what follows from the marks whenever they changed, until the session ends."""
+        self._look_for_changed_files()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closed or self._followed < self._changes)
+                if self._closed:
+                    return
+                changes, marking, last = self._changes, self._marking, self._following
+                fits = dict(self._fits)
+            try:
+                following = follow(self.project, marking, self._evidence, last)
+                proposals = propose(following, marking, self.pixels.grey, self.project, fits)
+                failed = ""
+            except KolinearError as error:
+                following, proposals, failed = last, {}, str(error)
+            with self._changed:
+                self._followed, self._failed = changes, failed
+                if changes == self._changes:
+                    self._following, self._proposals = following, proposals
+                elif following is not None:
+                    self._following = following  # the next round continues it
+                self._version += 1
+                self._changed.notify_all()
+
+    def _look_for_changed_files(self) -> None:
+        """Compare the photographs that have marks with their hashes in the marks file."""
+        for name, stated in self._saved.now.hashes.items():
+            if name not in self._index:
+                continue
+            path = self.project.photographs.paths[self._index[name]]
+            with suppress(PhotographError):
+                if content_hash(path) != stated:
+                    self._changed_files[name] = "changed since it was marked: check its marks"
 
     # --- the state ---------------------------------------------------------------------------------
 
     def _state(self) -> dict[str, Any]:
-        marking, project = self._marking, self.project
-        count: dict[str, int] = {}
-        rays: dict[str, int] = {}
-        for photograph, point in marking.marks:
-            count[photograph] = count.get(photograph, 0) + 1
-            rays[point] = rays.get(point, 0) + 1
-        control = self._stated()
-        names = tuple(dict.fromkeys((*marking.points, *control)))
+        marking, project, following = self._marking, self.project, self._following
+        marks = [self._shown_mark(mark) for mark in marking.marks.values() if mark.photograph in self._index]
+        marks += [
+            self._shown_automatic(key)
+            for key in self._automatic
+            if key[0] in self._index and key not in marking.marks and key not in marking.refused
+        ]
         return {
             "version": self._version,
             "name": project.survey.name,
             "unit": project.survey.unit,
-            "photographs": [
-                {
-                    "index": i,
-                    "name": name,
-                    "width": project.sizes[i][0],
-                    "height": project.sizes[i][1],
-                    "oriented": False,
-                    "marks": count.get(name, 0),
-                    "needs": max(3 - count.get(name, 0), 0),
-                    "changed": None,
-                }
-                for i, name in enumerate(project.photographs.names)
-            ],
-            "points": [
-                {
-                    "name": name,
-                    "X": None,
-                    "sigma": None,
-                    "rays": rays.get(name, 0),
-                    "control": (
-                        {"X": list(control[name].xyz), "sigma": list(control[name].sigma)}
-                        if name in control
-                        else None
-                    ),
-                    "automatic": False,
-                }
-                for name in names
-            ],
-            "marks": [
-                self._shown_mark(mark) for mark in marking.marks.values() if mark.photograph in self._index
-            ],
-            "proposals": [],
-            "lines": [],
-            "bars": [
-                {"start": b.start, "end": b.end, "length": b.length, "sigma": b.sigma, "residual": None}
-                for b in self._bars()
-            ],
-            "adjustment": {
-                "state": "none",
-                "sigma0_px": None,
-                "redundancy": 0,
-                "worst": None,
-                "sentence": "",
-            },
-            "next": "Click the same point in two photographs.",
+            "photographs": self._shown_photographs(marks),
+            "points": self._shown_points(marks),
+            "marks": marks,
+            "proposals": [self._shown_proposal(key, proposal) for key, proposal in self._proposals.items()],
+            "lines": self._shown_lines(marks),
+            "bars": [self._shown_bar(bar) for bar in scale_bars(project, marking)],
+            "adjustment": self._shown_adjustment(),
+            "next": self._next_sentence(),
             "can_undo": self._saved.can_undo,
             "can_redo": self._saved.can_redo,
             "saved": str(self._saved.path),
-            "run": None,
+            "run": None if self._run is None else vars(self._run),
         }
+
+    def _next_sentence(self) -> str:
+        if self._failed:
+            return self._failed
+        missing = sorted({name for name, _ in self._marking.marks} - self._index.keys())
+        if missing:
+            return f"{missing[0]} has marks, but is not among the photographs; its marks are kept."
+        if self._following is None:
+            return "Click a point that several photographs show; the click is measured."
+        return sentence_of(self._following, self._proposals)
+
+    def _shown_photographs(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        project, following = self.project, self._following
+        count = np.bincount([mark["image"] for mark in marks], minlength=len(project.sizes))
+        oriented = np.zeros(len(project.sizes), dtype=bool)
+        needs = np.maximum(3 - count, 1)
+        if following is not None:
+            oriented, needs = following.estimate.oriented, marks_needed(following)[0]
+        return [
+            {
+                "index": i,
+                "name": name,
+                "width": project.sizes[i][0],
+                "height": project.sizes[i][1],
+                "oriented": bool(oriented[i]),
+                "marks": int(count[i]),
+                "needs": int(needs[i]),
+                "changed": self._changed_files.get(name),
+            }
+            for i, name in enumerate(project.photographs.names)
+        ]
+
+    def _shown_points(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        following, control = self._following, stated_points(self.project, self._marking)
+        rays: dict[str, int] = {}
+        by_hand = dict.fromkeys((*control, *self._marking.points), True)
+        for mark in marks:
+            rays[mark["point"]] = rays.get(mark["point"], 0) + 1
+        names = tuple(dict.fromkeys((*by_hand, *rays)))
+        number = {} if following is None else following.marked.point
+        shown = []
+        for name in names:
+            X = sigma = None
+            if following is not None and name in number:
+                j, adjustment = number[name], following.adjustment
+                if np.isfinite(following.estimate.points[j]).all():
+                    X = following.estimate.points[j].tolist()
+                if adjustment is not None and adjustment.points[j]:
+                    k = int(np.count_nonzero(adjustment.points[:j]))
+                    variance = np.diagonal(adjustment.adjustment.covariance.points[k])
+                    if np.isfinite(variance).all():
+                        sigma = np.sqrt(np.maximum(variance, 0.0)).tolist()
+            stated = control.get(name)
+            shown.append(
+                {
+                    "name": name,
+                    "X": X,
+                    "sigma": sigma,
+                    "rays": rays.get(name, 0),
+                    "control": (
+                        None if stated is None else {"X": list(stated.xyz), "sigma": list(stated.sigma)}
+                    ),
+                    "automatic": name not in by_hand,
+                }
+            )
+        return shown
 
     def _shown_mark(self, mark: Mark) -> dict[str, Any]:
         return {
@@ -372,22 +575,99 @@ class MarkingSession:
             "kind": mark.kind,
             "by": mark.by,
             "when": mark.when,
-            "residual": None,
-            "test": None,
+            **self._fit_of(mark.key, mark.x, mark.y),
             "automatic": False,
         }
 
-    def _stated(self) -> dict[str, StatedPoint]:
-        """Return the known points of the survey and those that the person states, which come first."""
-        stated = dict[str, StatedPoint]()
-        control = self.project.control
-        if control is not None:
-            for name, xyz, sigma in zip(control.names, control.xyz, control.sigma, strict=True):
-                if np.isfinite(xyz).all() and np.isfinite(sigma).all():
-                    stated[name] = StatedPoint(tuple(xyz.tolist()), tuple(sigma.tolist()))
-        return {**stated, **self._marking.control}
+    def _shown_automatic(self, key: tuple[str, str]) -> dict[str, Any]:
+        x, y, C = self._automatic[key]
+        return {
+            "image": self._index[key[0]],
+            "point": key[1],
+            "x": x,
+            "y": y,
+            "sigma": np.sqrt(np.diagonal(C)).tolist(),
+            "kind": "target",
+            "by": "measured",
+            "when": "",
+            **self._fit_of(key, x, y),
+            "automatic": True,
+        }
 
-    def _bars(self) -> list[ScaleBar]:
-        own = self._marking.bars
-        given = [b for b in self.project.bars if (b.start, b.end) not in own and (b.end, b.start) not in own]
-        return [*given, *own.values()]
+    def _fit_of(self, key: tuple[str, str], x: float, y: float) -> dict[str, Any]:
+        """Return residual and test of a mark, None as long as it is not adjusted where it is."""
+        fits = {} if self._following is None else self._following.residuals
+        if key not in fits or fits[key].place != (x, y):
+            return {"residual": None, "test": None}
+        fit = fits[key]
+        return {"residual": [or_none(v) for v in fit.residual], "test": or_none(fit.test)}
+
+    def _shown_proposal(self, key: tuple[str, str], proposal: Proposal) -> dict[str, Any]:
+        ellipse, measured = proposal.predicted.ellipse, proposal.measured
+        x, y = proposal.predicted.xy.tolist() if measured is None else (measured.x, measured.y)
+        sigma = None if measured is None else np.sqrt(np.diagonal(measured.covariance)).tolist()
+        return {
+            "image": self._index[key[0]],
+            "point": key[1],
+            "x": x,
+            "y": y,
+            "ellipse": {"a": ellipse.a, "b": ellipse.b, "angle_deg": ellipse.angle_deg},
+            "measured": measured is not None,
+            "kind": None if measured is None else measured.kind,
+            "sigma": sigma,
+        }
+
+    def _shown_lines(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return the epipolar lines of the points with one mark and without coordinates."""
+        guide = self._guide()
+        if guide is None or self._following is None:
+            return []
+        of_point: dict[str, list[dict[str, Any]]] = {}
+        for mark in marks:
+            of_point.setdefault(mark["point"], []).append(mark)
+        control, lines = stated_points(self.project, self._marking), []
+        for name, own in of_point.items():
+            if len(own) == 1 and name not in control and not own[0]["automatic"]:
+                at = np.array([own[0]["x"], own[0]["y"]])
+                for j, path in guide.lines(own[0]["image"], at):
+                    lines.append({"image": j, "point": name, "xy": np.round(path, 2).tolist()})
+        return lines
+
+    def _shown_bar(self, bar: ScaleBar) -> dict[str, Any]:
+        residual, following = None, self._following
+        if following is not None and {bar.start, bar.end} <= following.marked.point.keys():
+            a, b = (following.estimate.points[following.marked.point[name]] for name in (bar.start, bar.end))
+            residual = or_none(float(np.linalg.norm(b - a)) - bar.length)
+        shown: dict[str, Any] = {"start": bar.start, "end": bar.end}
+        return {**shown, "length": bar.length, "sigma": bar.sigma, "residual": residual}
+
+    def _shown_adjustment(self) -> dict[str, Any]:
+        following = self._following
+        marks = None if following is None else following.adjustment
+        running = self._followed < self._changes
+        state = "running" if running else "none" if marks is None else "done"
+        shown: dict[str, Any] = {
+            "state": state,
+            "sigma0_px": None,
+            "redundancy": 0,
+            "worst": None,
+            "sentence": "",
+        }
+        if marks is None:
+            return shown
+        a, worst = marks.adjustment, marks.worst
+        shown["sigma0_px"] = or_none(a.sigma0_px) if a.redundancy > 0 else None
+        shown["redundancy"] = a.redundancy
+        if worst is not None:
+            shown["worst"] = {
+                "image": self._index[worst.photograph],
+                "point": worst.point,
+                "test": worst.test,
+                "flagged": worst.flagged,
+            }
+            fits = "does not fit" if worst.flagged else "fits least"
+            shown["sentence"] = (
+                f"{worst.point} in {worst.photograph} {fits} (|w| = {worst.test:.1f}); sigma0 "
+                f"{a.sigma0_px:.2f} px, redundancy {a.redundancy}."
+            )
+        return shown

@@ -1,0 +1,243 @@
+"""Adjustment of the marks: residuals, sigma0, and the mark that fits least.
+
+Everything that marks determine is adjusted together. The free parameters of the cameras are observed: as well as
+they are known of any camera, so that few marks bend nothing, and many determine them. Data snooping rejects marks;
+where it would reject many, few marks are too good to be tested, and all take part. The mark that fits least is the rejected one with the largest test value, or else the accepted one.
+Predicted places follow from the joint covariance of points, photographs and cameras.
+
+Source: Baarda (1968) for the test; Foerstner and Wrobel (2016), sec. 3.2, for the joint covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sfm.adjustment.covariance import Marginal, marginal_of
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import AdjustmentOptions, adjust
+from sfm.model.camera import (
+    KNOWN_WITHOUT,
+    Camera,
+    corner_shift,
+    parameter_jacobian,
+    pixel_from_tangents,
+    pixel_jacobian,
+)
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.distortion.models import Role
+from sfm.model.network import InteriorObservations, Network
+from sfm.model.reduced_network import merge_estimate, reduce_network
+from sfm.products.marking.orienting import MIN_KNOWN, determined_part
+from sfm.survey.free_parameters import C_SIGMA
+
+MAX_STEPS, TOLERANCE = 40, 1e-3  # marks that were only begun determine some parameters hardly at all
+MOST_REJECTED = 0.1  # of the marks; measured marks are hardly ever wrong
+PRIOR_REDUNDANCY = 10.0  # with which the stated standard deviations count against the residuals of few marks
+
+
+@dataclass(frozen=True)
+class WorstMark:
+    """The mark that fits least."""
+
+    photograph: str
+    point: str
+    test: float  # its largest |w|
+    flagged: bool  # whether the test rejects it
+
+
+@dataclass(frozen=True)
+class MarkAdjustment:
+    """Adjustment of the part of a network that marks determine."""
+
+    adjustment: Adjustment
+    estimate: Estimate  # of the whole network, NaN outside the part
+    images: BoolArray  # photographs in the adjustment, (m,)
+    points: BoolArray  # points in the adjustment, (n,)
+    rows: IntArray  # image points of the network in the adjustment, in its order
+
+    @property
+    def worst(self) -> WorstMark | None:
+        """The mark that fits least, if the redundancy allows a test."""
+        a = self.adjustment
+        if a.redundancy <= 0 or not len(a.standardised):
+            return None
+        test = np.nanmax(np.where(np.isfinite(a.standardised), np.abs(a.standardised), 0.0), axis=1)
+        rejected = a.rejected
+        k = int(np.argmax(np.where(rejected, test, -1.0) if rejected.any() else test))
+        seen = a.network.image_points
+        return WorstMark(
+            a.network.images[seen.image[k]],
+            a.network.points[seen.point[k]],
+            float(test[k]),
+            bool(rejected[k]),
+        )
+
+    @property
+    def variance_factor(self) -> float:
+        """Factor on cofactors: the residuals, and as long as there are few, the stated precision."""
+        a = self.adjustment
+        vPv = a.sigma0**2 * a.redundancy if a.redundancy > 0 and np.isfinite(a.sigma0) else 0.0
+        return (PRIOR_REDUNDANCY + vPv) / (PRIOR_REDUNDANCY + max(a.redundancy, 0))
+
+    @cached_property
+    def joint(self) -> JointPrecision | None:
+        """Joint precision of what was adjusted; None if the normal equations cannot be solved."""
+        try:
+            return JointPrecision(self)
+        except (GeometryError, np.linalg.LinAlgError):
+            return None
+
+
+def adjust_marks(
+    network: Network,
+    estimate: Estimate,
+    cameras: tuple[Camera, ...],
+    *,
+    in_control: bool,
+    false_alarm: float,
+) -> MarkAdjustment | None:
+    """Return the adjustment of everything that marks determine; None if that is nothing yet.
+
+    Args:
+        network: marks, control and scale bars.
+        estimate: what is oriented.
+        cameras: what is known of the cameras; they state which parameters are free.
+        in_control: whether the estimate is in the frame of the control.
+        false_alarm: probability that a right set of marks is called wrong.
+    """
+    images, points, used = determined_part(network, estimate)
+    if not images.any():
+        return None
+    part, start = reduce_network(network, estimate, images, points, used)
+    control = in_control and len(part.control.complete) >= MIN_KNOWN
+    part = part.with_given(_observed_cameras(part, cameras))
+    for reject in ("tau", "none"):
+        try:
+            adjustment = adjust(
+                part,
+                start,
+                datum="control" if control else "free",
+                reject=reject,
+                false_alarm=false_alarm,
+                options=AdjustmentOptions(method="gauss-newton", max_iterations=MAX_STEPS, tolerance=TOLERANCE),
+            )
+        except (GeometryError, np.linalg.LinAlgError):
+            continue
+        if adjustment.undetermined or not adjustment.estimate.oriented.all():
+            continue
+        if reject == "tau" and not adjustment.converged:
+            continue
+        if reject == "tau" and adjustment.rejected.sum() > max(1, MOST_REJECTED * len(adjustment.rejected)):
+            continue
+        whole = merge_estimate(adjustment.estimate, images, points)
+        return MarkAdjustment(adjustment, whole, images, points, np.flatnonzero(used))
+    return None
+
+
+def _observed_cameras(network: Network, cameras: tuple[Camera, ...]) -> InteriorObservations:
+    """Return the free parameters of the cameras of a network, with what is known of any camera."""
+    rows = []
+    for a in np.unique(network.camera).tolist():
+        camera = cameras[a]
+        focal = camera.plays(Role.FOCAL)
+        for s in np.flatnonzero(camera.free).tolist():
+            value, unit = float(camera.parameters[s]), 1e-6
+            sigma = unit * KNOWN_WITHOUT / max(corner_shift(camera, s, unit), 1e-12)
+            rows.append((a, s, value, C_SIGMA * abs(value) if focal[s] else sigma))
+    columns = list(zip(*rows, strict=True)) or [(), (), (), ()]
+    return InteriorObservations(
+        np.array(columns[0], dtype=np.int64),
+        np.array(columns[1], dtype=np.int64),
+        np.array(columns[2], dtype=float),
+        np.array(columns[3], dtype=float),
+    )
+
+
+class JointPrecision:
+    """Joint covariance of poses, interior orientation and points of an adjustment of marks.
+
+    A place is a function of the unknowns: X0 and a small rotation of its photograph, free parameters of its
+    camera, and its point.
+    """
+
+    def __init__(self, marks: MarkAdjustment) -> None:
+        """Compute the covariance.
+
+        Args:
+            marks: the adjustment.
+
+        Raises:
+            GeometryError: the normal equations cannot be solved.
+        """
+        self._marks, a = marks, marks.adjustment
+        m: Marginal = marginal_of(a, cross=False)
+        self._layout = m.layout
+        count = len(a.network.images)
+        columns, self._by = m.layout.photograph_terms(m.optimum.state, np.arange(count))
+        self._interior = [np.asarray(column, dtype=np.int64) for column in m.layout.interior_column]
+        unknowns = np.concatenate([columns.ravel(), *self._interior])
+        self._width = columns.shape[1]
+        self._first = np.cumsum([columns.size, *(len(column) for column in self._interior)])
+        self.size = len(unknowns)
+        everything = m.joint(unknowns, np.arange(len(a.network.points)))
+        sigma0 = a.sigma0 if a.sigma0 > 0 and np.isfinite(a.sigma0) else 1.0
+        self._covariance = everything * (marks.variance_factor / sigma0**2)
+        self._image = np.cumsum(marks.images) - 1
+        self._point = np.cumsum(marks.points) - 1
+
+    def of_unknowns(
+        self, i: int, camera: int, X: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Return where a photograph shows a point, and its derivatives; None if it does not.
+
+        Args:
+            i: index of a photograph of the whole network, which is in the adjustment.
+            camera: its camera.
+            X: object point, (3,).
+
+        Returns:
+            Place, px, (2,); derivatives by the unknowns without points, (2, u), and by X, (2, 3).
+        """
+        estimate = self._marks.estimate
+        lens, R = estimate.cameras[camera], estimate.rotation[i]
+        U = R.T @ (X - estimate.position[i])
+        if not U[2] < 0:
+            return None
+        uv = -U[:2] / U[2]
+        xy = pixel_from_tangents(lens, uv[None])
+        if not np.isfinite(xy).all():
+            return None
+        by_U = np.column_stack([-np.eye(2) / U[2], U[:2] / U[2] ** 2])
+        by_uv = pixel_jacobian(lens, xy)[0] @ by_U
+        by_X = by_uv @ R.T
+        by_pose = np.hstack([-by_X, by_uv @ skew(U[None])[0]])
+        by = np.zeros((2, self.size))
+        k, width = int(self._image[i]), self._width
+        by[:, k * width : (k + 1) * width] = by_pose @ self._by[k]
+        free = self._layout.interior_free[camera]
+        if len(self._interior[camera]):
+            first = int(self._first[camera])
+            by[:, first : first + len(free)] = parameter_jacobian(lens, uv[None])[0][:, free]
+        return xy[0], by, by_X
+
+    def of_adjusted(self, j: int, by: FloatArray, by_X: FloatArray) -> FloatArray:
+        """Return the covariance of a place of an adjusted point, px^2, (2, 2).
+
+        Args:
+            j: index of the point in the whole network.
+            by: derivatives by the unknowns, (2, u).
+            by_X: derivatives by the point, (2, 3).
+        """
+        at = self.size + 3 * int(self._point[j])
+        rows = np.concatenate([np.arange(self.size), np.arange(at, at + 3)])
+        J = np.hstack([by, by_X])
+        return np.asarray(J @ self._covariance[np.ix_(rows, rows)] @ J.T)
+
+    def of_new(self, J: FloatArray) -> FloatArray:
+        """Return the covariance of a place that depends on the unknowns alone, px^2, (2, 2)."""
+        return np.asarray(J @ self._covariance[: self.size, : self.size] @ J.T)
