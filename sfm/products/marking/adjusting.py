@@ -2,7 +2,8 @@
 
 Everything that marks determine is adjusted together. The free parameters of the cameras are observed: as well as
 they are known of any camera, so that few marks bend nothing, and many determine them. Data snooping rejects marks;
-where it would reject many, few marks are too good to be tested, and all take part. The mark that fits least is the rejected one with the largest test value, or else the accepted one.
+where it would reject many, few marks are too good to be tested, and all take part. The mark that contradicts is the one without which all others fit best. If none does, the one with the largest test
+value fits least.
 Predicted places follow from the joint covariance of points, photographs and cameras.
 
 Source: Baarda (1968) for the test; Foerstner and Wrobel (2016), sec. 3.2, for the joint covariance.
@@ -27,6 +28,7 @@ from sfm.model.camera import (
     pixel_jacobian,
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.distributions import level_of_single, t_ppf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.distortion.models import Role
@@ -35,6 +37,7 @@ from sfm.model.reduced_network import merge_estimate, reduce_network
 from sfm.products.marking.orienting import MIN_KNOWN, determined_part
 from sfm.survey.free_parameters import C_SIGMA
 
+MOST_DOUBTED = 4  # marks that are left out for trial
 MAX_STEPS, TOLERANCE = 40, 1e-3  # marks that were only begun determine some parameters hardly at all
 MOST_REJECTED = 0.1  # of the marks; measured marks are hardly ever wrong
 PRIOR_REDUNDANCY = 10.0  # with which the stated standard deviations count against the residuals of few marks
@@ -59,6 +62,7 @@ class MarkAdjustment:
     images: BoolArray  # photographs in the adjustment, (m,)
     points: BoolArray  # points in the adjustment, (n,)
     rows: IntArray  # image points of the network in the adjustment, in its order
+    named: int | None = None  # of these, the one that contradicts the others
 
     @property
     def worst(self) -> WorstMark | None:
@@ -67,14 +71,13 @@ class MarkAdjustment:
         if a.redundancy <= 0 or not len(a.standardised):
             return None
         test = np.nanmax(np.where(np.isfinite(a.standardised), np.abs(a.standardised), 0.0), axis=1)
-        rejected = a.rejected
-        k = int(np.argmax(np.where(rejected, test, -1.0) if rejected.any() else test))
+        k = int(np.argmax(test)) if self.named is None else self.named
         seen = a.network.image_points
         return WorstMark(
             a.network.images[seen.image[k]],
             a.network.points[seen.point[k]],
             float(test[k]),
-            bool(rejected[k]),
+            self.named is not None,
         )
 
     @property
@@ -116,27 +119,76 @@ def adjust_marks(
     part, start = reduce_network(network, estimate, images, points, used)
     control = in_control and len(part.control.complete) >= MIN_KNOWN
     part = part.with_given(_observed_cameras(part, cameras))
-    for reject in ("tau", "none"):
+    options = AdjustmentOptions(method="gauss-newton", max_iterations=MAX_STEPS, tolerance=TOLERANCE)
+
+    def adjusted(values: Estimate, reject: str, rejected: BoolArray | None = None) -> Adjustment | None:
         try:
             adjustment = adjust(
                 part,
-                start,
+                values,
                 datum="control" if control else "free",
                 reject=reject,
                 false_alarm=false_alarm,
-                options=AdjustmentOptions(method="gauss-newton", max_iterations=MAX_STEPS, tolerance=TOLERANCE),
+                rejected=rejected,
+                options=options,
+            )
+        except (GeometryError, np.linalg.LinAlgError):
+            return None
+        determined = not adjustment.undetermined and bool(adjustment.estimate.oriented.all())
+        return adjustment if determined else None
+
+    everything = adjusted(start, "none")
+    if everything is None:
+        return None
+    chosen, named = everything, None
+    if _is_doubtful(everything, false_alarm):
+        named = _contradicting(part, everything, options)
+        without = np.zeros(len(everything.rejected), dtype=bool)
+        without[[] if named is None else named] = True
+        tested = adjusted(everything.estimate, "tau", without)
+        most = max(1, MOST_REJECTED * len(without))
+        if tested is not None and tested.converged and 0 < tested.rejected.sum() <= most:
+            chosen = tested
+    whole = merge_estimate(chosen.estimate, images, points)
+    return MarkAdjustment(chosen, whole, images, points, np.flatnonzero(used), named)
+
+
+def _contradicting(network: Network, adjustment: Adjustment, options: AdjustmentOptions) -> int | None:
+    """Return the image point without which all others fit best, of those that fit least and the same points.
+
+    The test values of the image points of one point are correlated, and those of a gross error are not linear.
+    """
+    seen = network.image_points
+    test = np.nan_to_num(np.abs(adjustment.standardised)).max(axis=1)
+    first = np.argsort(-test)[:MOST_DOUBTED]
+    doubted = np.union1d(first, np.flatnonzero(seen.point == seen.point[first[0]]))
+    best: tuple[float, int] | None = None
+    for k in doubted.tolist():
+        kept = np.arange(len(seen)) != k
+        other = replace(network, image_points=seen.select(kept))
+        images, points, used = determined_part(other, adjustment.estimate)
+        if not images.all():
+            continue
+        part, start = reduce_network(other, adjustment.estimate, images, points, used)
+        try:
+            without = adjust(
+                part, start, datum=adjustment.datum, reject="none", covariance=False, options=options
             )
         except (GeometryError, np.linalg.LinAlgError):
             continue
-        if adjustment.undetermined or not adjustment.estimate.oriented.all():
-            continue
-        if reject == "tau" and not adjustment.converged:
-            continue
-        if reject == "tau" and adjustment.rejected.sum() > max(1, MOST_REJECTED * len(adjustment.rejected)):
-            continue
-        whole = merge_estimate(adjustment.estimate, images, points)
-        return MarkAdjustment(adjustment, whole, images, points, np.flatnonzero(used))
-    return None
+        if without.redundancy > 0 and np.isfinite(without.sigma0):
+            best = min(best or (np.inf, k), (without.sigma0, k))
+    return None if best is None else best[1]
+
+
+def _is_doubtful(adjustment: Adjustment, false_alarm: float) -> bool:
+    """Return whether the test of all marks together rejects one, by Pope's tau."""
+    r = adjustment.redundancy
+    if r < 2 or not adjustment.sigma0 > 0:
+        return False
+    t = float(t_ppf(1 - level_of_single(false_alarm, adjustment.standardised.size) / 2, r - 1))
+    limit = t * np.sqrt(r) / np.sqrt(r - 1 + t * t)
+    return bool(np.nanmax(np.abs(adjustment.tau)) > limit)
 
 
 def _observed_cameras(network: Network, cameras: tuple[Camera, ...]) -> InteriorObservations:

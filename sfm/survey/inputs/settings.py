@@ -321,6 +321,12 @@ class ObservationSettings(Section):
     sigma_px: Length | None = None  # standard deviation of rows that state none; else that of [adjust]
 
 
+class MarksSettings(Section):
+    """[marks]: image points that a person measured with kolinear mark, beside everything else."""
+
+    file: File  # the marks file, with the control and scale bars that the person states
+
+
 class PointSettings(Section):
     """[[point]]: a natural point that a person names in a photograph, and that is measured in all others."""
 

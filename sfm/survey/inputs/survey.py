@@ -47,6 +47,7 @@ from sfm.survey.inputs.given_values import (
     read_start_cameras,
 )
 from sfm.survey.inputs.ground_control import GroundControl, read_ground_control
+from sfm.survey.inputs.marks_file import Marking, image_points_of, read_marks
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -296,6 +297,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         return None if name is None else reader(file.beside(name))
 
     equipment = _given_by_equipment(file)
+    marking = read(read_marks, file.marked.file if file.marked else None)
     control = (
         read_ground_control(file.beside(file.control.file), file.control, file.unit) if file.control else None
     )
@@ -309,7 +311,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         datum=file.datum,
         adjust=file.adjust,
         compare=file.compare,
-        control=None if control is None else control.points,
+        control=_with_stated(None if control is None else control.points, marking),
         exterior=read(read_observed_exterior, file.exterior.file if file.exterior else None),
         exif_sigma_m=file.exif_sigma_m,
         rigs=file.rigs,
@@ -330,8 +332,9 @@ def survey_of_file(file: SurveyFile) -> Survey:
         + equipment.frames,
         equipment=equipment.placed,
         scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
-        + equipment.bars,
-        observations=_given_image_points(file, control),
+        + equipment.bars
+        + (() if marking is None else tuple(marking.bars.values())),
+        observations=_given_image_points(file, control, marking),
         marks=file.marks,
         diameters=read(read_diameters, file.targets.diameters),
         masks=file.masks,
@@ -344,8 +347,24 @@ def survey_of_file(file: SurveyFile) -> Survey:
     )
 
 
+def _with_stated(control: KnownPoints | None, marking: Marking | None) -> KnownPoints | None:
+    """Return the control with the coordinates that a person states in the marks file, which come first."""
+    stated = None if marking is None else marking.known_points()
+    if control is None or stated is None:
+        return control or stated
+    kept = control.select(~np.isin(control.names, stated.names))
+    n = len(stated.names)
+    return KnownPoints(
+        (*kept.names, *stated.names),
+        np.vstack([kept.xyz, stated.xyz]),
+        np.vstack([kept.sigma, stated.sigma]),
+        None if kept.covariances is None else np.vstack([kept.covariances, np.zeros((n, 3))]),
+        None if kept.check is None else np.vstack([kept.check, np.zeros((n, 3), dtype=bool)]),
+    )
+
+
 def _given_image_points(
-    file: SurveyFile, control: GroundControl | None
+    file: SurveyFile, control: GroundControl | None, marking: Marking | None
 ) -> Observations | tuple[Observations, ...] | None:
     """Return the image points that a survey file gives, in place of photographs or beside them.
 
@@ -359,8 +378,17 @@ def _given_image_points(
         )
     tables = tuple(
         replace(read_image_points(file.beside(table.file)), sigma_px=table.sigma_px)
-        for table in tables_of(file.observations)
+        for table in (file.image_points, *file.more_image_points)
+        if table is not None
     )
+    if marking is not None and file.marked is not None:
+        if file.image_points is not None:
+            raise SurveyFileError(
+                f"{file.source}: [observations] stands in place of photographs, and [marks] beside them; write "
+                "[[observations]]"
+            )
+        of_marks = image_points_of(marking, file.beside(file.marked.file), file.adjust.sigma_px)
+        tables += () if of_marks is None else (of_marks,)
     if control is not None and control.image_points is not None:
         if isinstance(file.observations, ObservationSettings):
             raise SurveyFileError(

@@ -29,6 +29,7 @@ from sfm.survey.inputs.settings import (
     EquipmentSettings,
     ExteriorSettings,
     Head,
+    MarksSettings,
     ObservationSettings,
     ObservationTableSettings,
     PlateSettings,
@@ -65,6 +66,7 @@ class SurveyFile(Section):
     more_image_points: Annotated[  # beside them
         tuple[ObservationSettings, ...], Field(strict=False, max_length=MAX_TABLES, alias=BESIDE)
     ] = ()
+    marked: MarksSettings | None = Field(None, alias="marks")
     marks: Annotated[tuple[PointSettings, ...], Field(strict=False, alias="point")] = ()
     observation_tables: Annotated[
         tuple[ObservationTableSettings, ...],
@@ -116,7 +118,8 @@ class SurveyFile(Section):
     @property
     def observations(self) -> ObservationSettings | tuple[ObservationSettings, ...] | None:
         """Tables of image points: one in place of photographs, or several beside them."""
-        return self.image_points or self.more_image_points or None
+        marked = () if self.marked is None else (ObservationSettings(file=self.marked.file),)
+        return self.image_points or (*self.more_image_points, *marked) or None
 
     @property
     def start_points(self) -> str | None:
