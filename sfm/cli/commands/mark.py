@@ -52,7 +52,8 @@ def mark(
         bool,
         typer.Option(
             "--allow-outside",
-            help="Let the survey file refer to files outside its folder; only for survey files that you trust.",
+            help="Let the survey file refer to files outside its folder; only for survey files that you "
+            "trust.",
         ),
     ] = False,
 ) -> None:

@@ -1,10 +1,10 @@
 """Adjustment of the marks: residuals, sigma0, and the mark that fits least.
 
-Everything that marks determine is adjusted together. The free parameters of the cameras are observed: as well as
-they are known of any camera, so that few marks bend nothing, and many determine them. Data snooping rejects marks;
-where it would reject many, few marks are too good to be tested, and all take part. The mark that contradicts is the one without which all others fit best. If none does, the one with the largest test
-value fits least.
-Predicted places follow from the joint covariance of points, photographs and cameras.
+Everything that marks determine is adjusted together. The free parameters of the cameras are observed: as
+well as they are known of any camera, so that few marks bend nothing, and many determine them. Data snooping
+rejects marks; where it would reject many, few marks are too good to be tested, and all take part. The mark
+that contradicts is the one without which all others fit best. If none does, the one with the largest test
+value fits least. Predicted places follow from the joint covariance of points, photographs and cameras.
 
 Source: Baarda (1968) for the test; Foerstner and Wrobel (2016), sec. 3.2, for the joint covariance.
 """
@@ -28,10 +28,10 @@ from sfm.model.camera import (
     pixel_jacobian,
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.distortion.models import Role
 from sfm.model.distributions import level_of_single, t_ppf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.distortion.models import Role
 from sfm.model.network import InteriorObservations, Network
 from sfm.model.reduced_network import merge_estimate, reduce_network
 from sfm.products.marking.orienting import MIN_KNOWN, determined_part
@@ -156,7 +156,8 @@ def adjust_marks(
 def _contradicting(network: Network, adjustment: Adjustment, options: AdjustmentOptions) -> int | None:
     """Return the image point without which all others fit best, of those that fit least and the same points.
 
-    The test values of the image points of one point are correlated, and those of a gross error are not linear.
+    The test values of the image points of one point are correlated, and those of a gross error are not
+    linear.
     """
     seen = network.image_points
     test = np.nan_to_num(np.abs(adjustment.standardised)).max(axis=1)

@@ -1,13 +1,13 @@
 """What a click measures: a target, a ring with its code, a saddle, a corner, a cross or a window.
 
-A person points to a feature within a few pixels. The feature is measured by the method that surveys use for it:
-targets and rings by the fit of a blurred ellipse, saddles by the intersection of their edges, corners by the fit
-of two blurred edges, natural points by the interest operator. A cross is its own image after half a turn, so least
-squares matching of its window with the turned one gives its centre. A measurement that depends on the size of its
-window is refused, since another feature is in it.
+A person points to a feature within a few pixels. The feature is measured by the method that surveys use for
+it: targets and rings by the fit of a blurred ellipse, saddles by the intersection of their edges, corners
+by the fit of two blurred edges, natural points by the interest operator. A cross is its own image after
+half a turn, so least squares matching of its window with the turned one gives its centre. A measurement
+that depends on the size of its window is refused, since another feature is in it.
 
-Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken; Loy and Zelinsky (2003), IEEE PAMI
-25(8), for points of symmetry.
+Source: Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken; Loy and Zelinsky (2003),
+IEEE PAMI 25(8), for points of symmetry.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def measure_click(
 
 def _part(photograph: AnyArray, at: FloatArray, half: int) -> _Part:
     height, width = photograph.shape
-    left, top = (max(int(round(float(v))) - half, 0) for v in at)
+    left, top = (max(round(float(v)) - half, 0) for v in at)
     right, bottom = min(left + 2 * half + 1, width), min(top + 2 * half + 1, height)
     pixels = np.ascontiguousarray(photograph[top:bottom, left:right])
     origin = np.array([left, top], dtype=float)
@@ -374,8 +374,8 @@ def _matched(
     match = match_points(left.pixels, right.pixels, left.at[None], settings, xy_right=right.at[None])
     if not match.good[0]:
         raise GeometryError(
-            f"mark: the window of the point is not matched within {reach:.0f} px of {at[0]:.1f}, {at[1]:.1f} px "
-            f"({match.reason[0]})"
+            f"mark: the window of the point is not matched within {reach:.0f} px of {at[0]:.1f}, "
+            f"{at[1]:.1f} px ({match.reason[0]})"
         )
     half, xy = window_px // 2, match.right[0]
     box = half * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
@@ -387,7 +387,7 @@ def _matched(
 
 def _window_covariance(part: _Part, xy: FloatArray, half: int) -> FloatArray | None:
     """Return the covariance with which least squares matching finds a window, px^2; None without texture."""
-    column, row = (int(round(float(v))) for v in xy)
+    column, row = (round(float(v)) for v in xy)
     window = part.grey[max(row - half, 0) : row + half + 1, max(column - half, 0) : column + half + 1]
     if min(window.shape) < half + 1:
         return None

@@ -1,8 +1,8 @@
 """What the photographs themselves say of orientations that a few marks leave open.
 
-Five marks in two photographs, and three known points in one, fit several orientations. The right one is that in
-which other features of the photographs lie on their epipolar lines: natural features that look alike, and the
-targets, which need not be told apart. Hits by chance are subtracted.
+Five marks in two photographs, and three known points in one, fit several orientations. The right one is
+that in which other features of the photographs lie on their epipolar lines: natural features that look
+alike, and the targets, which need not be told apart. Hits by chance are subtracted.
 
 Source: Longuet-Higgins (1981), Nature 293, for the epipolar constraint.
 """
@@ -20,8 +20,8 @@ from sfm.model.camera import Camera, project, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.detect import find_targets
 
-# Distances from an epipolar line, and from the place of a point, that a few marks give: the mean of the hits within
-# each counts near ones most, and those far off with a lens that is not known yet.
+# Distances from an epipolar line, and from the place of a point, that a few marks give: the mean of the
+# hits within each counts near ones most, and those far off with a lens that is not known yet.
 NEAR_PX, PLACE_PX = (2.0, 4.0, 8.0), (5.0, 10.0, 20.0)
 Pose = tuple[FloatArray, FloatArray]  # projection centre (3,) and rotation, image to object axes, (3, 3)
 
@@ -104,7 +104,7 @@ class PictureEvidence:
 
 
 def _distances(E: FloatArray, first: FloatArray, second: FloatArray, *, pairs: bool) -> FloatArray:
-    """Return the distances of rays from the epipolar lines of others, tangents: of pairs, (k,), or all, (k, l)."""
+    """Return the distances of rays from epipolar lines, tangents: of pairs, (k,), or all, (k, l)."""
     p, q = (np.column_stack([uv, -np.ones(len(uv))]) for uv in (first, second))
     lines = p @ E.T
     length = np.hypot(lines[:, 0], lines[:, 1])

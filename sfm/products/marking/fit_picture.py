@@ -37,7 +37,7 @@ def picture_of_mark(photograph: AnyArray, x: float, y: float, outline: FloatArra
 
     def at(xy: FloatArray) -> AnyArray:
         place = (np.asarray(xy) - (left, top) + 0.5) * ENLARGEMENT - 0.5
-        return np.round(place * 2**SHIFT).astype(np.int32)
+        return np.asarray(np.round(place * 2**SHIFT), dtype=np.int32)
 
     if len(outline):
         cv2.polylines(picture, [at(outline)], False, OUTLINE, 1, cv2.LINE_AA, SHIFT)

@@ -1,7 +1,7 @@
 """What follows from the marks: orientation, points, precision, and places in other photographs.
 
-It is computed anew from the marks, so that the same marks always give the same. Where marks were only added, the
-last orientation is continued.
+It is computed anew from the marks, so that the same marks always give the same. Where marks were only
+added, the last orientation is continued.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm.model.camera import Camera
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.display import counted
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
@@ -169,7 +170,7 @@ def network_of_marks(project: MarkedProject, marking: Marking) -> MarkedNetwork:
 def _automatic(
     project: MarkedProject,
 ) -> list[tuple[tuple[str, str], tuple[float, float], FloatArray]]:
-    """Return the image points of a result, without those of natural texture, which has too many to look at."""
+    """Return the image points of a result, without natural texture, which has too many to look at."""
     if project.solution is None:
         return []
     network = project.solution.network
@@ -370,7 +371,7 @@ def sentence_of(following: Following, proposals: Mapping[tuple[str, str], Propos
         return f"Check {worst.point} in {worst.photograph}: it does not fit the other marks."
     waiting = sum(proposal.measured is not None for proposal in proposals.values())
     if waiting:
-        return f"{waiting} proposed mark{'s' if waiting > 1 else ''}: Enter accepts those of the point, x refuses."
+        return f"{counted(waiting, 'proposed mark')}: Enter accepts those of the point, x refuses."
     for i in orientation.open:
         return f"{names[i]} has two orientations that fit its marks: mark one more point."
     if not estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
@@ -381,15 +382,13 @@ def sentence_of(following: Following, proposals: Mapping[tuple[str, str], Propos
             waiting_photographs[np.lexsort((-of_known[waiting_photographs], needed[waiting_photographs]))[0]]
         )
         more = "more " if of_known[i] else ""
-        return (
-            f"{names[i]} needs {needed[i]} {more}mark{'s' if needed[i] > 1 else ''} of known points "
-            "until it is oriented."
-        )
+        marks = counted(int(needed[i]), f"{more}mark")
+        return f"{names[i]} needs {marks} of known points until it is oriented."
     rays = np.bincount(network.image_points.point, minlength=len(network.points))
     short = [network.points[j] for j in np.flatnonzero((rays > 0) & (rays < 3)).tolist()]
     if short:
         more_rays = 3 - int(rays[network.points.index(short[0])])
-        return f"Point {short[0]} needs {more_rays} more ray{'s' if more_rays > 1 else ''} to be checked."
+        return f"Point {short[0]} needs {counted(more_rays, 'more ray')} to be checked."
     return "All photographs are oriented: find everything else automatically."
 
 
@@ -403,7 +402,7 @@ def _pair_sentence(following: Following) -> str:
     if not common[i, j]:
         return "Mark the same point in a second photograph: five common points orient two photographs."
     more = max(MIN_COMMON - int(common[i, j]), 1)
-    return f"{names[i]} and {names[j]} need {more} more common point{'s' if more > 1 else ''} until they are oriented."
+    return f"{names[i]} and {names[j]} need {counted(more, 'more common point')} until they are oriented."
 
 
 def without_moved(last: Following, marking: Marking, project: MarkedProject) -> Following | None:

@@ -1,8 +1,9 @@
 """Guidance: where the points that are marked should be in the other photographs, and what is there.
 
-A point with one ray lies on its epipolar lines. With two rays, or known coordinates, it has a predicted place in
-every oriented photograph, with an error ellipse from the joint covariance of everything. What is there is measured
-as it was at the marks: targets, corners and crosses by their fits, natural points by matching their windows.
+A point with one ray lies on its epipolar lines. With two rays, or known coordinates, it has a predicted
+place in every oriented photograph, with an error ellipse from the joint covariance of everything. What is
+there is measured as it was at the marks: targets, corners and crosses by their fits, natural points by
+matching their windows.
 
 Source: Kraus (2007), sec. 4.3, for epipolar lines; Luhmann et al. (2020), sec. 6.7 (driveback).
 """
@@ -32,7 +33,7 @@ CONTAINED, GATE = (
     0.001,
 )  # probability that a place is outside its ellipse, and outside where it is measured
 LEAST_REACH_PX, MOST_REACH_PX = 3.0, 40.0  # around predicted places in which is measured
-MOST_SIZES, MOST_RATIO = 3.0, 2.0  # reach in half sides of a target, and change of its size between photographs
+MOST_SIZES, MOST_RATIO = 3.0, 2.0  # reach in sizes of a target, and change of its size
 BORDER_PX = 4.0
 NEAREST, FARTHEST = 0.3, 3.0  # of the depths of known points, within which a ray is shown
 BEYOND = 0.1  # of its sides, by which a line may leave a photograph
@@ -119,7 +120,7 @@ class Guide:
         return predicted
 
     def _through_rays(self, rays: Sequence[int], X: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return the derivatives of an intersected point by the unknowns, (3, u), and its cofactors, (3, 3)."""
+        """Return the derivatives of an intersection by the unknowns, (3, u), and its cofactors, (3, 3)."""
         joint = None if self.marks is None else self.marks.joint
         if joint is None or len(rays) < 2:
             return None
@@ -137,7 +138,7 @@ class Guide:
             Q = np.linalg.inv(N)
         except np.linalg.LinAlgError:
             return None
-        return -Q @ right, Q
+        return -Q @ right, np.asarray(Q, dtype=float)
 
     def _given_covariance(self, point: int) -> FloatArray:
         control = self.network.control

@@ -1,9 +1,10 @@
 """Orientation by hand: from three marks of known points in a photograph, or five common points of two.
 
-Marks are few and precise. Four or more known points orient a photograph by the robust resection of surveys; three
-by the closed form, whose up to four solutions the photographs decide. Where nothing is known, five or more points
-that two photographs share orient them relative to one another; again the photographs decide between the
-solutions. What is oriented gives points, which orient further photographs. The result starts the adjustment.
+Marks are few and precise. Four or more known points orient a photograph by the robust resection of surveys;
+three by the closed form, whose up to four solutions the photographs decide. Where nothing is known, five or
+more points that two photographs share orient them relative to one another; again the photographs decide
+between the solutions. What is oriented gives points, which orient further photographs. The result starts
+the adjustment.
 
 Source: Fischler and Bolles (1981), Comm. ACM 24(6); Nister (2004), IEEE PAMI 26(6).
 """
@@ -135,7 +136,7 @@ class _Work:
     def tolerance(self, i: int) -> float:
         """Return the largest residual of a fitting mark, tangents: distortion is not known yet."""
         camera = self.estimate.cameras[self.network.camera[i]]
-        return START_TOLERANCE * float(np.hypot(*camera.size_px)) / camera.c_px
+        return float(START_TOLERANCE * np.hypot(*camera.size_px) / camera.c_px)
 
     def rows(self, i: int) -> IntArray:
         """Return the marks of determined points in a photograph."""
@@ -192,7 +193,7 @@ class _Work:
         return len(new)
 
     def decide(self, poses: dict[int, list[Pose]]) -> None:
-        """Keep one pose of the photograph, or of the two photographs, that the others support most clearly."""
+        """Keep one pose of the photograph, or of the two, that the others support most clearly."""
         best: tuple[float, float, dict[int, int]] | None = None
         for i in [i for i in poses if len(poses[i]) > 1]:
             own = np.array([self.evidence.places(i, p, self.estimate.points) for p in poses[i]])
@@ -200,13 +201,13 @@ class _Work:
                 support = own[:, None] + [
                     [self.evidence.support(j, i, q, p) for q in poses[j]] for p in poses[i]
                 ]
-                k, l = np.unravel_index(int(np.argmax(support)), support.shape)
+                k, q = divmod(int(np.argmax(support)), support.shape[1])
                 rival = max((float(support[a].max()) for a in range(len(support)) if a != k), default=0.0)
-                row = float(support[k, l]) - rival, float(support[k, l]), {i: int(k), j: int(l)}
+                row = float(support[k, q]) - rival, float(support[k, q]), {i: k, j: q}
                 best = row if best is None or row[0] > best[0] else best
             if len(poses) == 1:
-                k = int(np.argmax(own))
-                best = float(own[k] - np.sort(own)[-2]), float(own[k]), {i: k}
+                first = int(np.argmax(own))
+                best = float(own[first] - np.sort(own)[-2]), float(own[first]), {i: first}
         assert best is not None
         lead, support_of_best, chosen = best
         for i, k in chosen.items():
@@ -223,7 +224,7 @@ class _Work:
         ]
         if not candidates:
             return
-        support, i, j, points, solution = max(candidates, key=lambda row: row[0])
+        support, i, j, _, solution = max(candidates, key=lambda row: row[0])
         rivals = [
             row[0]
             for row in candidates

@@ -1,7 +1,7 @@
 """Pixels of the photographs that are marked: for measuring, and as tiles for the page.
 
-A photograph is decoded when it is first needed, and removed when memory is full. Small pictures come from a JPEG
-that is decoded at an eighth of its size.
+A photograph is decoded when it is first needed, and removed when memory is full. Small pictures come from a
+JPEG that is decoded at an eighth of its size.
 
 Source: the DZI format of Microsoft's Deep Zoom, which OpenSeadragon reads.
 """

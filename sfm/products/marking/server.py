@@ -1,11 +1,12 @@
 """The server of the marking page: on this computer only, under an address with a secret.
 
-A request needs the secret in its path, and the host and port of this server, so that no other page or user of the
-computer gets an answer. A request that changes something is a POST of JSON with the secret in a header, which
-pages of other sites cannot send. Everything else is refused. Nothing is written but the marks file and the survey.
+A request needs the secret in its path, and the host and port of this server, so that no other page or user
+of the computer gets an answer. A request that changes something is a POST of JSON with the secret in a
+header, which pages of other sites cannot send. Everything else is refused. Nothing is written but the marks
+file and the survey.
 
-Source: OWASP Cheat Sheet Series, Cross-Site Request Forgery Prevention; Jackson et al., Protecting Browsers from
-DNS Rebinding Attacks (2007).
+Source: OWASP Cheat Sheet Series, Cross-Site Request Forgery Prevention; Jackson et al., Protecting Browsers
+from DNS Rebinding Attacks (2007).
 """
 
 from __future__ import annotations
@@ -146,6 +147,7 @@ CHANGES: dict[str, tuple[type[Body], Callable[[MarkingSession, Any], dict[str, A
     "rename": (Renamed, lambda session, b: session.rename(b.point, b.name)),
     "control": (Control, _control),
     "bar": (Bar, _bar),
+    "automatic": (Nothing, lambda session, b: session.automatic()),
     "undo": (Nothing, lambda session, b: session.undo()),
     "redo": (Nothing, lambda session, b: session.redo()),
 }

@@ -1,7 +1,7 @@
 """A session of marking: the marks of one survey, what follows from them, and the state that the page shows.
 
-Every change is saved before it is answered. The orientation and the proposals for the point follow at once, the
-adjustment in a thread of its own; each new result has a version, for which pages wait.
+Every change is saved before it is answered. The orientation and the proposals for the point follow at once,
+the adjustment in a thread of its own; each new result has a version, for which pages wait.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm.files.plain_text import is_name, or_none
 from sfm.model.errors import KolinearError, PhotographError
+from sfm.products.marking.automatic import AutomaticRun, Run
 from sfm.products.marking.clicks import Measured, measure_click
 from sfm.products.marking.evidence import PictureEvidence
 from sfm.products.marking.fit_picture import picture_of_mark
@@ -49,16 +50,6 @@ class MarkError(KolinearError):
     """A request of the page that cannot be done; the message says why."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """A run of the survey with everything that can be found automatically."""
-
-    state: str  # running | done | failed
-    stage: str = ""
-    report: str | None = None  # path of the report
-    sentence: str = ""
-
-
 class MarkingSession:
     """Marks, orientation and proposals of one survey; its methods may be called by several threads."""
 
@@ -83,6 +74,7 @@ class MarkingSession:
         self._hashes: dict[str, str] = {}
         self._changed_files: dict[str, str] = {}
         self._run: Run | None = None
+        self._running: AutomaticRun | None = None
         self._evidence = PictureEvidence(
             self.pixels.grey, [project.cameras[k] for k in project.photographs.camera]
         )
@@ -310,11 +302,40 @@ class MarkingSession:
         """Make the last undone change again."""
         return self._step(self._saved.redo)
 
+    def automatic(self) -> dict[str, Any]:
+        """Run the survey with its marks and everything that can be found automatically, to a report."""
+        with self._changed:
+            if self._run is not None and self._run.state == "running":
+                raise MarkError("the survey is running already")
+            if not self._marking.marks:
+                raise MarkError("there is no mark yet")
+            project, control = self.project, len(stated_points(self.project, self._marking)) >= 3
+            self._running = AutomaticRun(
+                project.survey_file, project.photographs.folder, self._saved.path, project.survey.name
+            )
+            self._run = Run("running", "starting")
+            work = self._running
+            threading.Thread(
+                target=lambda: work.run(self._tell, control=control), name="run", daemon=True
+            ).start()
+            self._version += 1
+            self._changed.notify_all()
+            return self._state()
+
+    def _tell(self, run: Run) -> None:
+        """Take news of a run."""
+        with self._changed:
+            self._run = run
+            self._version += 1
+            self._changed.notify_all()
+
     def close(self) -> None:
         """End the session: pages that wait are answered, and the marks file is free."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+        if self._running is not None:
+            self._running.stop()
         self._worker.join()
         self._saved.close()
 
@@ -340,8 +361,8 @@ class MarkingSession:
                 for mark in self._marking.marks.values()
                 if mark.point == point and mark.by == "measured" and mark.photograph != name
             ]
-        kinds = [mark.kind for mark in marks]
-        usual = max(dict.fromkeys(kinds), key=kinds.count) if kinds else None
+        kinds: list[Kind] = [mark.kind for mark in marks]
+        usual: Kind | None = max(dict.fromkeys(kinds), key=kinds.count) if kinds else None
         if usual == "window" and kind in (None, "window"):
             first = next(mark for mark in marks if mark.kind == "window")
             template = template_of(first, self.pixels.grey, self.project)
@@ -427,9 +448,9 @@ class MarkingSession:
         adjustment = following.adjustment
         for name in changed & number.keys():
             j = number[name]
-            if adjustment is None or j >= len(adjustment.points) or not adjustment.points[j]:
-                if name not in following.marked.control:
-                    points[j] = guide.with_rays(j)
+            is_adjusted = adjustment is not None and j < len(adjustment.points) and adjustment.points[j]
+            if not is_adjusted and name not in following.marked.control:
+                points[j] = guide.with_rays(j)
         following = replace(following, estimate=replace(following.estimate, points=points))
         kept = {key: old for key, old in self._proposals.items() if key[1] not in changed}
         with suppress(KolinearError):
@@ -446,6 +467,7 @@ class MarkingSession:
                     return
                 changes, marking, last = self._changes, self._marking, self._following
                 fits = dict(self._fits)
+            following: Following | None
             try:
                 following = follow(self.project, marking, self._evidence, last)
                 proposals = propose(following, marking, self.pixels.grey, self.project, fits)
@@ -474,7 +496,7 @@ class MarkingSession:
     # --- the state ---------------------------------------------------------------------------------
 
     def _state(self) -> dict[str, Any]:
-        marking, project, following = self._marking, self.project, self._following
+        marking, project = self._marking, self.project
         marks = [self._shown_mark(mark) for mark in marking.marks.values() if mark.photograph in self._index]
         marks += [
             self._shown_automatic(key)

@@ -7,10 +7,10 @@
     # scale bar: FROM,TO,LENGTH,SIGMA  lengths that the person states, object unit
     photograph,point,x_px,y_px,sxx_px2,sxy_px2,syy_px2,kind,by,state,when
 
-`kind` is what was measured, `by` is "measured" or "hand", `when` is a time (ISO 8601, UTC). The state of a mark
-is "accepted". A place that the person refused is a row too, so that it is not proposed again. The covariance is
-that of the measurement, the noise of the photograph alone; sigma_px of the survey adds the other errors, as it
-does to targets.
+`kind` is what was measured, `by` is "measured" or "hand", `when` is a time (ISO 8601, UTC). The state of a
+mark is "accepted". A place that the person refused is a row too, so that it is not proposed again. The
+covariance is that of the measurement, the noise of the photograph alone; sigma_px of the survey adds the
+other errors, as it does to targets.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def read_marks(path: Path) -> Marking:
         if (photograph, point) in rows:
             raise SurveyFileError(f"{table.place(k)}: point '{point}' in '{photograph}' is marked already")
         x, y, sxx, sxy, syy = table.values[k].tolist()
-        rows[photograph, point] = Mark(photograph, point, x, y, sxx, sxy, syy, kind, by, state, when)  # type: ignore[arg-type]
+        rows[photograph, point] = Mark(photograph, point, x, y, sxx, sxy, syy, kind, by, state, when)
     return Marking(survey, marks, refused, control, bars, hashes)
 
 

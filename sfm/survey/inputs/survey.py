@@ -64,7 +64,7 @@ from sfm.survey.inputs.settings import (
     TiePointSettings,
     first_error,
 )
-from sfm.survey.inputs.sources import descriptions, reads_photographs, tables_of
+from sfm.survey.inputs.sources import descriptions, reads_photographs
 from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.observation_tables import DISTANCE, ObservationTable, bars_of, read_observation_table
 from sfm.targets.codes.plates import TargetFamily, code_family, is_table
@@ -384,8 +384,8 @@ def _given_image_points(
     if marking is not None and file.marked is not None:
         if file.image_points is not None:
             raise SurveyFileError(
-                f"{file.source}: [observations] stands in place of photographs, and [marks] beside them; write "
-                "[[observations]]"
+                f"{file.source}: [observations] stands in place of photographs, and [marks] beside them; "
+                "write [[observations]]"
             )
         of_marks = image_points_of(marking, file.beside(file.marked.file), file.adjust.sigma_px)
         tables += () if of_marks is None else (of_marks,)
