@@ -280,7 +280,9 @@ def application(session: MarkingSession, address: Address) -> Starlette:
         Route("/{secret}/fit/{image:int}/{point:str}.png", guarded(fit)),
         Route("/{secret}/{change:str}", guarded(change), methods=["POST"]),
     ]
-    return Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})
+    made = Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})
+    made.router.redirect_slashes = False  # it would answer before the secret is compared
+    return made
 
 
 def _only(

@@ -362,7 +362,9 @@ class MarkingSession:
                 if mark.point == point and mark.by == "measured" and mark.photograph != name
             ]
         kinds: list[Kind] = [mark.kind for mark in marks]
-        usual: Kind | None = max(dict.fromkeys(kinds), key=kinds.count) if kinds else None
+        usual: Kind | None = None
+        if kinds:
+            usual = max(dict.fromkeys(kinds), key=lambda kind: kinds.count(kind))
         if usual == "window" and kind in (None, "window"):
             first = next(mark for mark in marks if mark.kind == "window")
             template = template_of(first, self.pixels.grey, self.project)
@@ -433,8 +435,9 @@ class MarkingSession:
         self._proposals = {key: old for key, old in self._proposals.items() if key not in gone}
         changed = {
             key[1]
-            for key in marking.marks.keys() | before.marks.keys()
-            if marking.marks.get(key) is not before.marks.get(key)
+            for new, old in ((marking.marks, before.marks), (marking.refused, before.refused))
+            for key in new.keys() | old.keys()
+            if new.get(key) is not old.get(key)
         }
         last = self._following
         now_following = None if last is None else without_moved(last, marking, self.project)
