@@ -142,13 +142,17 @@ def adjust_marks(
         return None
     chosen, named = everything, None
     if _is_doubtful(everything, false_alarm):
-        named = _contradicting(part, everything, options)
+        robust = adjusted(start, "huber") or everything
+        named = _contradicting(part, robust, options)
         without = np.zeros(len(everything.rejected), dtype=bool)
         without[[] if named is None else named] = True
-        tested = adjusted(everything.estimate, "tau", without)
+        tested = adjusted(robust.estimate, "tau", without)
         most = max(1, MOST_REJECTED * len(without))
         if tested is not None and tested.converged and 0 < tested.rejected.sum() <= most:
             chosen = tested
+            if named is None or not tested.rejected[named]:
+                test = np.nan_to_num(np.abs(tested.standardised)).max(axis=1)
+                named = int(np.argmax(np.where(tested.rejected, test, -1.0)))
     whole = merge_estimate(chosen.estimate, images, points)
     return MarkAdjustment(chosen, whole, images, points, np.flatnonzero(used), named)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ TARGET_HALVES_PX = (60, 160, 400)  # half sides of the parts in which targets ar
 SADDLE_HALVES_PX = (4, 6, 9, 13)
 CORNER_REACHES_PX = (7.0, 10.0, 14.0, 19.0)  # lengths of the edges that are fitted
 CROSS_RADII_PX = (7.0, 10.0, 14.0, 20.0, 28.0)  # of the circles that cut the arms
+BESIDE = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))  # half radii
 ANGLES = 128  # samples of a circle
 AGREEMENT_SIGMAS, AGREEMENT_PX = 4.0, 0.1  # of one feature measured in windows of two sizes
 MIN_WEDGE, MAX_WEDGE = math.radians(20), math.radians(160)  # between the edges of a corner
@@ -225,8 +227,8 @@ def _cross(photograph: AnyArray, asked: _Asked) -> Measured | None:
     reach = asked.reach
     part = _part(photograph, asked.at, int(reach) + 2 * int(CROSS_RADII_PX[-1]))
     centre, radius = part.at, 0.0
-    for r in CROSS_RADII_PX:
-        place = _cross_start(part, part.at, r)
+    for r, away in product(CROSS_RADII_PX, BESIDE):
+        place = _cross_start(part, part.at + r / 2 * np.array(away), r)
         if place is not None and np.hypot(*(place - part.at)) <= reach:
             centre, radius = place, r
             break
