@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.process import loading
+from sfm.model.display import counted
 from sfm.model.errors import KolinearError, MissingLibraryError
 from sfm.runtime.faults import working_on
 
@@ -39,6 +40,24 @@ def mark(
             metavar="MARKS.csv",
             help="Marks file; an earlier one is continued.  [default: that of the survey file, or "
             "SURVEY-marks.csv beside it, or out/NAME-marks.csv]",
+        ),
+    ] = None,
+    import_from: Annotated[
+        Path | None,
+        typer.Option(
+            "--import",
+            metavar="FILE",
+            help="Add the marks of another program: ground_control_points.json, gcp_list.txt, Metashape's "
+            ".xml or COLMAP's .db.",
+        ),
+    ] = None,
+    export_to: Annotated[
+        Path | None,
+        typer.Option(
+            "--export",
+            metavar="FILE",
+            help="Write the marks for another program as .json (OpenSfM), .xml (Metashape) or .db (COLMAP), "
+            "and end without a page.",
         ),
     ] = None,
     port: Annotated[
@@ -78,6 +97,22 @@ def mark(
         project, marks = _project(source, images, allow_outside=allow_outside)
         session = MarkingSession(project, out or marks)
     try:
+        if import_from is not None:
+            from adapters.formats.marks_of_others import read_marks_of_others
+
+            names, sizes = project.photographs.names, project.sizes
+            with working_on(str(import_from)):
+                added = session.add(read_marks_of_others(import_from, names, sizes, project.survey.unit))
+            print(f"{import_from}: {counted(added, 'mark')} added")
+        if export_to is not None:
+            from adapters.formats.marks_of_others import write_marks_of_others
+
+            with working_on(str(export_to)):
+                network, estimate = session.exported()
+                before = import_from if import_from and import_from.suffix == export_to.suffix else None
+                write_marks_of_others(export_to, network, estimate, ground_control=before)
+            print(f"{export_to}: {counted(len(network.image_points), 'mark')}")
+            return
         server = MarkingServer(session, port)
         print(f"Marks: {out or marks}")
         print(f"Page: {server.address.url}", flush=True)
@@ -114,7 +149,11 @@ def _project(source: Path, images: Path | None, *, allow_outside: bool) -> tuple
         name = folder_name(source.resolve().name)
         return project_of_folder(source, sensor_widths(lambda _: None)), Path("out") / f"{name}{MARKS}"
     described = read_survey_file(survey_file, allow_outside=allow_outside)
+    marks = survey_file.with_name(f"{survey_file.stem}{MARKS}")
+    if described.marked is not None:  # the session reads them itself
+        marks = described.beside(described.marked.file)
+        described = described.model_copy(update={"marked": None})
     project = project_of_survey(
         survey_of_file(described), images_dir=images, survey_file=survey_file, solution=solution
     )
-    return project, survey_file.with_name(f"{survey_file.stem}{MARKS}")
+    return project, marks

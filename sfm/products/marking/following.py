@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from sfm.model.camera import Camera
-from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, IntArray
 from sfm.model.display import counted
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars
@@ -21,7 +21,7 @@ from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
 from sfm.products.marking.clicks import Measured, Template
 from sfm.products.marking.guidance import Guide, Look, Predicted, measure_predicted
 from sfm.products.marking.orienting import MIN_COMMON, MIN_KNOWN, Evidence, HandOrientation, orient_by_hand
-from sfm.products.marking.project import MarkedProject
+from sfm.products.marking.project import GivenImagePoint, MarkedProject
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint
 
@@ -124,13 +124,13 @@ def network_of_marks(project: MarkedProject, marking: Marking) -> MarkedNetwork:
         np.array(mark.covariance) + (sigma_px**2 * np.eye(2) if mark.by == "measured" else 0.0)
         for mark in rows
     ]
-    for (photograph, point), place, covariance in _automatic(project):
-        if photograph in index and not {(photograph, point)} & (
-            marking.marks.keys() | marking.refused.keys()
-        ):
-            keys.append((photograph, point))
-            xy.append(place)
-            C.append(covariance)
+    replaced = marking.marks.keys() | marking.refused.keys()
+    for row in automatic_image_points(project):
+        key = row.photograph, row.point
+        if row.photograph in index and key not in replaced:
+            keys.append(key)
+            xy.append(row.xy)
+            C.append(row.covariance)
     solved = () if project.solution is None else project.solution.network.points
     shown = {point for _, point in keys}
     points = tuple(
@@ -167,26 +167,22 @@ def network_of_marks(project: MarkedProject, marking: Marking) -> MarkedNetwork:
     return MarkedNetwork(network, project.cameras, tuple(keys), len(rows), control, bars)
 
 
-def _automatic(
-    project: MarkedProject,
-) -> list[tuple[tuple[str, str], tuple[float, float], FloatArray]]:
-    """Return the image points of a result, without natural texture, which has too many to look at."""
-    if project.solution is None:
-        return []
-    network = project.solution.network
-    common = np.array([source.has_common_errors for source in network.sources])[network.source]
-    seen = network.image_points.select(~common)
-    return [
-        ((network.images[i], network.points[j]), (float(x), float(y)), C)
+def automatic_image_points(project: MarkedProject) -> tuple[GivenImagePoint, ...]:
+    """Return what the survey gives and what its result measured, each image point once.
+
+    Natural texture has too many points to look at, and is left out.
+    """
+    every = {(row.photograph, row.point): row for row in project.given}
+    if project.solution is not None:
+        network = project.solution.network
+        common = np.array([source.has_common_errors for source in network.sources])[network.source]
+        seen = network.image_points.select(~common)
         for i, j, (x, y), C in zip(
             seen.image.tolist(), seen.point.tolist(), seen.xy.tolist(), seen.covariance, strict=True
-        )
-    ]
-
-
-def automatic_marks(project: MarkedProject) -> dict[tuple[str, str], tuple[float, float, FloatArray]]:
-    """Return the automatic image points by photograph and point: x, y (px) and covariance (px^2)."""
-    return {key: (x, y, C) for key, (x, y), C in _automatic(project)}
+        ):
+            key = network.images[i], network.points[j]
+            every[key] = GivenImagePoint(*key, (x, y), C)
+    return tuple(every.values())
 
 
 def follow(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm.model.camera import Camera
+from sfm.model.conventions import FloatArray
 from sfm.model.errors import SurveyFileError
 from sfm.model.solution import Solution
 from sfm.photographs.exif import read_metadata
@@ -16,7 +17,19 @@ from sfm.products.drafting.draft import UNIT, metadata_of_folder
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from sfm.survey.inputs.measurements import PhotographList, find_photographs
+from sfm.survey.inputs.sources import given_tables
 from sfm.survey.inputs.survey import CameraSetup, Survey
+from sfm.survey.sources.given import in_pixels
+
+
+@dataclass(frozen=True)
+class GivenImagePoint:
+    """An image point that a survey gives or that was measured automatically."""
+
+    photograph: str
+    point: str
+    xy: tuple[float, float]  # px
+    covariance: FloatArray  # px^2, (2, 2)
 
 
 @dataclass(frozen=True)
@@ -29,6 +42,7 @@ class MarkedProject:
     cameras: tuple[Camera, ...]  # start values; those of the result, if there is one
     solution: Solution | None = None  # orientation, points and image points of an automatic survey
     survey_file: Path | None = None  # None: of a folder, which has none yet
+    given: tuple[GivenImagePoint, ...] = ()  # image points that the survey gives
 
     @property
     def control(self) -> KnownPoints | None:
@@ -94,11 +108,28 @@ def project_of_survey(
     cameras = start_cameras(
         survey.cameras, survey.source, metadata, files.camera, files.names, survey.start_cameras
     )
+    given = _given_image_points(survey, files, cameras)
     if solution is not None:
         cameras, files = _cameras_of(solution, files, cameras)
-    return MarkedProject(
-        survey, files, tuple(data.size_px for data in metadata), cameras, solution, survey_file
-    )
+    sizes = tuple(data.size_px for data in metadata)
+    return MarkedProject(survey, files, sizes, cameras, solution, survey_file, given)
+
+
+def _given_image_points(
+    survey: Survey, files: PhotographList, cameras: tuple[Camera, ...]
+) -> tuple[GivenImagePoint, ...]:
+    """Return the image points of the tables of a survey, and of its control, in its photographs."""
+    owner = dict(zip(files.names, files.camera.tolist(), strict=True))
+    given = []
+    for table in given_tables(survey):
+        here = table.select(np.array([image in owner for image in table.image], dtype=bool))
+        camera = np.array([owner[image] for image in here.image], dtype=np.int64)
+        xy, C = in_pixels(here, cameras, camera, table.sigma_px or survey.adjust.sigma_px)
+        given += [
+            GivenImagePoint(image, point, (float(x), float(y)), covariance)
+            for image, point, (x, y), covariance in zip(here.image, here.point, xy, C, strict=True)
+        ]
+    return tuple(given)
 
 
 def _cameras_of(

@@ -17,6 +17,8 @@ import numpy as np
 
 from sfm.files.plain_text import is_name, or_none
 from sfm.model.errors import KolinearError, PhotographError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
 from sfm.products.marking.automatic import AutomaticRun, Run
 from sfm.products.marking.clicks import Measured, measure_click
 from sfm.products.marking.evidence import PictureEvidence
@@ -24,7 +26,7 @@ from sfm.products.marking.fit_picture import picture_of_mark
 from sfm.products.marking.following import (
     Following,
     Proposal,
-    automatic_marks,
+    automatic_image_points,
     follow,
     marks_needed,
     propose,
@@ -78,7 +80,7 @@ class MarkingSession:
         self._evidence = PictureEvidence(
             self.pixels.grey, [project.cameras[k] for k in project.photographs.camera]
         )
-        self._automatic = automatic_marks(project)
+        self._automatic = {(row.photograph, row.point): row for row in automatic_image_points(project)}
         self._following: Following | None = None
         self._proposals: dict[tuple[str, str], Proposal] = {}
         self._changes = 1  # of the marks, since the beginning
@@ -189,8 +191,7 @@ class MarkingSession:
             if image is not None and point is not None:
                 key = self._photograph(image), point
                 if key in self._automatic and key not in self._marking.marks:
-                    x, y, C = self._automatic[key]
-                    refused.append(self._mark_of(*key, Measured(x, y, C, "target", np.zeros((0, 2)))))
+                    refused.append(self._mark_of_automatic(key))
             if not refused:
                 for (photograph, name), proposal in self._chosen(image, point).items():
                     place = proposal.measured or Measured(
@@ -261,8 +262,7 @@ class MarkingSession:
                 raise MarkError(f"'{name}' has stated coordinates already")
             for key in automatic:  # the new name is a mark, and the old one is left out
                 if key not in marking.marks:
-                    x, y, C = self._automatic[key]
-                    mark = self._mark_of(*key, Measured(x, y, C, "target", np.zeros((0, 2))))
+                    mark = self._mark_of_automatic(key)
                     marking = self._with_hash(marking.with_mark(mark), self._index[key[0]])
             renamed = marking.renamed(point, name)
             for key in automatic:
@@ -301,6 +301,30 @@ class MarkingSession:
     def redo(self) -> dict[str, Any]:
         """Make the last undone change again."""
         return self._step(self._saved.redo)
+
+    def add(self, other: Marking) -> int:
+        """Add marks and control of another program; own ones stay.
+
+        Returns:
+            Number of marks that are added.
+        """
+        with self._changed:
+            marking = self._marking
+            new = {key: mark for key, mark in other.marks.items() if key not in marking.marks}
+            for photograph in dict.fromkeys(photograph for photograph, _ in new):
+                marking = self._with_hash(marking, self._index[photograph])
+            control = {**other.control, **marking.control}
+            self._change(replace(marking, marks={**marking.marks, **new}, control=control))
+            return len(new)
+
+    def exported(self) -> tuple[Network, Estimate]:
+        """Return all marks as a network, with what is oriented by them."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._followed >= self._changes)
+            following = self._following
+        if following is None:
+            raise MarkError(f"{self._saved.path}: no mark can be written")
+        return following.marked.network, following.estimate
 
     def automatic(self) -> dict[str, Any]:
         """Run the survey with its marks and everything that can be found automatically, to a report."""
@@ -404,6 +428,10 @@ class MarkingSession:
             "hand" if measured.kind == "hand" else "measured",
             when=now(),
         )
+
+    def _mark_of_automatic(self, key: tuple[str, str]) -> Mark:
+        row = self._automatic[key]
+        return self._mark_of(*key, Measured(*row.xy, row.covariance, "target", np.zeros((0, 2))))
 
     def _with_hash(self, marking: Marking, image: int) -> Marking:
         name = self.project.photographs.names[image]
@@ -605,7 +633,8 @@ class MarkingSession:
         }
 
     def _shown_automatic(self, key: tuple[str, str]) -> dict[str, Any]:
-        x, y, C = self._automatic[key]
+        row = self._automatic[key]
+        (x, y), C = row.xy, row.covariance
         return {
             "image": self._index[key[0]],
             "point": key[1],

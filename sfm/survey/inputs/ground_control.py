@@ -194,14 +194,16 @@ class _Point(Content):
     observations: tuple[_Projection, ...] = ()
 
 
-class _Points(Content):
+class OpenSfmPoints(Content):
+    """Content of ground_control_points.json."""
+
     points: tuple[_Point, ...]
 
 
 def _read_opensfm(path: Path) -> _Rows:
     rows = _Rows(path, "of the longer side", is_geographic=True)
     names = set[str]()
-    for point in read_json(path, _Points, "a file of ground control points").points:
+    for point in read_json(path, OpenSfmPoints, "a file of ground control points").points:
         if point.id in names:
             raise SurveyFileError(f"{path}: two points have the id '{point.id}'")
         names.add(point.id)

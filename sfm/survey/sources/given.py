@@ -102,7 +102,7 @@ def read_tables(survey: Survey, tables: tuple[Observations, ...], files: Photogr
         rows = slice(first, first + len(table))
         first = rows.stop
         camera = owner[image[rows]]
-        xy, covariance = _in_pixels(table, cameras, camera, table.sigma_px or survey.adjust.sigma_px)
+        xy, covariance = in_pixels(table, cameras, camera, table.sigma_px or survey.adjust.sigma_px)
         outside_parts.append(refuse_outside(table, xy, cameras, camera))
         sigma = np.full(xy.shape, np.nan) if table.sigma is None else table.sigma
         stated = np.asarray(np.isfinite(sigma).all(axis=1)) | (table.sigma_px is not None)
@@ -204,7 +204,7 @@ def _overlays(network: Network, files: PhotographList, readable: IntArray) -> tu
     return tuple(drawn)
 
 
-def _in_pixels(
+def in_pixels(
     given: Observations, cameras: tuple[Camera, ...], camera: IntArray, sigma_px: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return positions, px, (k, 2), and their covariance, px^2, (k, 2, 2), of rows in px or mm."""

@@ -27,7 +27,9 @@ def rendered(pattern: Pattern, rng: np.random.Generator, *, noise: float = 2.0) 
     return 255 - grey if rng.random() < 0.5 else grey
 
 
-def turned(x: AnyArray, y: AnyArray, centre: FloatArray, angle: float, shear: float) -> tuple[AnyArray, AnyArray]:
+def turned(
+    x: AnyArray, y: AnyArray, centre: FloatArray, angle: float, shear: float
+) -> tuple[AnyArray, AnyArray]:
     u, v = x - centre[0], y - centre[1]
     c, s = np.cos(angle), np.sin(angle)
     return c * u + s * v + shear * (c * v - s * u), c * v - s * u
@@ -71,7 +73,9 @@ LENS: Camera = camera_from_values(
 )
 
 
-def stations(rng: np.random.Generator, count: int, *, around: float = 2 * np.pi) -> tuple[FloatArray, FloatArray]:
+def stations(
+    rng: np.random.Generator, count: int, *, around: float = 2 * np.pi
+) -> tuple[FloatArray, FloatArray]:
     """Return places (m, 3) and rotations (m, 3, 3) of photographs around an object of two units."""
     turn = rng.uniform(0, 2 * np.pi) + around * np.arange(count) / count + rng.uniform(-0.15, 0.15, count)
     places = np.column_stack([2.5 * np.cos(turn), 2.5 * np.sin(turn), rng.uniform(1.4, 2.4, count)])
@@ -95,7 +99,9 @@ def network_of_points(xy: FloatArray, marked: AnyArray, sigma_px: float) -> Netw
     )
 
 
-def write_photographs(folder: Path, rng: np.random.Generator, *, count: int = 3, points: int = 9) -> FloatArray:
+def write_photographs(
+    folder: Path, rng: np.random.Generator, *, count: int = 3, points: int = 9
+) -> FloatArray:
     """Write photographs of dots on a flat board, and return the places of the dots, px, (m, n, 2)."""
     board = np.array([[-0.6 + 0.6 * (k % 3), -0.6 + 0.6 * (k // 3), 0.15 * (k % 2)] for k in range(points)])
     places, rotations = stations(rng, count, around=1.2)

@@ -61,7 +61,9 @@ def test_500_clicks_5_px_off(kind: Kind) -> None:
 
 
 def texture(rng: np.random.Generator, side: int) -> AnyArray:
-    layers = [cv2.GaussianBlur(rng.normal(size=(side, side)).astype(np.float32), (0, 0), s) for s in (1.5, 4, 10)]
+    layers = [
+        cv2.GaussianBlur(rng.normal(size=(side, side)).astype(np.float32), (0, 0), s) for s in (1.5, 4, 10)
+    ]
     total = sum(layer / layer.std() for layer in layers)
     return np.asarray(120 + 30 * total / np.std(total))
 

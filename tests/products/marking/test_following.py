@@ -51,7 +51,9 @@ class SeenEvidence(NoEvidence):
 
     def places(self, i: int, pose: Pose, points: FloatArray) -> float:
         at = project(LENS, pose[0], pose[1], points[np.isfinite(points).all(axis=1)])
-        seen = project(LENS, np.zeros(3), np.eye(3), np.column_stack([self._uv[i], -np.ones(len(self._uv[i]))]))
+        seen = project(
+            LENS, np.zeros(3), np.eye(3), np.column_stack([self._uv[i], -np.ones(len(self._uv[i]))])
+        )
         near = np.linalg.norm(at[:, None] - seen, axis=2).min(axis=1) <= 5
         return float(near.sum())
 
@@ -82,7 +84,9 @@ def test_three_marks_of_known_points_orient_a_photograph_50_of_50() -> None:
                 if np.linalg.norm(np.cross(b - a, c - a)) > 0.5:
                     break
             marked[i, chosen] = True
-        network = network_of_points(xy, marked, 0.1).with_control([f"p{j}" for j in range(10)], points[:10], 0.001)
+        network = network_of_points(xy, marked, 0.1).with_control(
+            [f"p{j}" for j in range(10)], points[:10], 0.001
+        )
         by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), SeenEvidence(xy))
         assert by_hand.in_control
         oriented += all(close(by_hand.estimate, i, places[i], rotations[i]) for i in range(2))
@@ -156,7 +160,9 @@ def coverage(rng: np.random.Generator, trials: int) -> tuple[float, float, int]:
         xy = truth + rng.normal(0, 0.3, truth.shape)
         marked = np.isfinite(truth).all(axis=2) & (rng.random(truth.shape[:2]) < 0.7)
         marked[:, new] = np.arange(6) < 2
-        network = network_of_points(xy, marked, 0.3).with_control(["p0", "p1", "p2", "p3"], points[:4], 0.0005)
+        network = network_of_points(xy, marked, 0.3).with_control(
+            ["p0", "p1", "p2", "p3"], points[:4], 0.0005
+        )
         known = np.where(np.arange(13)[:, None] < new, points, np.nan)
         marks = adjusted(network, Estimate((LENS,), places, rotations, known), in_control=True)
         guide = Guide(network, marks.estimate, marks)
@@ -229,7 +235,9 @@ def test_right_marks_are_seldom_called_wrong() -> None:
         points = object_points(rng, 12)
         places, rotations = stations(rng, 3, around=1.8)
         truth = seen_points(places, rotations, points)
-        network = network_of_points(truth + rng.normal(0, 0.1, truth.shape), np.ones((3, 12), dtype=bool), 0.1)
+        network = network_of_points(
+            truth + rng.normal(0, 0.1, truth.shape), np.ones((3, 12), dtype=bool), 0.1
+        )
         by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), NoEvidence())
         worst = adjusted(network, by_hand.estimate, in_control=False).worst
         called += worst is not None and worst.flagged

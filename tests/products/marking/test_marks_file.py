@@ -32,7 +32,18 @@ def marking_of(count: int = 7) -> Marking:
     marking = Marking("hall, no. 1", hashes={"a, b.jpg": "00ff", "c.jpg": "1234"})
     for k in range(count):
         kind = KINDS[k % len(KINDS)]
-        mark = Mark("a, b.jpg", f"=P{k}", k / 3, 1e5 / 7, 0.1 + k, 0.01, 0.2, kind, "measured", when="2026-01-01T00:00:00Z")
+        mark = Mark(
+            "a, b.jpg",
+            f"=P{k}",
+            k / 3,
+            1e5 / 7,
+            0.1 + k,
+            0.01,
+            0.2,
+            kind,
+            "measured",
+            when="2026-01-01T00:00:00Z",
+        )
         marking = marking.with_mark(mark)
     refused = Mark("c.jpg", "P1", 1.0, 2.0, 1.0, 0.0, 1.0, "hand", "hand", when="2026-01-01T00:00:00Z")
     marking = marking.with_refused(refused)
@@ -91,7 +102,9 @@ def _keep_marking(path: Path, count: int) -> None:
     """Mark one point after the other until the process is killed."""
     marking = Marking("hall")
     for k in range(count):
-        marking = marking.with_mark(Mark("a.jpg", f"P{k}", float(k), 0.0, 1.0, 0.0, 1.0, "hand", "hand", when="t"))
+        marking = marking.with_mark(
+            Mark("a.jpg", f"P{k}", float(k), 0.0, 1.0, 0.0, 1.0, "hand", "hand", when="t")
+        )
         write_marks(path, marking)
         (path.parent / "count").write_text(str(k + 1))  # what the page was told
 

@@ -40,7 +40,9 @@ class Served:
             usual |= {"X-Kolinear": address.secret, "Content-Type": "application/json"}
         usual |= {name.replace("_", "-"): value for name, value in headers.items()}
         data = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
-        connection.putrequest("GET" if data is None else "POST", f"/{secret or address.secret}/{path}", skip_host=True)
+        connection.putrequest(
+            "GET" if data is None else "POST", f"/{secret or address.secret}/{path}", skip_host=True
+        )
         for name, value in usual.items():
             if value is not None:
                 connection.putheader(name, value)
@@ -94,7 +96,9 @@ def test_a_click_measures_saves_and_is_undone(served: Served) -> None:
     assert mark["kind"] == "target"
     assert np.hypot(mark["x"] - served.dots[0, 4, 0], mark["y"] - served.dots[0, 4, 1]) < 0.2
     saved = read_marks(served.marks)
-    assert [(row.photograph, row.point, row.x) for row in saved.marks.values()] == [("i0.png", "P1", mark["x"])]
+    assert [(row.photograph, row.point, row.x) for row in saved.marks.values()] == [
+        ("i0.png", "P1", mark["x"])
+    ]
     assert json.loads(served.ask("undo", {})[1])["marks"] == []
     assert read_marks(served.marks).marks == {}
     assert len(json.loads(served.ask("redo", {})[1])["marks"]) == 1
@@ -143,7 +147,12 @@ def test_tiles_are_those_of_a_deep_zoom(served: Served) -> None:
     assert b'Width="770" Height="520"' in served.ask("tiles/0.dzi")[1]
     for level, column, row in ((10, 0, 0), (10, 1, 1), (6, 0, 0), (0, 0, 0)):
         assert served.ask(f"tiles/0_files/{level}/{column}_{row}.jpg")[1].startswith(b"\xff\xd8")
-    for path in ("tiles/9.dzi", "tiles/0_files/11/0_0.jpg", "tiles/0_files/10/9_0.jpg", "tiles/9_files/0/0_0.jpg"):
+    for path in (
+        "tiles/9.dzi",
+        "tiles/0_files/11/0_0.jpg",
+        "tiles/0_files/10/9_0.jpg",
+        "tiles/9_files/0/0_0.jpg",
+    ):
         assert served.ask(path)[0] == 404
 
 

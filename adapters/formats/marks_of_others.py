@@ -1,0 +1,186 @@
+"""Marks of other programs, read into a marks file and written from one.
+
+    .json   OpenSfM's ground_control_points.json
+    .txt    OpenDroneMap's gcp_list.txt, read only: its coordinates are in a projection
+    .xml    Metashape: markers with their image points
+    .db     COLMAP: key points with a match
+
+Names of points and photographs stay. Where a program states no standard deviation, that of pointing by
+hand is assumed. Coordinates of points are read as control.
+
+Source: documentation of OpenSfM, OpenDroneMap and Metashape, "Ground Control Points" and "Markers".
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapters.formats.registry import ENDINGS, format_named, read_any, write_any
+from sfm.comparison.camera_conversion import convert_cameras
+from sfm.files.plain_text import read_json
+from sfm.files.whole_files import whole_file
+from sfm.model.conventions import FloatArray
+from sfm.model.display import listed
+from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.survey.inputs.ground_control import READERS, OpenSfmPoints, read_ground_control
+from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint, now
+from sfm.survey.inputs.settings import ControlSettings
+
+SIGMA_PX = 1.0  # of pointing by hand
+PLACES = 12  # decimals of a part of the longer side: a millionth of a millionth of a photograph
+MAX_MARKS = 20_000  # more are no marks, but the image points of a survey
+READ = (*READERS, *ENDINGS)
+WRITTEN = (".json", ".xml", ".db")
+
+
+def read_marks_of_others(
+    path: Path, photographs: Sequence[str], sizes: Sequence[tuple[int, int]], unit: str
+) -> Marking:
+    """Return the marks of another program, by hand, with the control that it states.
+
+    Args:
+        path: the file; its ending states the format.
+        photographs: names of the photographs that are marked.
+        sizes: their widths and heights, px.
+        unit: object unit of the control.
+
+    Raises:
+        SurveyFileError: an unknown ending, an unreadable file, no mark in these photographs, or too many.
+    """
+    ending, size_of = path.suffix.lower(), dict(zip(photographs, sizes, strict=True))
+    marking = Marking()
+    if ending in READERS:
+        ground = read_ground_control(path, ControlSettings(file=path.name), unit)
+        known = np.isfinite(ground.points.xyz).all(axis=1)
+        control = _stated(ground.points.names, ground.points.xyz, ground.points.sigma, known.tolist())
+        seen = ground.image_points
+        if seen is None:
+            raise SurveyFileError(f"{path}: no image point in the file")
+        names = zip(seen.image, seen.point, strict=True)
+        rows = [
+            (image, point, *_in_pixels(xy, seen.unit, size_of.get(image)), SIGMA_PX**2 * np.eye(2))
+            for (image, point), xy in zip(names, seen.xy, strict=True)
+        ]
+    elif ending in (".xml", ".db"):
+        network, _ = read_any(path, ENDINGS[ending])
+        given = network.control.complete
+        control = _stated(
+            [network.points[j] for j in given.point],
+            given.xyz,
+            np.sqrt(np.diagonal(given.covariance, axis1=1, axis2=2)),
+        )
+        of = network.image_points
+        rows = [
+            (network.images[i], network.points[j], float(xy[0]), float(xy[1]), C)
+            for i, j, xy, C in zip(of.image.tolist(), of.point.tolist(), of.xy, of.covariance, strict=True)
+        ]
+    else:
+        raise SurveyFileError(f"{path}: unknown ending '{ending}', expected {listed(sorted(set(READ)))}")
+    here = [row for row in rows if row[0] in size_of]
+    if not here:
+        raise SurveyFileError(
+            f"{path}: none of its {len(rows)} image points is in these photographs, expected names as "
+            f"{photographs[0]}"
+        )
+    if len(here) > MAX_MARKS:
+        raise SurveyFileError(f"{path}: {len(here)} image points, at most {MAX_MARKS} are taken as marks")
+    when = now()
+    for image, point, x, y, C in here:
+        mark = Mark(
+            image, point, x, y, float(C[0, 0]), float(C[0, 1]), float(C[1, 1]), "hand", "hand", when=when
+        )
+        marking = replace(marking, marks={**marking.marks, mark.key: mark})
+    return replace(marking, control=control)
+
+
+def _stated(
+    names: Sequence[str], xyz: FloatArray, sigma: FloatArray, known: Sequence[bool] | None = None
+) -> dict[str, StatedPoint]:
+    kept = [True] * len(names) if known is None else known
+    return {
+        name: StatedPoint((place[0], place[1], place[2]), (s[0], s[1], s[2]))
+        for name, place, s, keep in zip(names, xyz.tolist(), sigma.tolist(), kept, strict=True)
+        if keep
+    }
+
+
+def _in_pixels(xy: FloatArray, unit: str, size: tuple[int, int] | None) -> tuple[float, float]:
+    """Return a position in px, of parts of the longer side from the middle if that is the unit."""
+    if unit == "px" or size is None:
+        return float(xy[0]), float(xy[1])
+    x, y = (float(v) * max(size) + (side - 1) / 2 for v, side in zip(xy, size, strict=True))
+    return x, y
+
+
+def write_marks_of_others(
+    path: Path,
+    network: Network,
+    estimate: Estimate,
+    *,
+    ground_control: Path | None = None,
+) -> None:
+    """Write marks for another program.
+
+    Args:
+        path: the new file; its ending states the format.
+        network: the marks, with control.
+        estimate: cameras, and what is oriented.
+        ground_control: a file of the same format whose positions and further points stay; for .json.
+
+    Raises:
+        OutputError: the file exists or cannot be written, or no such format is written.
+        SurveyFileError: the file of ground control cannot be read.
+    """
+    ending = path.suffix.lower()
+    if ending not in WRITTEN:
+        raise OutputError(f"{path}: marks are written as {listed(WRITTEN)}, not as '{ending}'")
+    if ending == ".json":
+        text = json.dumps(_opensfm(network, estimate, ground_control), indent=4) + "\n"
+        with whole_file(path, "the ground control") as part:
+            part.write_text(text, encoding="utf-8")
+        return
+    form = format_named(ENDINGS[ending])
+    converted = convert_cameras(estimate, form.models, held=form.lacks)[0] if form.models else estimate
+    write_any(path, form.name, network, converted)
+
+
+def _opensfm(network: Network, estimate: Estimate, ground_control: Path | None) -> dict[str, Any]:
+    """Return marks as OpenSfM states them; points and image points keep the order of an earlier file."""
+    seen, marked = network.image_points, dict[str, dict[str, list[float]]]()
+    for i, j, (x, y) in zip(seen.image.tolist(), seen.point.tolist(), seen.xy.tolist(), strict=True):
+        width, height = estimate.cameras[network.camera[i]].size_px
+        part = [
+            round((v - (side - 1) / 2) / max(width, height), PLACES) for v, side in ((x, width), (y, height))
+        ]
+        marked.setdefault(network.points[j], {})[network.images[i]] = part
+    before: Mapping[str, Any] = {"points": []}
+    if ground_control is not None:
+        read_json(ground_control, OpenSfmPoints, "a file of ground control points")
+        before = json.loads(ground_control.read_text(encoding="utf-8-sig"))
+    here = set(network.images)
+    points = []
+    for point in before["points"]:
+        own = marked.pop(point["id"], {})
+        observations = [
+            {**row, "projection": own.pop(row["shot_id"])} if row["shot_id"] in own else row
+            for row in point.get("observations", [])
+            if row["shot_id"] in own or row["shot_id"] not in here
+        ]
+        observations += [{"projection": xy, "shot_id": image} for image, xy in own.items()]
+        points.append({**point, "observations": observations})
+    points += [
+        {
+            "id": name,
+            "observations": [{"projection": xy, "shot_id": image} for image, xy in own.items()],
+        }
+        for name, own in marked.items()
+    ]
+    return {**before, "points": points}
