@@ -98,14 +98,14 @@ def mark(
         session = MarkingSession(project, out or marks)
     try:
         if import_from is not None:
-            from adapters.formats.marks_of_others import read_marks_of_others
+            from sfm.cli.other_marks import read_marks_of_others
 
             names, sizes = project.photographs.names, project.sizes
             with working_on(str(import_from)):
                 added = session.add(read_marks_of_others(import_from, names, sizes, project.survey.unit))
             print(f"{import_from}: {counted(added, 'mark')} added")
         if export_to is not None:
-            from adapters.formats.marks_of_others import write_marks_of_others
+            from sfm.cli.other_marks import write_marks_of_others
 
             with working_on(str(export_to)):
                 network, estimate = session.exported()

@@ -388,7 +388,7 @@ class MarkingSession:
         kinds: list[Kind] = [mark.kind for mark in marks]
         usual: Kind | None = None
         if kinds:
-            usual = max(dict.fromkeys(kinds), key=lambda kind: kinds.count(kind))
+            usual = max(dict.fromkeys(kinds), key=lambda own: kinds.count(own))
         if usual == "window" and kind in (None, "window"):
             first = next(mark for mark in marks if mark.kind == "window")
             template = template_of(first, self.pixels.grey, self.project)

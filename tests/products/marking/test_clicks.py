@@ -19,7 +19,7 @@ FLAGGED_PX = 1.0
 
 
 def errors_of(kind: Kind, count: int, *, asked: Kind | None) -> tuple[list[float], list[float], int]:
-    """Return errors (px) of clicks, their squares over the covariance, and the clicks that measured nothing."""
+    """Return errors (px) of clicks, their squares over the covariance, and how many clicks failed."""
     rng = np.random.default_rng(count)
     errors: list[float] = []
     squares: list[float] = []
@@ -69,7 +69,7 @@ def texture(rng: np.random.Generator, side: int) -> AnyArray:
 
 
 def errors_of_windows(count: int) -> tuple[list[float], int]:
-    """Return errors of clicks beside the places of windows in a turned photograph, px, and the refused ones."""
+    """Return errors of clicks beside the places of windows in a turned photograph, px, and how many failed."""
     rng = np.random.default_rng(count)
     errors: list[float] = []
     refused = 0

@@ -10,11 +10,11 @@ from sfm.model.conventions import FloatArray
 from sfm.model.distributions import chi2_isf
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, empty_estimate
+from sfm.orientation.relative import five_point_orientations
 from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
 from sfm.products.marking.evidence import Pose
 from sfm.products.marking.guidance import CONTAINED, Guide
 from sfm.products.marking.orienting import HandOrientation, orient_by_hand
-from sfm.orientation.relative import five_point_orientations
 from tests.products.marking.photographs import LENS, network_of_points, seen_points, stations
 
 FALSE_ALARM = 0.05
@@ -151,7 +151,7 @@ def adjusted(network: Network, start: Estimate, *, in_control: bool) -> MarkAdju
 
 
 def coverage(rng: np.random.Generator, trials: int) -> tuple[float, float, int]:
-    """Return the parts of ellipses that contain the place, of adjusted and of new points, and their number."""
+    """Return the parts of ellipses that contain the place, adjusted and new points, and their count."""
     inside = {True: [0, 0], False: [0, 0]}
     for _ in range(trials):
         points, new = object_points(rng, 13), 12

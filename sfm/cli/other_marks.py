@@ -56,18 +56,16 @@ def read_marks_of_others(
         SurveyFileError: an unknown ending, an unreadable file, no mark in these photographs, or too many.
     """
     ending, size_of = path.suffix.lower(), dict(zip(photographs, sizes, strict=True))
-    marking = Marking()
+    marking, control = Marking(), dict[str, StatedPoint]()
     if ending in READERS:
-        ground = read_ground_control(path, ControlSettings(file=path.name), unit)
-        known = np.isfinite(ground.points.xyz).all(axis=1)
-        control = _stated(ground.points.names, ground.points.xyz, ground.points.sigma, known.tolist())
-        seen = ground.image_points
-        if seen is None:
-            raise SurveyFileError(f"{path}: no image point in the file")
-        names = zip(seen.image, seen.point, strict=True)
+        seen = READERS[ending](path)
+        if seen.xyz:
+            points = read_ground_control(path, ControlSettings(file=path.name), unit).points
+            known: list[bool] = np.isfinite(points.xyz).all(axis=1).tolist()
+            control = _stated(points.names, points.xyz, points.sigma, known)
         rows = [
             (image, point, *_in_pixels(xy, seen.unit, size_of.get(image)), SIGMA_PX**2 * np.eye(2))
-            for (image, point), xy in zip(names, seen.xy, strict=True)
+            for image, point, xy in zip(seen.image, seen.point, seen.xy, strict=True)
         ]
     elif ending in (".xml", ".db"):
         network, _ = read_any(path, ENDINGS[ending])
@@ -112,7 +110,7 @@ def _stated(
     }
 
 
-def _in_pixels(xy: FloatArray, unit: str, size: tuple[int, int] | None) -> tuple[float, float]:
+def _in_pixels(xy: Sequence[float], unit: str, size: tuple[int, int] | None) -> tuple[float, float]:
     """Return a position in px, of parts of the longer side from the middle if that is the unit."""
     if unit == "px" or size is None:
         return float(xy[0]), float(xy[1])
