@@ -61,7 +61,7 @@ def read_marks_of_others(
         seen = READERS[ending](path)
         if seen.xyz:
             points = read_ground_control(path, ControlSettings(file=path.name), unit).points
-            known: list[bool] = np.isfinite(points.xyz).all(axis=1).tolist()
+            known = [bool(np.isfinite(xyz).all()) for xyz in points.xyz]
             control = _stated(points.names, points.xyz, points.sigma, known)
         rows = [
             (image, point, *_in_pixels(xy, seen.unit, size_of.get(image)), SIGMA_PX**2 * np.eye(2))

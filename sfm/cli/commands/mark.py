@@ -76,9 +76,9 @@ def mark(
         ),
     ] = False,
 ) -> None:
-    """Mark points in photographs in the browser: a click measures, and the program says what comes next.
+    """Measure points by hand, in the browser.
 
-    The page is served on this computer only, until Ctrl-C. Every mark is saved at once.
+    A click measures what is there; the page says which photograph needs how many marks. The page is served on this computer only, until Ctrl-C. Every mark is saved at once.
     """
     with loading():
         import webbrowser

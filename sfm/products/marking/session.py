@@ -7,6 +7,7 @@ the adjustment in a thread of its own; each new result has a version, for which 
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -386,9 +387,7 @@ class MarkingSession:
                 if mark.point == point and mark.by == "measured" and mark.photograph != name
             ]
         kinds: list[Kind] = [mark.kind for mark in marks]
-        usual: Kind | None = None
-        if kinds:
-            usual = max(dict.fromkeys(kinds), key=lambda own: kinds.count(own))
+        usual = Counter(kinds).most_common(1)[0][0] if kinds else None
         if usual == "window" and kind in (None, "window"):
             first = next(mark for mark in marks if mark.kind == "window")
             template = template_of(first, self.pixels.grey, self.project)

@@ -69,7 +69,7 @@ def texture(rng: np.random.Generator, side: int) -> AnyArray:
 
 
 def errors_of_windows(count: int) -> tuple[list[float], int]:
-    """Return errors of clicks beside the places of windows in a turned photograph, px, and how many failed."""
+    """Return errors of clicks beside windows in a turned photograph, px, and how many failed."""
     rng = np.random.default_rng(count)
     errors: list[float] = []
     refused = 0
