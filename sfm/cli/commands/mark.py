@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.process import loading
+from sfm.cli.process import compile_first, loading
 from sfm.model.display import counted
 from sfm.model.errors import KolinearError, MissingLibraryError
 from sfm.runtime.faults import working_on
@@ -78,7 +78,8 @@ def mark(
 ) -> None:
     """Measure points by hand, in the browser.
 
-    A click measures what is there; the page says which photograph needs how many marks. The page is served on this computer only, until Ctrl-C. Every mark is saved at once.
+    A click measures what is there, and the page says what comes next. It is served on this computer only,
+    until Ctrl-C. Every mark is saved at once.
     """
     with loading():
         import webbrowser
@@ -93,6 +94,7 @@ def mark(
             ) from None
         from sfm.products.marking.session import MarkingSession
 
+    compile_first()
     with working_on(str(source)):
         project, marks = _project(source, images, allow_outside=allow_outside)
         session = MarkingSession(project, out or marks)

@@ -12,10 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache
 
+import cv2
 import numpy as np
 
 from sfm.matching.epipolar import essential_matrices
-from sfm.matching.tracks.features import Features, match_features, sift_features
+from sfm.matching.tracks.features import MAX_SIDE_PX, Features, match_features, sift_features
 from sfm.model.camera import Camera, project, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.targets.detect import find_targets
@@ -38,7 +39,7 @@ class PictureEvidence:
         """
         self._cameras = tuple(cameras)
         self._features: Callable[[int], Features] = cache(lambda i: sift_features(read(i)))
-        self._targets: Callable[[int], FloatArray] = cache(lambda i: find_targets(read(i)).xy)
+        self._targets: Callable[[int], FloatArray] = cache(lambda i: _reduced_targets(read(i)))
         self.matches: Callable[[int, int], tuple[FloatArray, FloatArray]] = cache(self._match)
         """tangents of features of two photographs that look alike, (k, 2) each"""
 
@@ -101,6 +102,17 @@ class PictureEvidence:
             tangents_from_pixel(self._cameras[i], a.xy[rows[:, 0]]),
             tangents_from_pixel(self._cameras[j], b.xy[rows[:, 1]]),
         )
+
+
+def _reduced_targets(photograph: AnyArray) -> FloatArray:
+    """Return the targets of a photograph, px, (k, 2), found in it at a size that is searched in a second."""
+    shrink = -(-max(photograph.shape) // MAX_SIDE_PX)
+    if shrink == 1:
+        return find_targets(photograph).xy
+    height, width = (side // shrink for side in photograph.shape)
+    part = photograph[: height * shrink, : width * shrink]
+    small = np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA))
+    return np.asarray(shrink * (find_targets(small).xy + 0.5) - 0.5)
 
 
 def _distances(E: FloatArray, first: FloatArray, second: FloatArray, *, pairs: bool) -> FloatArray:

@@ -7,8 +7,10 @@ added, the last orientation is continued.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,9 +21,10 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
 from sfm.products.marking.clicks import Measured, Template
-from sfm.products.marking.guidance import Guide, Look, Predicted, measure_predicted
+from sfm.products.marking.guidance import Guide, Look, Predicted, is_same_place, measure_predicted
 from sfm.products.marking.orienting import MIN_COMMON, MIN_KNOWN, Evidence, HandOrientation, orient_by_hand
 from sfm.products.marking.project import GivenImagePoint, MarkedProject
+from sfm.runtime.threads import cores
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint
 
@@ -269,6 +272,7 @@ def propose(
     project: MarkedProject,
     fits: Mapping[tuple[str, str], Measured],
     points: set[str] | None = None,
+    known: Mapping[tuple[str, str], Proposal] = MappingProxyType({}),
 ) -> dict[tuple[str, str], Proposal]:
     """Return the proposals of points: where they should be, and what is measured there.
 
@@ -279,11 +283,12 @@ def propose(
         project: gives names and codes.
         fits: what was measured at the marks, by photograph and point.
         points: the points; all that are marked by hand if None.
+        known: earlier proposals, which are not measured again where a place hardly moved.
     """
     guide, names = following.guide, following.marked.network.images
     number, family = following.marked.point, project.survey.family
     wanted = [p for p in marking.points if points is None or p in points]
-    proposals = {}
+    found, asked = dict[tuple[str, str], Proposal](), list[tuple[tuple[str, str], Predicted, Look]]()
     for point in wanted:
         if point not in number:
             continue
@@ -292,9 +297,17 @@ def propose(
             key = names[predicted.image], point
             if key in marking.refused or key in marking.marks:
                 continue
-            measured = None if look is None else measure_predicted(read, predicted, look, family)
-            proposals[key] = Proposal(predicted, point, measured)
-    return proposals
+            before = known.get(key)
+            if before is not None and is_same_place(before.predicted, predicted):
+                found[key] = Proposal(predicted, point, before.measured)
+            else:
+                found[key] = Proposal(predicted, point)
+                asked += [] if look is None else [(key, predicted, look)]
+    with ThreadPoolExecutor(cores()) as pool:
+        measured = pool.map(lambda row: measure_predicted(read, row[1], row[2], family), asked)
+        for (key, predicted, _), fit in zip(asked, measured, strict=True):
+            found[key] = Proposal(predicted, key[1], fit)
+    return found
 
 
 def look_of(

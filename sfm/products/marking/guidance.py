@@ -35,6 +35,7 @@ CONTAINED, GATE = (
 LEAST_REACH_PX, MOST_REACH_PX = 3.0, 40.0  # around predicted places in which is measured
 MOST_SIZES, MOST_RATIO = 3.0, 2.0  # reach in sizes of a target, and change of its size
 BORDER_PX = 4.0
+SAME_PX = 0.5  # movement of a predicted place after which nothing is measured again
 NEAREST, FARTHEST = 0.3, 3.0  # of the depths of known points, within which a ray is shown
 BEYOND = 0.1  # of its sides, by which a line may leave a photograph
 
@@ -209,6 +210,13 @@ class Guide:
         if not len(depth):
             depth = np.ones(1)
         return NEAREST * float(depth.min()), FARTHEST * float(depth.max())
+
+
+def is_same_place(before: Predicted, after: Predicted) -> bool:
+    """Return whether what was measured at a place is also what would be measured at another."""
+    moved = float(np.linalg.norm(after.xy - before.xy))
+    wider = float(np.linalg.eigvalsh(after.covariance)[-1] / np.linalg.eigvalsh(before.covariance)[-1])
+    return moved <= SAME_PX and 0.5 < wider <= 1.5
 
 
 def measure_predicted(

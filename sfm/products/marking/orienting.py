@@ -40,6 +40,8 @@ from sfm.products.marking.evidence import Pose
 from sfm.survey.placing import object_scale
 
 MIN_KNOWN, MIN_COMMON = 3, 5  # marks of known points that orient a photograph, and common points of a pair
+MANY_COMMON = 8  # common points that orient a pair without other features
+MOST_PAIRS = 3  # that are tried as the first pair
 MIN_SHARE = 0.6  # of the known points of a photograph that must fit; a few marks may be wrong
 AGAIN = 1.3  # photographs over those of the last adjustment, from which all are adjusted again
 CLEAR, LEAD = (
@@ -217,11 +219,14 @@ class _Work:
 
     def orient_pair(self) -> None:
         """Orient the two photographs with the best common points, in the frame of the first."""
-        candidates = [
-            (support, i, j, points, solution)
-            for i, j in self.pairs()[:3]
-            for support, points, solution in self.solutions(i, j)
-        ]
+        candidates = []
+        for i, j in self.pairs()[:MOST_PAIRS]:
+            of_pair = [
+                (support, i, j, points, solution) for support, points, solution in self.solutions(i, j)
+            ]
+            candidates += of_pair
+            if len(of_pair) == 1 and len(of_pair[0][3]) >= MANY_COMMON:
+                break  # its marks determine it
         if not candidates:
             return
         support, i, j, _, solution = max(candidates, key=lambda row: row[0])
@@ -292,8 +297,9 @@ class _Work:
             solutions += five_point_orientations(a, b)
         with suppress(GeometryError):
             solutions += relative_orientations(a, b, tolerance=tolerance)
-        alike = self.evidence.matches(i, j)
-        if len(alike[0]):  # few marks may determine the orientation badly
+        few = len(points) < MANY_COMMON  # which may determine the orientation badly
+        alike = self.evidence.matches(i, j) if few else (a[:0], b[:0])
+        if len(alike[0]):
             with suppress(GeometryError):
                 of_all = relative_orientations(
                     np.vstack([a, alike[0]]), np.vstack([b, alike[1]]), tolerance=tolerance
@@ -304,13 +310,18 @@ class _Work:
                     for s in of_all
                     if s.inliers[rows].sum() >= MIN_SHARE * len(points)
                 ]
+        solutions = [
+            solution
+            for solution in solutions
+            if solution.kind != "infinite"
+            and np.isfinite(model_points(a, b, solution)).all(axis=1).sum() >= MIN_KNOWN + 1
+        ]
         for solution in solutions:
-            if (
-                solution.kind != "infinite"
-                and np.isfinite(model_points(a, b, solution)).all(axis=1).sum() > 3
-            ):
+            support = float(len(points))
+            if few or len(solutions) > 1:
                 pose = solution.base, solution.rotation
-                yield self.evidence.support(i, j, (np.zeros(3), np.eye(3)), pose), points, solution
+                support = self.evidence.support(i, j, (np.zeros(3), np.eye(3)), pose)
+            yield support, points, solution
 
     def put(self, i: int, pose: Pose) -> None:
         """Orient a photograph."""

@@ -8,6 +8,7 @@ Source: the DZI format of Microsoft's Deep Zoom, which OpenSeadragon reads.
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
@@ -45,6 +46,12 @@ class Kept(Generic[K, V]):
     def __contains__(self, key: K) -> bool:
         with self._lock:
             return key in self._values
+
+    @property
+    def size(self) -> int:
+        """Size of the kept values, bytes."""
+        with self._lock:
+            return sum(map(self._size, self._values.values()))
 
     def __getitem__(self, key: K) -> V:
         """Return a value, made by one thread while others that need it wait."""
@@ -93,6 +100,11 @@ class PhotographPixels:
     def is_decoded(self, i: int) -> bool:
         """Return whether the intensities of a photograph are in memory."""
         return i in self._grey
+
+    @property
+    def is_full(self) -> bool:
+        """Whether another photograph would take the memory of one that is in it."""
+        return self._grey.size > GREY_BYTES - max(map(math.prod, self._sizes))
 
     def descriptor(self, i: int) -> str:
         """Return the DZI descriptor of a photograph."""

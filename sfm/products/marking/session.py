@@ -496,11 +496,11 @@ class MarkingSession:
                 if self._closed:
                     return
                 changes, marking, last = self._changes, self._marking, self._following
-                fits = dict(self._fits)
+                fits, known = dict(self._fits), dict(self._proposals)
             following: Following | None
             try:
                 following = follow(self.project, marking, self._evidence, last)
-                proposals = propose(following, marking, self.pixels.grey, self.project, fits)
+                proposals = propose(following, marking, self.pixels.grey, self.project, fits, known=known)
                 failed = ""
             except KolinearError as error:
                 following, proposals, failed = last, {}, str(error)
@@ -512,6 +512,21 @@ class MarkingSession:
                     self._following = following  # the next round continues it
                 self._version += 1
                 self._changed.notify_all()
+            self._read_ahead()
+
+    def _read_ahead(self) -> None:
+        """Decode the oriented photographs for the next proposals, as long as nothing else is to be done."""
+        following = self._following
+        if following is None:
+            return
+        for i in np.flatnonzero(following.estimate.oriented).tolist():
+            with self._changed:
+                if self._closed or self._followed < self._changes:
+                    return
+            if self.pixels.is_full or self.pixels.is_decoded(i):
+                continue
+            with suppress(KolinearError):
+                self.pixels.grey(i)
 
     def _look_for_changed_files(self) -> None:
         """Compare the photographs that have marks with their hashes in the marks file."""
