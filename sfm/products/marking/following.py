@@ -14,9 +14,11 @@ from types import MappingProxyType
 
 import numpy as np
 
+from sfm.matching.radiometry import GreyPhotographs
 from sfm.model.camera import Camera
 from sfm.model.conventions import AnyArray, IntArray
 from sfm.model.display import counted
+from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars
 from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
@@ -27,6 +29,7 @@ from sfm.products.marking.project import GivenImagePoint, MarkedProject
 from sfm.runtime.threads import cores
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint
+from sfm.survey.measuring.templates import TemplateScene, match_templates
 
 
 @dataclass(frozen=True)
@@ -307,6 +310,64 @@ def propose(
         measured = pool.map(lambda row: measure_predicted(read, row[1], row[2], family), asked)
         for (key, predicted, _), fit in zip(asked, measured, strict=True):
             found[key] = Proposal(predicted, key[1], fit)
+    return found
+
+
+def match_single(
+    following: Following,
+    point: str,
+    marking: Marking,
+    read: Callable[[int], AnyArray],
+    project: MarkedProject,
+    fits: Mapping[tuple[str, str], Measured],
+) -> dict[tuple[str, str], Proposal]:
+    """Return the proposals of a point with one mark: its window matched along the ray of sight.
+
+    Least squares matching finds the depth at which other photographs show its surroundings alike. A feature
+    other than a natural point is then measured there by its fit.
+
+    Args:
+        following: the orientation, whose adjusted points give the surface.
+        point: the point.
+        marking: the marks; refused places are not proposed.
+        read: returns the intensities of a photograph, (H, W).
+        project: gives names and codes.
+        fits: what was measured at the marks, by photograph and point.
+    """
+    marks = [mark for mark in marking.marks.values() if mark.point == point]
+    adjustment, network, estimate = following.adjustment, following.marked.network, following.estimate
+    if len(marks) != 1 or adjustment is None or marks[0].photograph not in network.images:
+        return {}
+    mark, i = marks[0], network.images.index(marks[0].photograph)
+    look = look_of(point, marking, read, project, fits)
+    if look is None or not estimate.oriented[i]:
+        return {}
+    seen = network.image_points.select(adjustment.rows)
+    scene = TemplateScene(
+        network,
+        estimate,
+        replace(seen, source=None, stated=None).select(~adjustment.adjustment.rejected),
+        GreyPhotographs(read),
+    )
+    window_px, levels = project.survey.texture.window_px, project.survey.adjust.levels
+    try:
+        rays = match_templates(
+            scene, i, np.array([[mark.x, mark.y]]), np.full((1, 3), np.nan), window_px, levels, cores()
+        ).image_points
+    except GeometryError:
+        return {}
+    found, half = dict[tuple[str, str], Proposal](), window_px // 2
+    box = half * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    for j, xy, C in zip(rays.image.tolist(), rays.xy, rays.covariance, strict=True):
+        key = network.images[j], point
+        if j == i or key in marking.refused or key in marking.marks:
+            continue
+        predicted = Predicted(j, xy, C)
+        if look.kind == "window":
+            fit: Measured | None = Measured(float(xy[0]), float(xy[1]), C, "window", xy + box)
+        else:
+            fit = measure_predicted(read, predicted, look, project.survey.family)
+        found[key] = Proposal(predicted, point, fit)
     return found
 
 

@@ -30,6 +30,7 @@ from sfm.products.marking.following import (
     automatic_image_points,
     follow,
     marks_needed,
+    match_single,
     propose,
     scale_bars,
     sentence_of,
@@ -87,6 +88,7 @@ class MarkingSession:
         self._changes = 1  # of the marks, since the beginning
         self._followed = 0  # changes that the orientation follows
         self._failed = ""  # why the orientation failed
+        self._latest = ""  # point of the last click
         self._worker = threading.Thread(target=self._follow_changes, name="marks", daemon=True)
         self._worker.start()
 
@@ -163,6 +165,7 @@ class MarkingSession:
                 raise MarkError("a name of plain text is needed for the point")
             mark = self._mark_of(name, point, measured)
             self._fits[mark.key] = measured
+            self._latest = point
             self._change(self._with_hash(marking.with_mark(mark), image))
             return {"mark": self._shown_mark(mark), "note": measured.note, "state": self._state()}
 
@@ -497,10 +500,12 @@ class MarkingSession:
                     return
                 changes, marking, last = self._changes, self._marking, self._following
                 fits, known = dict(self._fits), dict(self._proposals)
+                latest = self._latest
             following: Following | None
             try:
                 following = follow(self.project, marking, self._evidence, last)
                 proposals = propose(following, marking, self.pixels.grey, self.project, fits, known=known)
+                proposals |= match_single(following, latest, marking, self.pixels.grey, self.project, fits)
                 failed = ""
             except KolinearError as error:
                 following, proposals, failed = last, {}, str(error)
