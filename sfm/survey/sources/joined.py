@@ -20,16 +20,17 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import LEVEL, chi2_isf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, ScaleBars, without_given
+from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of, without_given
 from sfm.model.reduced_network import reduce_network, select_determined
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.image_rays import intersect_image_points
 from sfm.orientation.incremental.sequence import Orientation
 from sfm.photographs.reading import decoding_once
 from sfm.runtime.progress import Progress, StageClock
-from sfm.survey.inputs.measurements import NO_NAMES, Measurements, PhotographList
+from sfm.survey.inputs.measurements import NO_NAMES, Measurements, Naming, PhotographList
 from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.sources import Declared, declared
 from sfm.survey.inputs.start import network_of, scale_bars
@@ -41,6 +42,9 @@ from sfm.survey.measuring.targets import each_photograph
 from sfm.survey.orientation import Oriented
 from sfm.survey.sources.repeated import without_repeated
 from sfm.survey.sources.source import Correspondences, SurveySource
+
+SAME_PX = 0.1  # by which two measurements of one target differ, whatever their stated precision
+MIN_SAME = 2  # photographs in which a point without a name is where another is
 
 
 def sources_of(survey: Survey | SurveyFile) -> tuple[tuple[Declared, SurveySource], ...]:
@@ -173,6 +177,70 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
 
 def _of_one_source(survey: Survey, network: Network) -> Network:
     return replace(network, sources=tuple(row.source for row in declared(survey)))
+
+
+def _named_as_given(completed: Sequence[Correspondences]) -> list[Correspondences]:
+    """Return the points of all sources, where those without a name that others name have this name.
+
+    A target without a code that a person marked too is one point. It is that of the mark where both are at
+    the same place in most photographs that show both, and in two at least.
+    """
+    named = []
+    for k, matched in enumerate(completed):
+        names = dict[str, str]()
+        for j, other in enumerate(completed):
+            if j != k:
+                names = _same_points(matched, other) | names
+        points = tuple(names.get(name, name) for name in matched.network.points)
+        named.append(replace(matched, network=replace(matched.network, points=points)))
+    return named
+
+
+def _naming_of(
+    completed: Sequence[Correspondences], before: Sequence[Sequence[str]], after: Sequence[Sequence[str]]
+) -> Naming:
+    """Return the naming of the targets, with the names that their points have after others named them."""
+    for matched, old, new in zip(completed, before, after, strict=True):
+        if matched.naming.names:
+            names = dict(zip(old, new, strict=True))
+            return replace(
+                matched.naming, names=tuple(names.get(name, name) for name in matched.naming.names)
+            )
+    return NO_NAMES
+
+
+def _same_points(matched: Correspondences, other: Correspondences) -> dict[str, str]:
+    """Return the names that another source has for points of one without a name."""
+    running, given = _running(matched), set(other.network.points) - _running(other)
+    a, b = matched.network, other.network
+    if not running or not given:
+        return {}
+    unnamed = np.array([name in running for name in a.points], dtype=bool)
+    has_name = np.array([name in given for name in b.points], dtype=bool)
+    index = {name: i for i, name in enumerate(b.images)}
+    both = np.zeros((len(a.points), len(b.points)), dtype=np.int64)
+    alike = both.copy()
+    of_a, of_b = a.image_points, b.image_points
+    rows_a, rows_b = rows_of(of_a.image, len(a.images)), rows_of(of_b.image, len(b.images))
+    for i, name in enumerate(a.images):
+        if name not in index:
+            continue
+        first = rows_a[i][unnamed[of_a.point[rows_a[i]]]]
+        second = rows_b[index[name]]
+        second = second[has_name[of_b.point[second]]]
+        if not (len(first) and len(second)):
+            continue
+        pairs = np.ix_(of_a.point[first], of_b.point[second])
+        both[pairs] += 1
+        d = of_a.xy[first][:, None] - of_b.xy[second]
+        C = of_a.covariance[first][:, None] + of_b.covariance[second] + SAME_PX**2 * np.eye(2)
+        square = np.einsum("abi,abij,abj->ab", d, np.linalg.inv(C), d)
+        alike[pairs] += square <= chi2_isf(LEVEL, 2)
+    names = dict[str, str]()
+    for p, q in np.argwhere((alike >= MIN_SAME) & (2 * alike > both)).tolist():
+        names.setdefault(a.points[p], b.points[q])
+    taken = list(names.values())
+    return {name: new for name, new in names.items() if taken.count(new) == 1 and new not in a.points}
 
 
 def _renamed(parts: Sequence[Measurements | Correspondences]) -> list[Network]:
@@ -325,6 +393,8 @@ def _joined_correspondences(
     """Return the image points of all sources in the orientation of all photographs."""
     if len(completed) == 1:
         return replace(completed[0], network=_of_one_source(survey, completed[0].network))
+    without_names = [matched.network.points for matched in completed]
+    completed = _named_as_given(completed)
     named = [matched.network.points for matched in completed]
     completed = [
         replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
@@ -357,7 +427,7 @@ def _joined_correspondences(
         network,
         estimate,
         min_rays,
-        next((matched.naming for matched in completed if matched.naming.names), NO_NAMES),
+        _naming_of(completed, without_names, named),
         next((matched.eccentricity for matched in completed if matched.eccentricity is not None), None),
         tuple(name for matched in completed for name in matched.no_circles),
         tuple(said for matched in completed for said in matched.remarks) + repeated.of_sources,

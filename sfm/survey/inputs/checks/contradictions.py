@@ -335,6 +335,8 @@ def _of_control(survey: Described) -> Iterator[str]:
     if survey.datum.kind != "control":
         return
     observed = survey.exterior is not None or survey.exif_sigma_m is not None
+    if getattr(survey, "marked", None) is not None:  # of a survey file: the marks file may state control
+        return
     if not (survey.control is not None or observed or plate_control(survey.targets) is not None):
         yield "datum kind 'control' needs [control] with the file of known points, or [exterior]"
     given = survey.control if isinstance(survey.control, KnownPoints) else None
