@@ -29,7 +29,7 @@ from sfm.model.camera import (
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
-from sfm.model.distributions import level_of_single, t_ppf
+from sfm.model.distributions import chi2_isf, f_isf, level_of_single, t_ppf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import InteriorObservations, Network
@@ -37,6 +37,7 @@ from sfm.model.reduced_network import merge_estimate, reduce_network
 from sfm.products.marking.orienting import MIN_KNOWN, determined_part
 from sfm.survey.free_parameters import C_SIGMA
 
+CONTAINED = 0.05  # probability that a place is outside its ellipse
 MOST_DOUBTED = 4  # marks that are left out for trial
 MAX_STEPS, TOLERANCE = 40, 1e-3  # marks that were only begun determine some parameters hardly at all
 MOST_REJECTED = 0.1  # of the marks; measured marks are hardly ever wrong
@@ -82,10 +83,16 @@ class MarkAdjustment:
 
     @property
     def variance_factor(self) -> float:
-        """Factor on cofactors: the residuals, and as long as there are few, the stated precision."""
+        """Factor on cofactors: the residuals, and as long as there are few, the stated precision.
+
+        It is as much larger as a sigma0 from this redundancy makes regions of 95 %.
+        """
         a = self.adjustment
-        vPv = a.sigma0**2 * a.redundancy if a.redundancy > 0 and np.isfinite(a.sigma0) else 0.0
-        return (PRIOR_REDUNDANCY + vPv) / (PRIOR_REDUNDANCY + max(a.redundancy, 0))
+        r = float(np.nansum(a.redundancy_numbers)) if a.redundancy > 0 else 0.0  # of the marks alone
+        vPv = a.image_sigma0**2 * r if r > 0 else 0.0
+        r += PRIOR_REDUNDANCY
+        wider = 2 * float(f_isf(CONTAINED, 2, r)) / float(chi2_isf(CONTAINED, 2))
+        return (PRIOR_REDUNDANCY + vPv) / r * wider
 
     @cached_property
     def joint(self) -> JointPrecision | None:

@@ -23,15 +23,12 @@ from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.orientation.image_rays import intersect_image_points
-from sfm.products.marking.adjusting import MarkAdjustment
+from sfm.products.marking.adjusting import CONTAINED, MarkAdjustment
 from sfm.products.marking.clicks import Measured, Template, measure_click
 from sfm.survey.inputs.marks_file import Kind
 from sfm.targets.codes.plates import TargetFamily
 
-CONTAINED, GATE = (
-    0.05,
-    0.001,
-)  # probability that a place is outside its ellipse, and outside where it is measured
+GATE = 0.001  # probability that a place is outside where it is measured
 LEAST_REACH_PX, MOST_REACH_PX = 3.0, 40.0  # around predicted places in which is measured
 MOST_SIZES, MOST_RATIO = 3.0, 2.0  # reach in sizes of a target, and change of its size
 BORDER_PX = 4.0
@@ -252,7 +249,6 @@ def measure_predicted(
     if look.size_px > 0 and not 1 / MOST_RATIO <= measured.size_px / look.size_px <= MOST_RATIO:
         return None
     off = np.array([measured.x, measured.y]) - predicted.xy
-    C = (
-        predicted.covariance + measured.covariance + 0.25 * np.eye(2)
-    )  # half a pixel for what is not adjusted yet
+    # half a pixel for what is not adjusted yet
+    C = predicted.covariance + measured.covariance + SAME_PX**2 * np.eye(2)
     return measured if off @ np.linalg.solve(C, off) <= chi2_isf(GATE, 2) else None

@@ -44,10 +44,8 @@ MANY_COMMON = 8  # common points that orient a pair without other features
 MOST_PAIRS = 3  # that are tried as the first pair
 MIN_SHARE = 0.6  # of the known points of a photograph that must fit; a few marks may be wrong
 AGAIN = 1.3  # photographs over those of the last adjustment, from which all are adjusted again
-CLEAR, LEAD = (
-    0.25,
-    2.0,
-)  # part of its support, and features, by which the best orientation leads if it is clear
+# Part of its support, and features, by which the best orientation leads if it is clear.
+CLEAR, LEAD = 0.25, 2.0
 ALIKE_DEG = 15.0  # between orientations that are no rivals, but one with and without further features
 
 

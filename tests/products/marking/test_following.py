@@ -11,9 +11,9 @@ from sfm.model.distributions import chi2_isf
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, empty_estimate
 from sfm.orientation.relative import five_point_orientations
-from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
+from sfm.products.marking.adjusting import CONTAINED, MarkAdjustment, adjust_marks
 from sfm.products.marking.evidence import Pose
-from sfm.products.marking.guidance import CONTAINED, Guide
+from sfm.products.marking.guidance import Guide
 from sfm.products.marking.orienting import HandOrientation, orient_by_hand
 from tests.products.marking.photographs import LENS, network_of_points, seen_points, stations
 
@@ -223,10 +223,16 @@ def spoiled(rng: np.random.Generator, *, neighbour: bool, control: bool) -> tupl
 
 
 @pytest.mark.parametrize("control", [False, True])
-def test_a_wrong_mark_among_12_is_named_in_95_of_100(control: bool) -> None:
+def test_a_wrong_mark_among_12_is_named(control: bool) -> None:
     rng = np.random.default_rng(7)
-    named = [spoiled(rng, neighbour=k % 2 == 0, control=control)[0] for k in range(100)]
-    assert sum(named) >= 95
+    assert sum(spoiled(rng, neighbour=k % 2 == 0, control=control)[0] for k in range(20)) >= 19
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("control", [False, True])
+def test_a_wrong_mark_among_12_is_named_in_95_of_100(control: bool) -> None:
+    rng = np.random.default_rng(8)
+    assert sum(spoiled(rng, neighbour=k % 2 == 0, control=control)[0] for k in range(200)) >= 190
 
 
 def test_right_marks_are_seldom_called_wrong() -> None:
