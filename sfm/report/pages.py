@@ -116,7 +116,7 @@ def write_declared(page: Page, out: Path, *, also: Callable[[Path], None] | None
 
 def html(page: Page) -> str:
     """Return a page as HTML."""
-    style, script = source("report.css"), source("tables.js")
+    style, script = source("base.css") + source("report.css"), source("tables.js")
     policy = content_policy(
         [style, page.viewer.style] if page.viewer else [style],
         [page.viewer.script, script] if page.viewer else [script],
@@ -133,7 +133,7 @@ def data_url(data: bytes, kind: str) -> str:
 
 @cache
 def source(name: str) -> str:
-    """Return the style sheet or the script shared by all pages."""
+    """Return a style sheet or the script shared by all pages."""
     return files("sfm.report").joinpath(f"templates/{name}").read_text(encoding="utf-8")
 
 

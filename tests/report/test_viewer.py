@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -23,13 +24,15 @@ from tests.synthetic import SIZE_PX, make_network, seed_of
 SOURCE = ROOT / "viewer"
 
 
-def test_the_committed_script_is_what_its_sources_give(tmp_path: Path) -> None:
+def test_the_committed_scripts_are_what_their_sources_give(tmp_path: Path) -> None:
     node = shutil.which("node")
     if node is None or not (SOURCE / "node_modules" / "esbuild").is_dir():
         pytest.skip("no node, or no viewer/node_modules (npm ci in viewer): the viewer is not built again")
-    built = tmp_path / "viewer.js"
-    subprocess.run([node, str(SOURCE / "build.mjs"), str(built)], check=True, cwd=SOURCE, timeout=120)
-    assert built.read_text(encoding="utf-8") == sources()[0]
+    subprocess.run([node, str(SOURCE / "build.mjs"), str(tmp_path)], check=True, cwd=SOURCE, timeout=120)
+    built = {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()}
+    page = files("sfm.products.marking") / "page"
+    committed = {name: (page / name).read_text(encoding="utf-8") for name in ("mark.js", "mark.css")}
+    assert built == {"viewer.js": sources()[0], **committed}
 
 
 def test_the_script_fits_into_a_page_and_names_its_licences() -> None:

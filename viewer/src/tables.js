@@ -74,6 +74,15 @@ export class Table {
     this.order()
   }
 
+  /** Take over other rows, and the active one, where the table was scrolled to. */
+  renew(rows, active) {
+    const top = this.box.scrollTop
+    this.all = rows
+    this.filter()
+    this.box.scrollTop = top
+    if (active !== this.active) this.reveal(active)
+  }
+
   draw() {
     const height = this.box.clientHeight || 300
     const first = Math.max(0, Math.floor(this.box.scrollTop / ROW_PX) - SPARE)
