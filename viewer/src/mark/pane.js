@@ -64,9 +64,12 @@ export class Pane {
       if (there) actions.choose(this, there.point)
       else if (this.contains(place)) actions.click(this, place, event.shift)
     })
-    viewer.addHandler("update-viewport", () => this.draw())
+    viewer.addHandler("update-viewport", () => {
+      const { viewport } = viewer
+      if (this.whole && Math.abs(viewport.getZoom() / viewport.getHomeZoom() - 1) > 1e-6) viewport.goHome(true)
+      this.draw()
+    })
     viewer.addHandler("open", () => this.opened())
-    viewer.addHandler("after-resize", () => this.whole && viewer.viewport.goHome(true))
     for (const gesture of ["canvas-drag", "canvas-scroll", "canvas-pinch"]) viewer.addHandler(gesture, () => (this.whole = false))
     viewer.addHandler("open-failed", () => this.warn("The photograph cannot be shown."))
     viewer.addHandler("tile-load-failed", () => this.warn("A part of the photograph cannot be shown."))
