@@ -40,8 +40,10 @@ def chromium() -> Iterator[Any]:
 class Tab:
     """A page in the browser, with everything that it complained of and asked for."""
 
-    def __init__(self, browser: Any, file: Path, *, width: int = 1300, **context: Any) -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": 900}, **context)
+    def __init__(
+        self, browser: Any, page: Path | str, *, width: int = 1300, height: int = 900, **context: Any
+    ) -> None:
+        self.context = browser.new_context(viewport={"width": width, "height": height}, **context)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
         self.requests: list[str] = []
@@ -49,7 +51,7 @@ class Tab:
         self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.set_default_timeout(WAIT_MS)
-        self.page.goto(file.as_uri())
+        self.page.goto(page if isinstance(page, str) else page.as_uri())
 
     def _hear(self, message: Any) -> None:
         own = "willReadFrequently" in message.text  # tests read the pixels of the page's pictures

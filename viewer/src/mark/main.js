@@ -34,7 +34,7 @@ class Page {
     this.tools = make("div", { className: "v-tools", role: "toolbar", "aria-label": "tools" })
     this.grid = make("main", { id: "m-panes" })
     this.side = make("aside", { id: "m-side", "aria-label": "points and adjustment" })
-    const film = make("nav", { id: "m-strip", "aria-label": "photographs" })
+    const film = make("nav", { id: "m-strip", "aria-label": "filmstrip" })
     this.strip = new Strip(this.model, film, (image) => this.showIn(this.pane, image))
     root.replaceChildren(make("header", { id: "m-head" }, this.title, this.next, this.run), this.lost, this.tools, this.told, this.grid, film, this.side)
     this.hub.on("state", (state) => this.take(state))
@@ -136,7 +136,7 @@ class Page {
       sigma.value = this.model.sigma_px
     })
     this.sigma = make("label", { className: "v-choice", hidden: true }, "sigma ", sigma, " px")
-    this.layouts = choice("photographs", LAYOUTS.map((n) => [n, String(n)]), (n) => this.layOut(Number(n)), { title: "side by side (L)" })
+    this.layouts = choice("side by side", LAYOUTS.map((n) => [n, String(n)]), (n) => this.layOut(Number(n)), { title: "photographs side by side (L)" })
     this.sliders = Object.fromEntries(["brightness", "contrast"].map((name) => [name, this.slider(name)]))
     this.ticks = {
       names: tick("names", true, () => this.toggle("names")),

@@ -12,6 +12,7 @@ class Stranger extends Error {}
 
 export class Server {
   #last = Promise.resolve() // the change sent last: changes reach the program in the order of the clicks
+  #poll = null // ends the request that waits for a newer state
   #waiting = [] // told as soon as the program answers again
 
   /** @param hub hears `state` with each newer state, `lost` with a sentence and `back`. */
@@ -19,6 +20,11 @@ export class Server {
     this.hub = hub
     this.version = null
     this.failures = 0
+    this.open = 0 // changes that are not answered yet
+  }
+
+  get idle() {
+    return this.open === 0
   }
 
   /** Keep the state current: each request waits in the program until there is a newer one. */
@@ -26,7 +32,8 @@ export class Server {
     for (;;) {
       try {
         const fresh = this.version === null || this.failures > 0
-        this.#take(await this.#ask(fresh ? "state" : `state?after=${this.version}`), fresh)
+        this.#poll = new AbortController()
+        this.#take(await this.#ask(fresh ? "state" : `state?after=${this.version}`, { signal: AbortSignal.any([this.#poll.signal, AbortSignal.timeout(PATIENCE_MS)]) }), fresh)
         this.#answered()
       } catch (error) {
         await this.#lose(error)
@@ -46,7 +53,8 @@ export class Server {
       follow(answer)
       return answer
     })
-    this.#last = sent.catch(() => {})
+    this.open += 1
+    this.#last = sent.catch(() => {}).finally(() => (this.open -= 1))
     return sent
   }
 
@@ -59,9 +67,9 @@ export class Server {
         answer = await this.#ask(what, options)
       } catch (error) {
         if (error instanceof Refusal) throw error
-        this.hub.tell("lost", lostWords(error))
-        this.failures ||= 1
-        await new Promise((resolve) => this.#waiting.push(resolve))
+        const back = new Promise((resolve) => this.#waiting.push(resolve))
+        this.#poll?.abort() // ask at once whether the program still answers
+        await back
         if (this.version !== before) throw new Refusal("The program did not answer in time. Look whether the last change was made; if not, make it again.")
         continue
       }

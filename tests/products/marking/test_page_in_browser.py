@@ -1,0 +1,362 @@
+"""The page for marking in a real browser, with the server that `kolinear mark` runs, as a person would use it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm.model.conventions import FloatArray
+from sfm.products.marking.project import project_of_survey
+from sfm.products.marking.server import MarkingServer
+from sfm.products.marking.session import MarkingSession
+from sfm.survey.inputs.marks_file import read_marks
+from sfm.survey.inputs.survey import read_survey
+from tests.browser import Tab, chromium
+
+SIZE = (900, 640)
+DISCS = np.array([[x, y] for y in (120.25, 320.5, 520.75) for x in (150.25, 350.5, 550.75, 750.0)])
+SHIFT = np.array([7.5, -4.25])  # of the second photograph against the first, px
+EVIL = "<img src=x onerror=document.title='broken'>"
+OWN_ERRORS = "status of 422"  # the browser reports what the server refuses, as the page does
+
+PLACE = """([pane, x, y]) => {
+  const shown = document.getElementById('marking').page.panes[pane]
+  const box = shown.view.getBoundingClientRect()
+  const [left, top] = shown.frame().at([x, y])
+  return [box.left + left, box.top + top]
+}"""
+STATE = "() => document.getElementById('marking').page.model.state"
+PAGE = "document.getElementById('marking').page"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A running browser; the test is skipped where there is none."""
+    with chromium() as running:
+        yield running
+
+
+@contextmanager
+def served(survey: Path, marks: Path) -> Iterator[MarkingServer]:
+    """Serve the page of a survey file, in a thread."""
+    session = MarkingSession(project_of_survey(read_survey(survey), survey_file=survey), marks)
+    server = MarkingServer(session)
+    thread = threading.Thread(target=server.serve, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        session.close()
+        server.stop()
+        thread.join(20)
+
+
+@dataclass
+class Marking:
+    """An open page, with what a person does there."""
+
+    tab: Tab
+    pressed: int = 0  # clicks and keys
+
+    @property
+    def page(self) -> Any:
+        return self.tab.page
+
+    @property
+    def state(self) -> Any:
+        return self.page.evaluate(STATE)
+
+    def ready(self) -> Marking:
+        self.page.wait_for_selector(".m-view[data-ready]")
+        self.tab.until(f"() => {PAGE}.panes.every((pane) => pane.ready)")
+        return self
+
+    def click(self, pane: int, place: Sequence[float], **options: Any) -> None:
+        self.pressed += 1
+        self.page.mouse.click(*self.page.evaluate(PLACE, [pane, *map(float, place)]), **options)
+        self.settled()
+
+    def key(self, key: str) -> None:
+        self.pressed += 1
+        self.page.keyboard.press(key)
+        self.settled()
+
+    def settled(self) -> None:
+        """Wait until the program has answered what was asked."""
+        self.tab.until(f"() => {PAGE}.server.idle")
+
+    def said(self) -> str:
+        return str(self.page.locator("#m-said").inner_text())
+
+    def close(self) -> None:
+        complaints = [text for text in self.tab.complaints if OWN_ERRORS not in text]
+        assert complaints == []
+        self.tab.close()
+
+
+def open_page(browser: Any, server: MarkingServer, **options: Any) -> Marking:
+    return Marking(Tab(browser, server.address.url, **options)).ready()
+
+
+def picture(places: FloatArray) -> Any:
+    """Return a photograph of discs of 9 px diameter and of one single bright pixel."""
+    big = np.full((SIZE[1] * 4, SIZE[0] * 4), 60, np.uint8)
+    for x, y in places:
+        centre = tuple(int(round(16 * (4 * (v + 0.5) - 0.5))) for v in (x, y))
+        cv2.circle(big, centre, 16 * 18, 210, -1, cv2.LINE_AA, 4)
+    small = cv2.resize(big, SIZE, interpolation=cv2.INTER_AREA)
+    noise = np.random.default_rng(5).normal(0, 1.0, small.shape)
+    return np.clip(cv2.GaussianBlur(small, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8)
+
+
+SURVEY = f"""
+[survey]
+name = "discs"
+unit = "mm"
+[[camera]]
+name = "scene"
+images = "*.png"
+size_px = [{SIZE[0]}, {SIZE[1]}]
+pixel_mm = [0.005, 0.005]
+c_mm = 8.0
+[targets]
+codes = "none"
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four photographs of discs, one of them with a name that would be markup."""
+    folder = tmp_path_factory.mktemp("discs")
+    for i in range(3):
+        cv2.imwrite(str(folder / f"photo {i + 1}.png"), picture(DISCS + i * SHIFT))
+    cv2.imwrite(str(folder / f"{EVIL}.png"), picture(DISCS[:1]))
+    (folder / "survey.toml").write_text(SURVEY, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture
+def discs(browser: Any, folder: Path, tmp_path: Path) -> Iterator[Marking]:
+    """The page of photographs of discs, without marks."""
+    with served(folder / "survey.toml", tmp_path / "marks.csv") as server:
+        marking = open_page(browser, server)
+        yield marking
+        assert all(url.startswith(server.address.url) for url in marking.tab.requests if url[:5] != "data:")
+        marking.close()
+
+
+def pane_of(marking: Marking, name: str) -> None:
+    marking.page.locator(".m-pane select").first.select_option(label=name)
+    marking.ready()
+
+
+def test_a_click_measures_and_its_mark_lies_on_the_disc(discs: Marking) -> None:
+    page = discs.page
+    image = next(p["index"] for p in discs.state["photographs"] if p["name"] == "photo 1.png")
+    pane_of(discs, "photo 1.png")
+    discs.click(0, DISCS[5] + (2.5, -2))
+    (mark,) = discs.state["marks"]
+    assert (mark["image"], mark["point"], mark["kind"], mark["by"]) == (image, "P1", "target", "measured")
+    np.testing.assert_allclose([mark["x"], mark["y"]], DISCS[5], atol=0.05)
+    assert "P1 in photo 1.png: target, sigma" in discs.said()
+    assert page.locator(".m-card h2").first.inner_text() == "Point P1"
+    picture = page.locator(".m-fit img")
+    discs.tab.until("() => document.querySelector('.m-fit img')?.naturalWidth > 50")
+    assert picture.get_attribute("alt") == "fit of P1 in photo 1.png"
+    discs.key("g")  # large
+    page.wait_for_timeout(300)
+    place = page.evaluate(PLACE, [0, mark["x"], mark["y"]])
+    page.evaluate(
+        "() => { for (const c of document.querySelectorAll('.m-overlay')) c.style.visibility = 'hidden' }"
+    )
+    clip = {"x": round(place[0]) - 60, "y": round(place[1]) - 60, "width": 120, "height": 120}
+    shot = cv2.imdecode(np.frombuffer(page.screenshot(clip=clip), np.uint8), cv2.IMREAD_GRAYSCALE)
+    bright = np.clip(shot.astype(float) - 130, 0, None)
+    rows, columns = np.indices(shot.shape)
+    centre = np.array([(bright * columns).sum(), (bright * rows).sum()]) / bright.sum() + 0.5
+    np.testing.assert_allclose(
+        centre + [clip["x"], clip["y"]], place, atol=0.6
+    )  # px of the screen, magnified
+
+
+def test_nothing_to_measure_is_said_and_by_hand_it_is_marked(discs: Marking) -> None:
+    pane_of(discs, "photo 1.png")
+    empty = (450.0, 220.0)
+    discs.key("1")
+    discs.click(0, empty)
+    assert discs.state["marks"] == [] and "no target can be measured" in discs.said()
+    discs.key("7")
+    discs.page.get_by_label("sigma").fill("0.5")
+    discs.page.get_by_label("sigma").press("Tab")
+    discs.click(0, empty)
+    (mark,) = discs.state["marks"]
+    assert (mark["kind"], mark["by"], mark["sigma"]) == ("hand", "hand", [0.5, 0.5])
+    np.testing.assert_allclose([mark["x"], mark["y"]], empty, atol=1.0)
+
+
+def test_marks_are_renamed_measured_again_deleted_and_all_is_undone(discs: Marking, tmp_path: Path) -> None:
+    page = discs.page
+    pane_of(discs, "photo 1.png")
+    discs.click(0, DISCS[0])
+    discs.click(0, DISCS[1])
+    assert {mark["point"] for mark in discs.state["marks"]} == {"P1", "P2"}
+    discs.click(0, DISCS[0])  # chooses what is there
+    assert page.locator(".m-aim b").inner_text() == "P1" and len(discs.state["marks"]) == 2
+    discs.key("r")
+    page.get_by_label("name", exact=True).fill(EVIL)
+    page.keyboard.press("Enter")
+    discs.tab.until("(name) => document.querySelector('.m-card h2').textContent === 'Point ' + name", EVIL)
+    discs.tab.until("() => !document.querySelector('dialog')")
+    page.keyboard.down("Shift")
+    discs.click(0, DISCS[2])
+    page.keyboard.up("Shift")
+    moved = next(mark for mark in discs.state["marks"] if mark["point"] == EVIL)
+    np.testing.assert_allclose([moved["x"], moved["y"]], DISCS[2], atol=0.05)
+    discs.key("Delete")
+    assert [mark["point"] for mark in discs.state["marks"]] == ["P2"]
+    for _ in range(5):
+        discs.key("z")
+    assert discs.state["marks"] == [] and not discs.state["can_undo"]
+    discs.key("Shift+Z")
+    assert [mark["point"] for mark in discs.state["marks"]] == ["P1"]
+    assert [key[1] for key in read_marks(tmp_path / "marks.csv").marks] == ["P1"]
+    assert "broken" not in page.title()
+
+
+def test_control_and_bars_are_stated_in_forms(discs: Marking) -> None:
+    page = discs.page
+    pane_of(discs, "photo 1.png")
+    discs.click(0, DISCS[0])
+    discs.click(0, DISCS[1])
+    discs.key("c")
+    for field, value in (
+        ("X [mm]", "1.5"),
+        ("Y [mm]", "-2"),
+        ("Z [mm]", "x"),
+        *((f"sigma {a} [mm]", "0.01") for a in "XYZ"),
+    ):
+        page.get_by_label(field, exact=True).fill(value)
+    page.keyboard.press("Enter")
+    assert page.get_by_role("alert").get_by_text("x is not a number.").count() == 1
+    page.get_by_label("Z [mm]", exact=True).fill("0,25")
+    page.keyboard.press("Enter")
+    discs.tab.until("() => !document.querySelector('dialog')")
+    point = next(p for p in discs.state["points"] if p["name"] == "P2")
+    assert point["control"] == {"X": [1.5, -2, 0.25], "sigma": [0.01] * 3}
+    discs.key("b")
+    page.get_by_label("to point").fill("P1")
+    page.get_by_label("length [mm]").fill("400.003")
+    page.get_by_label("sigma [mm]").fill("0.004")
+    page.keyboard.press("Enter")
+    discs.tab.until("() => !document.querySelector('dialog')")
+    (bar,) = discs.state["bars"]
+    assert (bar["start"], bar["end"], bar["length"], bar["sigma"]) == ("P2", "P1", 400.003, 0.004)
+    page.get_by_role("button", name="delete the bar from P2 to P1").click()
+    discs.settled()
+    assert discs.state["bars"] == []
+
+
+def test_two_pages_keep_each_other_current(browser: Any, folder: Path, tmp_path: Path) -> None:
+    with served(folder / "survey.toml", tmp_path / "marks.csv") as server:
+        pages = [open_page(browser, server), open_page(browser, server)]
+        for page in pages:
+            pane_of(page, "photo 1.png")
+        pages[0].click(0, DISCS[0])
+        pages[1].tab.until("() => document.getElementById('marking').page.model.state.marks.length === 1")
+        pages[1].click(0, DISCS[1])
+        pages[0].tab.until("() => document.getElementById('marking').page.model.state.marks.length === 2")
+        names = [sorted(mark["point"] for mark in page.state["marks"]) for page in pages]
+        assert names == [["P1", "P2"], ["P1", "P2"]]
+        for page in pages:
+            page.close()
+
+
+def test_a_lost_program_is_told_and_the_click_is_made_when_it_answers(discs: Marking) -> None:
+    page = discs.page
+    pane_of(discs, "photo 1.png")
+    page.route("**/*", lambda route: route.abort())
+    page.mouse.click(*page.evaluate(PLACE, [0, *DISCS[3]]))
+    page.locator("#m-lost", has_text="does not answer").wait_for()
+    assert discs.state["marks"] == []
+    page.unroute("**/*")
+    discs.settled()
+    page.locator("#m-lost").wait_for(state="hidden")
+    assert [mark["point"] for mark in discs.state["marks"]] == ["P1"]
+    discs.tab.complaints[:] = [text for text in discs.tab.complaints if "ERR_FAILED" not in text]
+
+
+def test_everything_is_done_by_keys(discs: Marking) -> None:
+    page = discs.page
+    page.keyboard.press("?")
+    assert page.locator("dialog kbd").count() > 40
+    page.keyboard.press("Escape")
+    page.locator(".m-view").first.focus()
+    start = page.evaluate(f"() => {PAGE}.panes.map((pane) => pane.image)")
+    discs.key(".")
+    assert page.evaluate(f"() => {PAGE}.panes[0].image") == start[0] + 1
+    discs.ready()
+    place = page.evaluate(
+        f"() => {{ const p = {PAGE}.panes[0]; return p.placeAt(p.view.clientWidth / 2, p.view.clientHeight / 2) }}"
+    )
+    goal = DISCS[5]
+    discs.key("ArrowRight")  # shows the crosshair
+    scale = page.evaluate(f"() => {PAGE}.panes[0].frame().scale")
+    steps = np.rint((goal - place) * scale).astype(int)
+    for count, keys in zip(steps, (("ArrowLeft", "ArrowRight"), ("ArrowUp", "ArrowDown")), strict=True):
+        for _ in range(abs(count) // 10):
+            discs.key(keys[int(count > 0)])
+        for _ in range(abs(count) % 10):
+            discs.key(f"Shift+{keys[int(count > 0)]}")
+    discs.key("Space")
+    (mark,) = discs.state["marks"]
+    np.testing.assert_allclose([mark["x"], mark["y"]], goal, atol=0.05)
+    before = page.evaluate(f"() => {{ const p = {PAGE}; return [p.lights.brightness, p.lights.contrast] }}")
+    for key in ("]", "]", "[", "}", "l", "h", "v", "t", "f", "PageDown"):
+        discs.key(key)
+    discs.ready()
+    after = page.evaluate(f"() => {{ const p = {PAGE}; return [p.lights.brightness, p.lights.contrast] }}")
+    assert after[0] > before[0] and after[1] > before[1]
+    assert page.locator(".m-pane").count() == 4
+    assert "brightness(1.15)" in page.locator(".m-stage canvas").first.evaluate(
+        "(c) => getComputedStyle(c).filter"
+    )
+    # the focus is seen wherever Tab leads
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        outline = page.evaluate(
+            "() => { const one = document.activeElement; return one === document.body || getComputedStyle(one).outlineStyle !== 'none' }"
+        )
+        assert outline
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 800])
+def test_the_page_is_readable(browser: Any, folder: Path, tmp_path: Path, scheme: str, width: int) -> None:
+    with served(folder / "survey.toml", tmp_path / "marks.csv") as server:
+        marking = open_page(browser, server, width=width, color_scheme=scheme)
+        pane_of(marking, "photo 1.png")
+        marking.click(0, DISCS[0])
+        page = marking.page
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        ground, ink = page.evaluate(
+            "() => { const s = getComputedStyle(document.body); return [s.backgroundColor, s.color] }"
+        )
+        light = [sum(int(v) for v in text[4:-1].split(",")) for text in (ground, ink)]
+        assert (light[0] > light[1]) == (scheme == "light")
+        for count in ("1", "4"):
+            page.get_by_label("side by side", exact=True).select_option(count)
+            marking.ready()
+            sizes = page.locator(".m-view").evaluate_all(
+                "all => all.map((v) => [v.clientWidth, v.clientHeight])"
+            )
+            assert len(sizes) == int(count) and np.min(sizes) > 150
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        marking.close()
