@@ -92,7 +92,7 @@ export function showHelp(keys) {
     "div",
     { className: "m-help" },
     make("h2", {}, "Keys"),
-    make("div", { className: "m-columns" }, make("div", {}, make("h3", {}, "In a photograph"), table(IN_PHOTOGRAPH), make("h3", {}, "Everywhere"), table(keys.slice(0, 14))), make("div", {}, table(keys.slice(14)))),
+    make("div", { className: "m-columns" }, make("div", {}, make("h3", {}, "In a photograph"), table(IN_PHOTOGRAPH), make("h3", {}, "Everywhere"), table(keys.slice(0, 15))), make("div", {}, table(keys.slice(15)))),
     make("p", { className: "note" }, "Green: accepted marks, by hand as squares. Blue: proposals with their 95 % ellipses, and the epipolar line. Yellow: residual vectors, and the ray of sight of the place under the pointer. Red: the mark that fits least."),
   )
   const close = show(content, "Keys")

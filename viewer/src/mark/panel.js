@@ -93,7 +93,7 @@ export class Panel {
         make("br"),
         `${mark.kind}${mark.by === "hand" ? " by hand" : mark.automatic ? ", automatic" : ""}`,
         make("br"),
-        `${fixed(mark.x, 2)}, ${fixed(mark.y, 2)} px`,
+        `${fixed(mark.x, 2)}, ${fixed(mark.y, 2)}`,
         make("br"),
         `sigma ${significant(Math.max(...mark.sigma), SIGMA_DIGITS)} px`,
         ...(mark.residual ? [make("br"), `v ${mark.residual.map((v) => signed(v, 2)).join(", ")} px`] : []),
