@@ -174,6 +174,7 @@ class Page {
     this.lights[name] = Math.min(LIGHT_LIMIT, Math.max(1 / LIGHT_LIMIT, value))
     this.sliders[name].value = Math.log(this.lights[name])
     this.grid.style.setProperty(`--${name}`, this.lights[name])
+    this.grid.classList.toggle("m-lit", Object.values(this.lights).some((light) => light !== 1)) // a filter takes time
     this.say(`${name} ${significant(this.lights[name], 2)}`)
   }
 
