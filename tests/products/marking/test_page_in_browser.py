@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,30 +11,14 @@ import numpy as np
 import pytest
 
 from sfm.model.conventions import FloatArray
-from sfm.products.marking.project import project_of_survey
-from sfm.products.marking.server import MarkingServer
-from sfm.products.marking.session import MarkingSession
 from sfm.survey.inputs.marks_file import read_marks
-from sfm.survey.inputs.survey import read_survey
-from tests.browser import Tab, chromium
+from tests.browser import chromium
+from tests.marking import PAGE, PLACE, Marking, open_page, served
 
 SIZE = (900, 640)
 DISCS = np.array([[x, y] for y in (120.25, 320.5, 520.75) for x in (150.25, 350.5, 550.75, 750.0)])
 SHIFT = np.array([7.5, -4.25])  # of the second photograph against the first, px
 EVIL = "<img src=x onerror=document.title='broken'>"
-NO_DEFECT = (
-    "status of 422",  # the browser reports what the server refuses, as the page does
-    "loaded before reset",  # OpenSeadragon, of tiles of a photograph that was left meanwhile
-)
-
-PLACE = """([pane, x, y]) => {
-  const shown = document.getElementById('marking').page.panes[pane]
-  const box = shown.view.getBoundingClientRect()
-  const [left, top] = shown.frame().at([x, y])
-  return [box.left + left, box.top + top]
-}"""
-STATE = "() => document.getElementById('marking').page.model.state"
-PAGE = "document.getElementById('marking').page"
 
 
 @pytest.fixture(scope="module")
@@ -45,68 +26,6 @@ def browser() -> Iterator[Any]:
     """A running browser; the test is skipped where there is none."""
     with chromium() as running:
         yield running
-
-
-@contextmanager
-def served(survey: Path, marks: Path) -> Iterator[MarkingServer]:
-    """Serve the page of a survey file, in a thread."""
-    session = MarkingSession(project_of_survey(read_survey(survey), survey_file=survey), marks)
-    server = MarkingServer(session)
-    thread = threading.Thread(target=server.serve, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        session.close()
-        server.stop()
-        thread.join(20)
-
-
-@dataclass
-class Marking:
-    """An open page, with what a person does there."""
-
-    tab: Tab
-    pressed: int = 0  # clicks and keys
-
-    @property
-    def page(self) -> Any:
-        return self.tab.page
-
-    @property
-    def state(self) -> Any:
-        return self.page.evaluate(STATE)
-
-    def ready(self) -> Marking:
-        self.page.wait_for_selector(".m-view[data-ready]")
-        self.tab.until(f"() => {PAGE}.panes.every((pane) => pane.ready)")
-        return self
-
-    def click(self, pane: int, place: Sequence[float], **options: Any) -> None:
-        self.pressed += 1
-        self.page.mouse.click(*self.page.evaluate(PLACE, [pane, *map(float, place)]), **options)
-        self.settled()
-
-    def key(self, key: str) -> None:
-        self.pressed += 1
-        self.page.keyboard.press(key)
-        self.settled()
-
-    def settled(self) -> None:
-        """Wait until the program has answered what was asked."""
-        self.tab.until(f"() => {PAGE}.server.idle")
-
-    def said(self) -> str:
-        return str(self.page.locator("#m-said").inner_text())
-
-    def close(self) -> None:
-        complaints = [text for text in self.tab.complaints if not any(known in text for known in NO_DEFECT)]
-        assert complaints == []
-        self.tab.close()
-
-
-def open_page(browser: Any, server: MarkingServer, **options: Any) -> Marking:
-    return Marking(Tab(browser, server.address.url, **options)).ready()
 
 
 def picture(places: FloatArray) -> Any:
@@ -292,7 +211,8 @@ def test_a_lost_program_is_told_and_the_click_is_made_when_it_answers(discs: Mar
     discs.settled()
     page.locator("#m-lost").wait_for(state="hidden")
     assert [mark["point"] for mark in discs.state["marks"]] == ["P1"]
-    discs.tab.complaints[:] = [text for text in discs.tab.complaints if "ERR_FAILED" not in text]
+    assert page.locator(".m-warning:visible").count() == 0
+    discs.tab.complaints.clear()  # of the browser, about requests that failed
 
 
 def test_everything_is_done_by_keys(discs: Marking) -> None:

@@ -39,7 +39,7 @@ class Page {
     root.replaceChildren(make("header", { id: "m-head" }, this.title, this.next, this.run), this.lost, this.tools, this.told, this.grid, film, this.side)
     this.hub.on("state", (state) => this.take(state))
     this.hub.on("lost", (sentence) => this.lose(sentence))
-    this.hub.on("back", () => (this.lost.hidden = true))
+    this.hub.on("back", () => this.regain())
     this.hub.on("chosen", () => this.refresh())
     listenToKeys(this.keys)
   }
@@ -83,6 +83,12 @@ class Page {
   lose(sentence) {
     this.lost.textContent = sentence
     this.lost.hidden = false
+  }
+
+  regain() {
+    this.lost.hidden = true
+    for (const pane of this.panes) pane.warning.hidden = true
+    this.refresh()
   }
 
   refresh() {

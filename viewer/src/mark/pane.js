@@ -42,6 +42,7 @@ export class Pane {
       smoothTileEdgesMinZoom: Infinity,
       maxImageCacheCount: Math.ceil(TILES_CACHED / count),
       maxTilesPerFrame: 4,
+      tileRetryMax: 100, // until the program answers again
       clickTimeThreshold: 60_000, // a person who aims presses long
       clickDistThreshold: 4,
       gestureSettingsMouse: GESTURES,
