@@ -50,6 +50,7 @@ def test_the_wheel_has_what_runs_at_run_time() -> None:
     needed = (
         *("py.typed", "__init__.pyi", "report/viewer/viewer.js", "report/viewer/viewer.css"),
         *("report/viewer/LICENSES.txt", "report/templates/tables.js", "report/templates/page.html"),
+        *(f"products/marking/page/{name}" for name in ("mark.html", "mark.js", "mark.css", "LICENSES.txt")),
     )
     files = packed("sfm")
     assert not [name for name in needed if ROOT / "sfm" / name not in files]
@@ -61,13 +62,15 @@ def test_both_packages_are_found_and_nothing_else() -> None:
 
 
 def test_licences_of_all_that_is_shipped_are_named() -> None:
-    assert PROJECT["license"] == "BSD-3-Clause AND MIT"
-    assert PROJECT["license-files"] == ["LICENSE", "sfm/report/viewer/LICENSES.txt"]
-    texts = [(ROOT / name).read_text(encoding="utf-8") for name in PROJECT["license-files"]]
-    assert texts[0].startswith("BSD 3-Clause") and "The MIT License" in texts[1]
-    script = (ROOT / "sfm" / "report" / "viewer" / "viewer.js").read_text(encoding="utf-8")
-    built_with = re.match(r"/\* Viewer of Kolinear with (three\.js [\d.]+);", script)
-    assert built_with and f"- {built_with[1]} (" in texts[1], "the licences are those of another three.js"
+    assert PROJECT["license"] == "BSD-3-Clause AND MIT AND Apache-2.0"
+    assert len(PROJECT["license-files"]) == 3
+    own, viewer, marking = ((ROOT / name).read_text(encoding="utf-8") for name in PROJECT["license-files"])
+    assert own.startswith("BSD 3-Clause") and "The MIT License" in viewer
+    assert all(name in marking for name in ("The BSD 3-Clause License", "The MIT License", "Apache License"))
+    for script, texts in (("report/viewer/viewer.js", viewer), ("products/marking/page/mark.js", marking)):
+        head = (ROOT / "sfm" / script).read_text(encoding="utf-8")[:200]
+        built_with = re.match(r"/\* \w+ of Kolinear with (\S+ [\d.]+);", head)
+        assert built_with and f"- {built_with[1]} (" in texts, f"{script}: the licences are of another version"
 
 
 def test_the_package_brings_colmap_and_no_library_of_an_extra() -> None:
