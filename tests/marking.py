@@ -15,6 +15,7 @@ from sfm.products.marking.server import MarkingServer
 from sfm.products.marking.session import MarkingSession
 from sfm.survey.inputs.survey import read_survey
 from tests.browser import Tab
+from tests.places import ROOT
 
 NO_DEFECT = (
     "status of 422",  # the browser reports what the server refuses, as the page does
@@ -112,6 +113,23 @@ def open_page(browser: Any, server: MarkingServer, **options: Any) -> Marking:
     return Marking(Tab(browser, server.address.url, **options)).ready()
 
 
+PAIR = ("t001", "t011", "t054", "t063", "t065")  # spread over the part of the demo, one above its plane
+MORE = ("t076", "t102", "t058", "t029", "t092", "t023", "t074")
+
+
+def demo_survey(folder: Path, photographs: Path) -> Path:
+    """Write the survey file of the demo without codes, bars and a second adjustment; returns its path."""
+    camera = (ROOT / "datasets" / "demo" / "survey.toml").read_text(encoding="utf-8")
+    camera = camera[camera.index("[[camera]]") : camera.index("[targets]")]
+    head = '[survey]\nname = "by hand"\nunit = "mm"\n'
+    end = '[targets]\npolarity = "auto"\ncodes = "none"\nmin_diameter_px = 5\n[adjust]\nsigma_px = 0.02\n'
+    for path in photographs.glob("part_*.jpg"):
+        (folder / path.name).symlink_to(path.resolve())
+    survey = folder / "survey.toml"
+    survey.write_text(f"{head}{camera}{end}", encoding="utf-8")
+    return survey
+
+
 @dataclass(frozen=True)
 class Targets:
     """The targets of a rendered scene."""
@@ -138,54 +156,50 @@ def targets_of(folder: Path) -> Targets:
     return Targets(places, xyz)
 
 
-def mark_everything(
-    marking: Marking, targets: Targets, pair: Sequence[str], more: Sequence[str]
-) -> dict[str, str]:
-    """Mark from nothing, six photographs side by side, until all are oriented and all is accepted.
+class Person:
+    """Someone who sees the targets and marks them from nothing."""
 
-    Args:
-        marking: the page, with two photographs side by side and no marks.
-        targets: where a person sees the targets.
-        pair: the targets that orient the first two photographs and then the others.
-        more: further targets, clicked once each: the others are proposed.
+    def __init__(self, marking: Marking, targets: Targets) -> None:
+        self.marking = marking
+        self.targets = targets
+        self.names = [photograph["name"] for photograph in marking.state["photographs"]]
+        self.target_of: dict[str, str] = {}  # of each point
 
-    Returns:
-        The target of each point.
-    """
-    names = {photograph["index"]: photograph["name"] for photograph in marking.state["photographs"]}
-    target_of: dict[str, str] = {}
+    def click(self, pane: int, target: str) -> None:
+        photograph = self.names[self.marking.images[pane]]
+        self.marking.click(pane, self.targets.places[photograph][target])
+        self.target_of.setdefault(self.marking.chosen, target)
 
-    def click(pane: int, target: str) -> None:
-        marking.click(pane, targets.places[names[marking.images[pane]]][target])
-        target_of.setdefault(marking.chosen, target)
+    def mark_pair(self, targets: Sequence[str]) -> None:
+        """Mark targets in the two photographs that the page shows."""
+        for target in targets:
+            for pane in (0, 1):
+                self.click(pane, target)
 
-    for key in ("l", "l"):  # 4, then 6 side by side
-        marking.key(key)
-    marking.ready()
-    for target in pair:
-        for pane in (0, 1):
-            click(pane, target)
-    for pane in range(2, 6):
-        orient(marking, pane, target_of, click)
-    marking.key("PageDown")
-    marking.ready()
-    for pane in range(6):
-        orient(marking, pane, target_of, click)
-    for target in more:
-        click(0, target)
-        for pane in range(1, 6):
-            if marking.proposals_of(marking.chosen):
-                break
-            click(pane, target)
-    marking.key("Shift+Enter")
-    return target_of
+    def orient_others(self) -> None:
+        """Orient all photographs, six side by side."""
+        for _ in range(2):  # 4, then 6 side by side
+            self.marking.key("l")
+        for k in range(0, len(self.names), 6):
+            if k:
+                self.marking.key("PageDown")
+            self.marking.ready()
+            for pane in range(6):
+                self.orient(pane)
 
+    def orient(self, pane: int) -> None:
+        """Click in a photograph, always on the point that the page names, until it is oriented."""
+        image = self.marking.images[pane]
+        for _ in range(6):
+            if self.marking.state["photographs"][image]["oriented"]:
+                return
+            self.click(pane, self.target_of[self.marking.next_point(pane)])
+        raise AssertionError(f"{self.names[image]} is not oriented after six marks")
 
-def orient(marking: Marking, pane: int, target_of: Mapping[str, str], click: Any) -> None:
-    """Click in a photograph, always on the point that the page names, until it is oriented."""
-    image = marking.images[pane]
-    for _ in range(6):
-        if marking.state["photographs"][image]["oriented"]:
-            return
-        click(pane, target_of[marking.next_point(pane)])
-    raise AssertionError(f"photograph {image} is not oriented after six marks")
+    def mark_more(self, targets: Sequence[str]) -> None:
+        """Mark further targets, in as many photographs as it takes until the others are proposed."""
+        for target in targets:
+            for pane in range(6):
+                self.click(pane, target)
+                if self.marking.proposals_of(self.marking.chosen):
+                    break
