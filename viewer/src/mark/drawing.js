@@ -11,6 +11,7 @@ const ARM = 11
 const ARROW = 16 // length of a residual of the size of the RMS
 const CELL = 14 // names in the same cell would overlap
 const AWAY = [13, -9] // from the mark to its name
+const MAX_TEXT = 40 // characters of a name over a photograph
 const MARGIN = 40 // beyond the edge, within which a mark is still drawn
 
 /**
@@ -128,7 +129,8 @@ function outlined(context, colour, width, path, dashes = []) {
   context.setLineDash([])
 }
 
-function words(context, text, x, y, colour, bold = false) {
+function words(context, whole, x, y, colour, bold = false) {
+  const text = whole.length > MAX_TEXT ? `${whole.slice(0, MAX_TEXT)}\u2026` : whole
   context.font = `${bold ? "600 " : ""}12px system-ui, sans-serif`
   context.strokeStyle = HALO
   context.lineWidth = 3

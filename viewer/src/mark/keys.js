@@ -20,6 +20,7 @@ export function keysOf(page) {
     ["n", "the next click measures a new point", () => page.chooseNew()],
     ["Enter", "accept the proposals of the chosen point", () => page.accept()],
     ["Shift+Enter", "accept all proposals", () => page.acceptAll()],
+    ["y", "accept the proposal of the chosen point in the active photograph", () => page.acceptHere()],
     ["x", "refuse the proposal of the chosen point in the active photograph", () => page.refuseHere()],
     ["Shift+x", "refuse all proposals of the chosen point", () => page.refuse()],
     ["Delete", "delete the mark of the chosen point in the active photograph", () => page.removeHere()],
@@ -60,7 +61,7 @@ export function keysOf(page) {
 const IN_PHOTOGRAPH = [
   ["click", "measure the chosen point, or a new one if it is marked here already"],
   ["Shift+click", "measure the chosen point again, here"],
-  ["click a mark", "choose its point"],
+  ["click a mark", "choose its point, also where it is proposed"],
   ["drag, wheel", "move the photograph, zoom"],
   ["Tab", "from pane to pane, to the list, to the filmstrip"],
   ["arrow keys", "move the crosshair, with Shift by single steps"],
@@ -92,7 +93,7 @@ export function showHelp(keys) {
     "div",
     { className: "m-help" },
     make("h2", {}, "Keys"),
-    make("div", { className: "m-columns" }, make("div", {}, make("h3", {}, "In a photograph"), table(IN_PHOTOGRAPH), make("h3", {}, "Everywhere"), table(keys.slice(0, 15))), make("div", {}, table(keys.slice(15)))),
+    make("div", { className: "m-columns" }, make("div", {}, make("h3", {}, "In a photograph"), table(IN_PHOTOGRAPH), make("h3", {}, "Everywhere"), table(keys.slice(0, 16))), make("div", {}, table(keys.slice(16)))),
     make("p", { className: "note" }, "Green: accepted marks, by hand as squares. Blue: proposals with their 95 % ellipses, and the epipolar line. Yellow: residual vectors, and the ray of sight of the place under the pointer. Red: the mark that fits least."),
   )
   const close = show(content, "Keys")

@@ -212,7 +212,7 @@ class Page {
     const images = [...shown, ...after, ...free.filter((image) => !after.includes(image))].slice(0, count)
     const actions = {
       click: (pane, place, again) => this.click(pane, place, again),
-      choose: (pane, name) => this.model.choose(name),
+      choose: (pane, name) => this.chooseAt(pane, name),
       hover: (pane, place) => this.hover(pane, place),
       activate: (pane) => this.activate(pane.number),
       show: (pane, image) => this.showIn(pane, image),
@@ -382,6 +382,11 @@ class Page {
     return proposals
   }
 
+  chooseAt(pane, point) {
+    this.model.choose(point)
+    this.say(this.model.markOf(pane.image, point) ? `${point} is chosen.` : `${point} is proposed here: Enter accepts all its proposals, Y this one, X refuses it.`)
+  }
+
   chooseNew() {
     this.model.choose(null)
     this.say("The next click measures a new point.")
@@ -392,6 +397,14 @@ class Page {
     if (!this.hasChosen()) return
     const proposals = this.proposalsOf(point)
     if (proposals.length) this.change("accept", { point }, `${counted(proposals.length, "proposal")} of ${point} accepted.`)
+  }
+
+  acceptHere() {
+    const point = this.model.chosen
+    const { image } = this.pane
+    if (!this.hasChosen()) return
+    if (this.model.proposalOf(image, point)) this.change("accept", { image, point }, `Proposal of ${point} accepted here.`)
+    else this.say(`${point} has no proposal in this photograph.`, true)
   }
 
   acceptAll() {

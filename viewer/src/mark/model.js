@@ -38,6 +38,14 @@ export class Model {
     return (this.proposed.get(point) ?? []).find((proposal) => proposal.image === image) ?? null
   }
 
+  /** What a photograph is in need of, in a few words. */
+  stateOf(image) {
+    const { changed, oriented, needs } = this.photograph(image)
+    if (changed) return { words: "changed", look: "m-bad" }
+    if (oriented) return { words: "oriented", look: "m-good" }
+    return { words: needs ? `needs ${needs}` : "not oriented", look: "m-fair" }
+  }
+
   /** Names of all points, in natural order. */
   names() {
     return [...new Set([...this.pointOf.keys(), ...this.rays.keys()])].sort(byName)
@@ -52,7 +60,8 @@ export class Model {
     const { chosen } = this
     if (chosen === null || !this.markOf(image, chosen)) return chosen
     if (this.photograph(image).oriented) return null
-    const waiting = this.names().filter((name) => this.pointOf.get(name)?.X && !this.markOf(image, name))
+    const known = (point) => point?.X || point?.control
+    const waiting = this.names().filter((name) => known(this.pointOf.get(name)) && !this.markOf(image, name))
     return waiting.find((name) => byName(name, chosen) > 0) ?? waiting[0] ?? null
   }
 

@@ -9,7 +9,7 @@ const TILES_CACHED = 240 // of all panes, about 1 MB each
 const SHARP = 3 // magnification from which single pixels are shown
 const CURSOR_STEP = 10 // px of the screen, of the crosshair that the arrow keys move
 const EDGE = 40 // px of the screen, from which the view follows the crosshair
-const NEAR = 9 // px of the screen within which a click chooses a mark that is there
+const NEAR = 9 // px of the screen within which a click chooses what is marked or proposed there
 const GESTURES = { clickToZoom: false, dblClickToZoom: false, dblClickDragToZoom: false, flickEnabled: false }
 
 export class Pane {
@@ -61,8 +61,8 @@ export class Pane {
       event.preventDefaultAction = true
       if (!event.quick) return
       const place = this.placeAt(event.position.x, event.position.y)
-      const there = event.shift ? null : this.markAt(event.position.x, event.position.y)
-      if (there) actions.choose(this, there.point)
+      const there = event.shift ? null : this.pointAt(event.position.x, event.position.y)
+      if (there !== null && there !== this.model.pointFor(this.image)) actions.choose(this, there)
       else if (this.contains(place)) actions.click(this, place, event.shift)
     })
     viewer.addHandler("update-viewport", () => {
@@ -133,8 +133,9 @@ export class Pane {
     }
     this.choice.value = this.image
     if (photograph.changed) this.warn(photograph.changed)
-    this.told.textContent = photograph.oriented ? `oriented, ${counted(photograph.marks, "mark")}` : `needs ${counted(photograph.needs, "mark")}`
-    this.told.className = `m-told ${photograph.oriented ? "m-good" : "m-fair"}`
+    const { words, look } = this.model.stateOf(this.image)
+    this.told.textContent = `${words}${photograph.needs && !photograph.oriented ? " more" : ""}, ${counted(photograph.marks, "mark")}`
+    this.told.className = `m-told ${look}`
     this.view.setAttribute("aria-label", `${photograph.name}, ${this.told.textContent}; arrow keys move the crosshair, Space measures, plus and minus zoom`)
     this.draw()
   }
@@ -176,16 +177,17 @@ export class Pane {
     return Boolean(place) && place[0] >= -0.5 && place[1] >= -0.5 && place[0] <= width - 0.5 && place[1] <= height - 0.5
   }
 
-  /** The mark at a place of the canvas, or null. */
-  markAt(left, top) {
+  /** The point that is marked or proposed at a place of the canvas, or null. */
+  pointAt(left, top) {
     const { at } = this.frame()
-    let nearest = { away: NEAR, mark: null }
-    for (const mark of this.model.marks.get(this.image) ?? []) {
-      const [x, y] = at([mark.x, mark.y])
-      const away = Math.hypot(x - left, y - top)
-      if (away < nearest.away) nearest = { away, mark }
+    let nearest = { away: NEAR, point: null }
+    const { marks, proposals } = this.model
+    for (const { x, y, point } of [...(marks.get(this.image) ?? []), ...(proposals.get(this.image) ?? [])]) {
+      const [u, v] = at([x, y])
+      const away = Math.hypot(u - left, v - top)
+      if (away < nearest.away) nearest = { away, point }
     }
-    return nearest.mark
+    return nearest.point
   }
 
   draw() {

@@ -21,10 +21,10 @@ export class Strip {
     photographs.forEach((photograph, image) => {
       const { button, told } = this.frames[image]
       const proposals = this.model.proposals.get(image)?.length ?? 0
-      const state = photograph.changed ? "changed" : photograph.oriented ? "oriented" : `needs ${photograph.needs}`
-      const words = `${state}, ${counted(photograph.marks, "mark")}${proposals ? `, ${counted(proposals, "proposal")}` : ""}`
+      const state = this.model.stateOf(image)
+      const words = `${state.words}, ${counted(photograph.marks, "mark")}${proposals ? `, ${counted(proposals, "proposal")}` : ""}`
       told.replaceChildren(
-        make("span", { className: photograph.changed ? "m-bad" : photograph.oriented ? "m-good" : "m-fair" }, state),
+        make("span", { className: state.look }, state.words),
         ` ${photograph.marks}`,
         proposals ? make("span", { className: "m-blue" }, ` +${proposals}`) : "",
       )
