@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -80,8 +81,8 @@ class Marking:
         self.settled()
 
     def settled(self) -> None:
-        """Wait until the program has answered what was asked."""
-        self.tab.until(f"() => {PAGE}.server.idle")
+        """Wait until the program has answered what was asked, and adjusted it."""
+        self.tab.until(f"() => {PAGE}.server.idle && {PAGE}.model.state.adjustment.state !== 'running'")
 
     @property
     def images(self) -> list[int]:
@@ -113,8 +114,8 @@ def open_page(browser: Any, server: MarkingServer, **options: Any) -> Marking:
     return Marking(Tab(browser, server.address.url, **options)).ready()
 
 
-PAIR = ("t001", "t011", "t054", "t063", "t065")  # spread over the part of the demo, one above its plane
-MORE = ("t076", "t102", "t058", "t029", "t092", "t023", "t074")
+PAIR = ("t001", "t011", "t054", "t063", "t065", "t102")  # spread over the part of the demo, two above its plane
+MORE = ("t076", "t058", "t029", "t092", "t023", "t074")
 
 
 def demo_survey(folder: Path, photographs: Path) -> Path:
@@ -124,7 +125,7 @@ def demo_survey(folder: Path, photographs: Path) -> Path:
     head = '[survey]\nname = "by hand"\nunit = "mm"\n'
     end = '[targets]\npolarity = "auto"\ncodes = "none"\nmin_diameter_px = 5\n[adjust]\nsigma_px = 0.02\n'
     for path in photographs.glob("part_*.jpg"):
-        (folder / path.name).symlink_to(path.resolve())
+        shutil.copy(path, folder)
     survey = folder / "survey.toml"
     survey.write_text(f"{head}{camera}{end}", encoding="utf-8")
     return survey
@@ -151,7 +152,7 @@ def targets_of(folder: Path) -> Targets:
             places.setdefault(row["image"], {})[row["target"]] = (float(row["x_px"]), float(row["y_px"]))
     with (folder / "truth_points.csv").open(encoding="utf-8") as file:
         xyz = {
-            row["name"]: (float(row["X"]), float(row["Y"]), float(row["Z"])) for row in csv.DictReader(file)
+            row["target"]: (float(row["X"]), float(row["Y"]), float(row["Z"])) for row in csv.DictReader(file)
         }
     return Targets(places, xyz)
 

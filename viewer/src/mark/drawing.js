@@ -63,7 +63,7 @@ function drawProposal(context, frame, proposal, labels, inside, chosen) {
   const [long, short] = [Math.max(3, a * frame.scale), Math.max(3, b * frame.scale)]
   outlined(context, BLUE, chosen ? 2.2 : 1.3, () => context.ellipse(x, y, long, short, frame.turn + (angle_deg * Math.PI) / 180, 0, 2 * Math.PI))
   if (proposal.measured) outlined(context, BLUE, 1.3, () => cross(context, x, y, 9))
-  labels.put(proposal.measured ? `${proposal.point}?` : `${proposal.point} (predicted)`, x + AWAY[0], y + AWAY[1], BLUE, chosen)
+  labels.put(proposal.measured ? `${proposal.point}?` : `(${proposal.point})`, x + AWAY[0], y + AWAY[1], BLUE, chosen)
 }
 
 function drawResiduals(context, frame, model, image) {

@@ -102,9 +102,9 @@ class Page {
     this.buttons.redo.disabled = !model.state.can_redo
     this.aim.textContent = model.chosen ?? "new point"
     this.buttons.fresh.setAttribute("aria-pressed", String(model.chosen === null))
-    const proposed = model.state.proposals.length
-    this.buttons.all.disabled = !proposed
-    this.buttons.all.textContent = proposed ? `Accept ${counted(proposed, "proposal")}` : "Accept all"
+    const measured = model.measured(model.state.proposals).length
+    this.buttons.all.disabled = !measured
+    this.buttons.all.textContent = measured ? `Accept ${counted(measured, "proposal")}` : "Accept all"
   }
 
   refreshRun() {
@@ -376,11 +376,6 @@ class Page {
     return this.model.chosen !== null
   }
 
-  proposalsOf(point) {
-    const proposals = this.model.proposed.get(point) ?? []
-    if (!proposals.length) this.say(`${point} has no proposals.`, true)
-    return proposals
-  }
 
   chooseAt(pane, point) {
     this.model.choose(point)
@@ -395,36 +390,39 @@ class Page {
   accept() {
     const point = this.model.chosen
     if (!this.hasChosen()) return
-    const proposals = this.proposalsOf(point)
-    if (proposals.length) this.change("accept", { point }, `${counted(proposals.length, "proposal")} of ${point} accepted.`)
+    const measured = this.model.measured(this.model.proposed.get(point) ?? [])
+    if (measured.length) this.change("accept", { point }, `${counted(measured.length, "proposal")} of ${point} accepted.`)
+    else this.say(`Nothing measured is proposed for ${point}.`, true)
   }
 
   acceptHere() {
     const point = this.model.chosen
     const { image } = this.pane
     if (!this.hasChosen()) return
-    if (this.model.proposalOf(image, point)) this.change("accept", { image, point }, `Proposal of ${point} accepted here.`)
-    else this.say(`${point} has no proposal in this photograph.`, true)
+    if (this.model.proposalOf(image, point)?.measured) this.change("accept", { image, point }, `Proposal of ${point} accepted here.`)
+    else this.say(`Nothing measured is proposed for ${point} in this photograph: click it.`, true)
   }
 
   acceptAll() {
-    const { proposals } = this.model.state
-    if (proposals.length) this.change("accept", {}, `${counted(proposals.length, "proposal")} accepted.`)
-    else this.say("There are no proposals.", true)
+    const measured = this.model.measured(this.model.state.proposals)
+    if (measured.length) this.change("accept", {}, `${counted(measured.length, "proposal")} accepted.`)
+    else this.say("Nothing measured is proposed.", true)
   }
 
   refuse() {
     const point = this.model.chosen
     if (!this.hasChosen()) return
-    const proposals = this.proposalsOf(point)
+    const proposals = this.model.proposed.get(point) ?? []
     if (proposals.length) this.change("refuse", { point }, `${counted(proposals.length, "proposal")} of ${point} refused.`)
+    else this.say(`${point} has no proposals.`, true)
   }
 
   refuseHere() {
     const point = this.model.chosen
     const { image } = this.pane
     if (!this.hasChosen()) return
-    if (this.model.proposalOf(image, point)) this.change("refuse", { image, point }, `Proposal of ${point} refused here.`)
+    if (this.model.markOf(image, point)?.automatic) this.removeHere()
+    else if (this.model.proposalOf(image, point)) this.change("refuse", { image, point }, `Proposal of ${point} refused here.`)
     else this.say(`${point} has no proposal in this photograph.`, true)
   }
 
@@ -432,13 +430,17 @@ class Page {
     const point = this.model.chosen
     const { image } = this.pane
     if (!this.hasChosen()) return
-    if (this.model.markOf(image, point)) this.change("delete", { image, point }, `Mark of ${point} deleted here; Z undoes it.`)
+    const mark = this.model.markOf(image, point)
+    if (mark) this.change(mark.automatic ? "refuse" : "delete", { image, point }, `Mark of ${point} ${mark.automatic ? "refused" : "deleted"} here; Z undoes it.`)
     else this.say(`${point} is not marked in this photograph; Shift+Delete deletes the whole point.`, true)
   }
 
   remove() {
     const point = this.model.chosen
-    if (this.hasChosen()) this.change("delete", { point }, `${point} deleted; Z undoes it.`)
+    if (!this.hasChosen()) return
+    const automatic = (this.model.rays.get(point) ?? []).filter((mark) => mark.automatic)
+    for (const { image } of automatic) this.change("refuse", { image, point }, `${point} refused.`)
+    if (!this.model.pointOf.get(point)?.automatic) this.change("delete", { point }, `${point} deleted; Z undoes it.`)
   }
 
   undo() {

@@ -38,6 +38,11 @@ export class Model {
     return (this.proposed.get(point) ?? []).find((proposal) => proposal.image === image) ?? null
   }
 
+  /** Those of proposals that were measured: only they can be accepted. */
+  measured(proposals) {
+    return proposals.filter((proposal) => proposal.measured)
+  }
+
   /** What a photograph is in need of, in a few words. */
   stateOf(image) {
     const { changed, oriented, needs } = this.photograph(image)

@@ -50,6 +50,7 @@ export class Panel {
     const point = model.pointOf.get(name) ?? {}
     const marks = model.rays.get(name) ?? []
     const proposals = model.proposed.get(name) ?? []
+    const measured = model.measured(proposals).length
     const coordinate = (c) => `${toPrecision(point.X[c], point.sigma?.[c])} ${model.state.unit}${point.sigma ? `, sigma ${significant(point.sigma[c], SIGMA_DIGITS)}` : ""}`
     const rows = point.X ? [0, 1, 2].map((c) => ["XYZ"[c], coordinate(c)]) : [["coordinates", "not known yet: mark it in two oriented photographs"]]
     if (point.control) rows.push(["control", point.control.X.map((x, c) => `${x} \u00b1 ${point.control.sigma[c]}`).join(", ")])
@@ -59,12 +60,8 @@ export class Panel {
       make(
         "div",
         { className: "v-tools" },
-        ...(proposals.length
-          ? [
-              button(`Accept ${counted(proposals.length, "proposal")}`, () => actions.accept(name), { title: "Enter", className: "m-main" }),
-              button("Refuse", () => actions.refuse(name), { title: "Shift+X" }),
-            ]
-          : []),
+        measured ? button(`Accept ${counted(measured, "proposal")}`, () => actions.accept(name), { title: "Enter", className: "m-main" }) : null,
+        proposals.length ? button("Refuse", () => actions.refuse(name), { title: "Shift+X" }) : null,
         button("Rename\u2026", () => actions.rename(name), { title: "R" }),
         button("Control\u2026", () => actions.control(name), { title: "C" }),
         button("Delete point", () => actions.remove(name), { title: "Shift+Delete" }),

@@ -20,7 +20,7 @@ export class Strip {
     }
     photographs.forEach((photograph, image) => {
       const { button, told } = this.frames[image]
-      const proposals = this.model.proposals.get(image)?.length ?? 0
+      const proposals = this.model.measured(this.model.proposals.get(image) ?? []).length
       const state = this.model.stateOf(image)
       const words = `${state.words}, ${counted(photograph.marks, "mark")}${proposals ? `, ${counted(proposals, "proposal")}` : ""}`
       told.replaceChildren(
