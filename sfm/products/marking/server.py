@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from sfm.files.plain_text import MAX_NAME
@@ -55,6 +55,7 @@ SAFE = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+OF_REPORT = {**SAFE, "Content-Security-Policy": "frame-ancestors 'none'"}  # pages of reports state their own
 KEPT = {"Cache-Control": "private, max-age=3600"}  # of tiles, which do not change
 Name = Annotated[str, Field(min_length=1, max_length=MAX_NAME)]
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
@@ -242,6 +243,10 @@ def application(session: MarkingSession, address: Address) -> Starlette:
         data = await run_in_threadpool(session.fit_picture, at["image"], at["point"])
         return _refused(404) if data is None else Response(data, media_type="image/png", headers=SAFE)
 
+    async def report(request: Request) -> Response:
+        path = await run_in_threadpool(session.report_file, request.path_params["path"])
+        return _refused(404) if path is None else FileResponse(path, headers=OF_REPORT)
+
     async def sight(request: Request) -> Response:
         try:
             image = int(request.query_params["image"])
@@ -277,7 +282,8 @@ def application(session: MarkingSession, address: Address) -> Starlette:
         Route("/{secret}/{file:str}", guarded(_only(page, FILES))),
         Route("/{secret}/tiles/{image:int}.dzi", guarded(descriptor)),
         Route("/{secret}/tiles/{image:int}_files/{level:int}/{column:int}_{row:int}.jpg", guarded(tile)),
-        Route("/{secret}/fit/{image:int}/{point:str}.png", guarded(fit)),
+        Route("/{secret}/fit/{image:int}/{point:path}.png", guarded(fit)),
+        Route("/{secret}/report/{path:path}", guarded(report)),
         Route("/{secret}/{change:str}", guarded(change), methods=["POST"]),
     ]
     made = Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})

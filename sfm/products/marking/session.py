@@ -350,6 +350,16 @@ class MarkingSession:
             self._changed.notify_all()
             return self._state()
 
+    def report_file(self, name: str) -> Path | None:
+        """Return the path of a file of the last report, named as in its folder; None without it."""
+        with self._changed:
+            report = None if self._run is None else self._run.report
+        if report is None or "\0" in name:
+            return None
+        folder = Path(report).parent.resolve()
+        path = (folder / name).resolve()
+        return path if path.is_relative_to(folder) and path.is_file() else None
+
     def _tell(self, run: Run) -> None:
         """Take news of a run."""
         with self._changed:

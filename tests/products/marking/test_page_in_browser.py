@@ -10,10 +10,34 @@ import cv2
 import numpy as np
 import pytest
 
+from adapters.formats.result_tables import read_result
+from datasets.textured import render as textured
+from sfm.model.camera import project, tangents_from_pixel
 from sfm.model.conventions import FloatArray
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import fit_similarity
+from sfm.model.solution import Solution
+from sfm.products.marking.project import MarkedProject, project_of_survey
+from sfm.products.rendering.render import write_photographs
+from sfm.products.rendering.scene_file import read_scene
 from sfm.survey.inputs.marks_file import read_marks
+from sfm.survey.inputs.survey import read_survey
 from tests.browser import chromium
-from tests.marking import PAGE, PLACE, Marking, open_page, served
+from tests.marking import (
+    MORE,
+    PAGE,
+    PAIR,
+    PLACE,
+    Marking,
+    Person,
+    Targets,
+    demo_survey,
+    open_page,
+    served,
+    targets_of,
+)
+from tests.places import ROOT
 
 SIZE = (900, 640)
 DISCS = np.array([[x, y] for y in (120.25, 320.5, 520.75) for x in (150.25, 350.5, 550.75, 750.0)])
@@ -280,4 +304,130 @@ def test_the_page_is_readable(browser: Any, folder: Path, tmp_path: Path, scheme
             )
             assert len(sizes) == int(count) and np.min(sizes) > 150
         assert page.evaluate("document.documentElement.scrollWidth") <= width
+        marking.close()
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Targets]:
+    """The survey of the demo without codes, and where its targets are."""
+    folder = tmp_path_factory.mktemp("demo")
+    write_photographs(read_scene(ROOT / "datasets" / "demo" / "scene.toml"), folder / "photographs")
+    return demo_survey(folder, folder / "photographs"), targets_of(folder / "photographs")
+
+
+def normalised(xyz: FloatArray, sigma: FloatArray, truth: FloatArray) -> float:
+    """Return the RMS of the errors after a similarity, in parts of their standard deviations."""
+    to_truth = fit_similarity(xyz, truth)
+    return float(np.sqrt((((to_truth.apply(xyz) - truth) / (to_truth.scale * sigma)) ** 2).mean()))
+
+
+def test_from_nothing_to_a_report_by_clicks_and_keys(
+    browser: Any, demo: tuple[Path, Targets], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twelve points in twelve photographs, no code read; then everything else is found automatically."""
+    monkeypatch.chdir(tmp_path)  # the result is in the folder out
+    survey, targets = demo
+    with served(survey, survey.parent / "marks.csv") as server:
+        marking = open_page(browser, server, width=1400)
+        person = Person(marking, targets)
+        person.mark_pair(PAIR)
+        person.orient_others()
+        person.mark_more(MORE)
+        while any(proposal["measured"] for proposal in marking.adjusted()["proposals"]):
+            marking.key("Shift+Enter")
+        assert marking.pressed < 60
+        state = marking.state
+        assert len(state["marks"]) == 144 and len({mark["point"] for mark in state["marks"]}) == 12
+        assert all(photograph["oriented"] for photograph in state["photographs"])
+        assert state["adjustment"]["sigma0_px"] < 0.05
+        assert state["adjustment"]["worst"] is None or not state["adjustment"]["worst"]["flagged"]
+        truth = np.array([targets.xyz[person.target_of[point["name"]]] for point in state["points"]])
+        xyz, sigma = (np.array([point[key] for point in state["points"]]) for key in ("X", "sigma"))
+        assert normalised(xyz, sigma, truth) < 2
+        marking.key("a")
+        assert marking.page.get_by_role("progressbar", name="automatic run").is_visible()
+        marking.tab.until(f"() => {PAGE}.model.state.run.state !== 'running'")
+        assert marking.state["run"]["state"] == "done", marking.state["run"]
+        link = marking.page.get_by_role("link", name="Open the report")
+        with marking.tab.context.expect_page() as opened:
+            link.click()
+        report = opened.value
+        report.wait_for_load_state()
+        assert "12 photographs" in report.inner_text("body")
+        result = read_result(Path(marking.state["run"]["report"]).parent)
+        rows = [result.network.points.index(point["name"]) for point in state["points"]]
+        assert len(result.network.points) > 60 and result.point_covariance is not None
+        variance = np.diagonal(result.point_covariance[rows], axis1=1, axis2=2)
+        assert normalised(result.estimate.points[rows], np.sqrt(variance), truth) < 1.3
+        marking.close()
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[MarkedProject, FloatArray]:
+    """Two oriented photographs of natural texture, and the projection centres."""
+    folder = tmp_path_factory.mktemp("pair")
+    position = np.array([[-0.2, 0.0, 1.6], [0.2, 0.0, 1.6]])
+    rotation = np.tile(np.eye(3), (2, 1, 1))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(textured, "stations", lambda: (position, rotation))
+        skin = textured.texture()
+        for i in range(2):
+            photograph = textured.photograph(i, textured.intensities(i, skin))
+            cv2.imwrite(str(folder / f"surface_{i + 1}.png"), photograph)
+    survey = (ROOT / "datasets" / "textured" / "survey.toml").read_text(encoding="utf-8")
+    (folder / "survey.toml").write_text(survey, encoding="utf-8")
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-0.3, 0.3, 5), np.linspace(-0.3, 0.3, 4)))
+    points = np.column_stack([x, y, textured.height(x, y)])
+    camera = textured.camera()
+    network = Network.from_arrays(
+        image=[f"surface_{i + 1}.png" for i in range(2) for _ in points],
+        point=[f"N{j + 1}" for _ in range(2) for j in range(len(points))],
+        xy=np.concatenate([project(camera, position[i], rotation[i], points) for i in range(2)]),
+        sigma_px=0.02,
+    )
+    estimate = Estimate((camera,), position, rotation, points)
+    solution = Solution("textured", network, estimate, unit="m")
+    return project_of_survey(read_survey(folder / "survey.toml"), solution=solution), position
+
+
+def marks_of(marking: Marking, point: str) -> list[Any]:
+    marks = [mark for mark in marking.state["marks"] if mark["point"] == point]
+    return sorted(marks, key=lambda mark: int(mark["image"]))
+
+
+def distance_to(line: FloatArray, place: FloatArray) -> float:
+    """Return the distance of a place from a polyline, px."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    t = np.clip(((place - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+    return float(np.linalg.norm(start + t[:, None] * along - place, axis=1).min())
+
+
+def test_a_click_in_the_left_photograph_is_matched_in_the_right(
+    browser: Any, pair: tuple[MarkedProject, FloatArray], tmp_path: Path
+) -> None:
+    """Document 002: a pair, a click at the left, its match at the right, and the coordinates."""
+    marked, position = pair
+    camera = textured.camera()
+    with served(marked, tmp_path / "marks.csv") as server:
+        marking = open_page(browser, server)
+        page = marking.page
+        marking.key("6")
+        for xy, off in (((620.0, 300.0), (2, -1)), ((560.0, 500.0), (-2, 2)), ((700.0, 420.0), (1, 2))):
+            marking.key("n")
+            marking.click(0, xy)
+            (left,) = marks_of(marking, marking.chosen)
+            uv = tangents_from_pixel(camera, np.array([[left["x"], left["y"]]]))
+            truth = textured.surface_points(position[0], np.column_stack([uv, [-1.0]]))
+            seen = project(camera, position[1], np.eye(3), truth)[0]
+            state = marking.adjusted()
+            (line,) = (line for line in state["lines"] if line["point"] == marking.chosen)
+            assert line["image"] == 1 and distance_to(np.array(line["xy"]), seen) < 0.1
+            marking.click(1, seen + off)
+            right = marks_of(marking, marking.chosen)[1]
+            np.testing.assert_allclose([right["x"], right["y"]], seen, atol=0.2)
+            state = marking.adjusted()
+            point = next(p for p in state["points"] if p["name"] == marking.chosen)
+            assert (np.abs(point["X"] - truth[0]) < 5 * np.array(point["sigma"])).all()
+            shown = page.locator(".m-card").first.inner_text()
+            assert all(f"{axis}\t" in shown or f"{axis}\n" in shown for axis in "XYZ") and "sigma" in shown
         marking.close()

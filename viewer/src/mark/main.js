@@ -113,7 +113,7 @@ class Page {
     const parts = []
     if (running) parts.push(make("progress", { "aria-label": "automatic run" }))
     if (run) parts.push(make("span", { className: run.state === "failed" ? "m-bad" : "" }, running ? `${run.stage ?? ""}: ${run.sentence ?? ""}`.replace(/^: |: $/g, "") : (run.sentence ?? "")))
-    if (run?.report) parts.push(make("a", { href: run.report, target: "_blank", rel: "noopener" }, "Open the report"))
+    if (run?.report) parts.push(make("a", { href: "report/report.html", target: "_blank", rel: "noopener", title: run.report }, "Open the report"))
     parts.push(button("Find the rest automatically", () => this.automatic(), { disabled: running, title: "targets and texture in all photographs, adjusted with the marks (A)" }))
     this.run.replaceChildren(...parts)
   }

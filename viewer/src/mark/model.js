@@ -58,16 +58,23 @@ export class Model {
 
   /**
    * The point that a click in a photograph measures; null: a new one.
-   * A chosen point that is marked there already is left alone. In a photograph that is not oriented the next point with
-   * coordinates follows, because the photograph waits for it; elsewhere the click makes a new point.
+   * A chosen point that is marked there already is left alone. In a photograph that is not oriented a point with
+   * coordinates follows, because the photograph waits for it; elsewhere the click makes a new point. The best one is
+   * farthest from all lines through points that are marked there: points on a line do not orient a photograph.
    */
   pointFor(image) {
     const { chosen } = this
     if (chosen === null || !this.markOf(image, chosen)) return chosen
     if (this.photograph(image).oriented) return null
-    const known = (point) => point?.X || point?.control
-    const waiting = this.names().filter((name) => known(this.pointOf.get(name)) && !this.markOf(image, name))
-    return waiting.find((name) => byName(name, chosen) > 0) ?? waiting[0] ?? null
+    const place = (name) => this.pointOf.get(name)?.X ?? this.pointOf.get(name)?.control?.X
+    const marked = (this.marks.get(image) ?? []).map((mark) => place(mark.point)).filter(Boolean)
+    let best = { name: null, away: -Infinity }
+    for (const name of this.names()) {
+      if (!place(name) || this.markOf(image, name)) continue
+      const away = distanceFrom(marked, place(name))
+      if (away > best.away) best = { name, away }
+    }
+    return best.name
   }
 
   /** The point that stands out on the page: that of the next click under the pointer, or the chosen one. */
@@ -81,11 +88,33 @@ export class Model {
     this.hub.tell("chosen", point)
   }
 
+  /** The unit of lengths; empty if neither a bar nor control nor an earlier result gives the scale. */
+  get unit() {
+    const { unit, bars, points } = this.state
+    return bars.length || points.some((point) => point.control || point.automatic) ? unit : ""
+  }
+
   /** RMS of the residuals in px; 0 without residuals. */
   get rms() {
     const squares = this.state.marks.filter((mark) => mark.residual).flatMap((mark) => mark.residual.map((v) => v * v))
     return squares.length ? Math.sqrt(squares.reduce((sum, square) => sum + square, 0) / squares.length) : 0
   }
+}
+
+/** The least distance of a point from the lines through others; from the point, if there is one other only. */
+function distanceFrom(others, [x, y, z]) {
+  let least = Infinity
+  for (const [i, a] of others.entries()) {
+    const d = [x - a[0], y - a[1], z - a[2]]
+    const square = d.reduce((sum, v) => sum + v * v, 0)
+    if (others.length === 1) return Math.sqrt(square)
+    for (const b of others.slice(i + 1)) {
+      const u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]]
+      const along = d.reduce((sum, v, c) => sum + v * u[c], 0) / Math.hypot(...u)
+      least = Math.min(least, Math.sqrt(Math.max(0, square - along * along)))
+    }
+  }
+  return others.length ? least : 0
 }
 
 function grouped(rows, key) {

@@ -68,6 +68,7 @@ export class Pane {
     viewer.addHandler("update-viewport", () => {
       const { viewport } = viewer
       if (this.whole && Math.abs(viewport.getZoom() / viewport.getHomeZoom() - 1) > 1e-6) viewport.goHome(true)
+      else if (this.ready) this.view.dataset.ready = String(this.image)
       this.draw()
     })
     viewer.addHandler("open", () => this.opened())
@@ -116,7 +117,6 @@ export class Pane {
     this.viewer.viewport.goHome(true)
     if (this.goal) this.centre(this.goal)
     this.resize()
-    this.view.dataset.ready = String(this.image)
   }
 
   warn(sentence) {

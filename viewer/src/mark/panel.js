@@ -18,7 +18,7 @@ export class Panel {
     const columns = [
       { key: "name", name: "point", value: (name) => name },
       number("rays", "rays", (point) => point.rays, String),
-      number("sigma", "sigma", (point) => (point.sigma ? Math.max(...point.sigma) : NaN), short, model.state.unit),
+      number("sigma", "sigma", (point) => (point.sigma ? Math.max(...point.sigma) : NaN), short),
       number("proposals", "proposals", (point) => point.proposals, (n) => (n ? String(n) : "")),
       { key: "kind", name: "", value: (name) => pointWords(this.row(name)) },
     ]
@@ -51,7 +51,7 @@ export class Panel {
     const marks = model.rays.get(name) ?? []
     const proposals = model.proposed.get(name) ?? []
     const measured = model.measured(proposals).length
-    const coordinate = (c) => `${toPrecision(point.X[c], point.sigma?.[c])} ${model.state.unit}${point.sigma ? `, sigma ${significant(point.sigma[c], SIGMA_DIGITS)}` : ""}`
+    const coordinate = (c) => `${toPrecision(point.X[c], point.sigma?.[c])}${model.unit && ` ${model.unit}`}${point.sigma ? `, sigma ${significant(point.sigma[c], SIGMA_DIGITS)}` : ""}`
     const rows = point.X ? [0, 1, 2].map((c) => ["XYZ"[c], coordinate(c)]) : [["coordinates", "not known yet: mark it in two oriented photographs"]]
     if (point.control) rows.push(["control", point.control.X.map((x, c) => `${x} \u00b1 ${point.control.sigma[c]}`).join(", ")])
     this.point.replaceChildren(
@@ -129,6 +129,7 @@ export class Panel {
       const words = `${worst.point} in ${photograph} fits least, |w| ${fixed(Math.abs(worst.test), 1)}`
       parts.push(make("p", { className: worst.flagged ? "m-verdict bad" : "note" }, worst.flagged ? `${words}. Look at it: measure it again, or delete it. ` : `${words}. `, button("Show (w)", () => this.actions.openWorst())))
     }
+    if (done && !this.model.unit) parts.push(make("p", { className: "note" }, "Neither a scale bar nor control: coordinates have no unit."))
     parts.push(make("p", { className: "note" }, `Marks are saved after every change in ${saved}`))
     this.adjustment.replaceChildren(...parts)
   }
