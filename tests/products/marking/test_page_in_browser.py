@@ -382,7 +382,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[MarkedProject, Float
     network = Network.from_arrays(
         image=[f"surface_{i + 1}.png" for i in range(2) for _ in points],
         point=[f"N{j + 1}" for _ in range(2) for j in range(len(points))],
-        xy=np.concatenate([project(camera, position[i], rotation[i], points) for i in range(2)]),
+        xy=np.concatenate([project(camera, position[i], rotation[i], points) for i in range(2)])
+        + np.random.default_rng(2).normal(0, 0.02, (2 * len(points), 2)),
         sigma_px=0.02,
     )
     estimate = Estimate((camera,), position, rotation, points)
