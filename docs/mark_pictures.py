@@ -46,6 +46,9 @@ def main() -> None:
             save(marking, "mark-pair")
             person.orient_others()
             person.mark_more(MORE[:2])
+            marking.adjusted()
+            marking.key("Shift+Enter")
+            person.mark_more(MORE[2:4])
             save(marking, "mark-six")
             marking.close()
 

@@ -8,7 +8,7 @@ const WHITE = "#ffffff"
 const HALO = "rgba(0, 0, 0, .7)"
 const GAP = 4 // the middle of a mark is left free, so that what is marked stays visible
 const ARM = 11
-const ARROW = 16 // length of a residual of the size of the RMS
+const ARROW = 16 // length of a usual residual
 const CELL = 14 // names in the same cell would overlap
 const AWAY = [13, -9] // from the mark to its name
 const MAX_TEXT = 40 // characters of a name over a photograph
@@ -67,9 +67,9 @@ function drawProposal(context, frame, proposal, labels, inside, chosen) {
 }
 
 function drawResiduals(context, frame, model, image) {
-  const { rms } = model
-  if (!rms) return
-  const perPixel = ARROW / rms // px of the screen for 1 px of residual
+  const usual = model.usualResidual
+  if (!usual) return
+  const perPixel = ARROW / usual // px of the screen for 1 px of residual
   for (const mark of model.marks.get(image) ?? []) {
     if (!mark.residual) continue
     const [x, y] = frame.at([mark.x, mark.y])
@@ -79,7 +79,7 @@ function drawResiduals(context, frame, model, image) {
       context.lineTo(x + perPixel * u, y + perPixel * v)
     })
   }
-  const round = roundStep((60 / ARROW) * rms) // the scale, at most 60 px of the screen long
+  const round = roundStep((60 / ARROW) * usual) // the scale, at most 60 px of the screen long
   const [left, low] = [12, frame.height - 12]
   outlined(context, YELLOW, 2, () => {
     context.moveTo(left, low)

@@ -131,7 +131,7 @@ class Page {
       undo: act("Undo", "Z", () => this.undo()),
       redo: act("Redo", "Shift+Z", () => this.redo()),
       fresh: act("New point", "N", () => this.chooseNew()),
-      all: act("Accept all", "Shift+Enter", () => this.acceptAll()),
+      all: act("Accept all", "Shift+Enter", () => this.acceptAll(), { className: "m-all" }),
     }
     this.aim = make("b", {})
     const kinds = [["", "what fits (0)"], ...KINDS.map((kind, k) => [kind, `${kind === "hand" ? "by hand" : kind} (${k + 1})`])]

@@ -94,10 +94,13 @@ export class Model {
     return bars.length || points.some((point) => point.control || point.automatic) ? unit : ""
   }
 
-  /** RMS of the residuals in px; 0 without residuals. */
-  get rms() {
-    const squares = this.state.marks.filter((mark) => mark.residual).flatMap((mark) => mark.residual.map((v) => v * v))
-    return squares.length ? Math.sqrt(squares.reduce((sum, square) => sum + square, 0) / squares.length) : 0
+  /** A usual residual in px: the RMS, or the median sigma of the marks where that is larger; 0 without residuals. */
+  get usualResidual() {
+    const adjusted = this.state.marks.filter((mark) => mark.residual)
+    if (!adjusted.length) return 0
+    const squares = adjusted.flatMap((mark) => mark.residual.map((v) => v * v))
+    const sigmas = adjusted.map((mark) => Math.max(...mark.sigma)).sort((a, b) => a - b)
+    return Math.max(Math.sqrt(squares.reduce((sum, square) => sum + square, 0) / squares.length), sigmas[sigmas.length >> 1])
   }
 }
 
