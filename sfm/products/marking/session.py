@@ -111,13 +111,16 @@ class MarkingSession:
         name = self._photograph(image)
         with self._changed:
             mark = self._marking.marks.get((name, point))
+            row = self._automatic.get((name, point))
             fit = self._fits.get((name, point))
-        if mark is None:
+        if mark is not None:
+            x, y = mark.x, mark.y
+        elif row is not None:
+            x, y = row.xy
+        else:
             return None
-        if fit is not None and (fit.x, fit.y) != (mark.x, mark.y):
-            fit = None
-        outline = np.zeros((0, 2)) if fit is None else fit.outline
-        return picture_of_mark(self.pixels.grey(image), mark.x, mark.y, outline)
+        outline = fit.outline if fit is not None and (fit.x, fit.y) == (x, y) else np.zeros((0, 2))
+        return picture_of_mark(self.pixels.grey(image), x, y, outline)
 
     # --- changes -----------------------------------------------------------------------------------
 
