@@ -70,7 +70,7 @@ def test_licences_of_all_that_is_shipped_are_named() -> None:
     for script, texts in (("report/viewer/viewer.js", viewer), ("products/marking/page/mark.js", marking)):
         head = (ROOT / "sfm" / script).read_text(encoding="utf-8")[:200]
         built_with = re.match(r"/\* \w+ of Kolinear with (\S+ [\d.]+);", head)
-        assert built_with and f"- {built_with[1]} (" in texts, f"{script}: the licences are of another version"
+        assert built_with and f"- {built_with[1]} (" in texts, f"{script}: licences of another version"
 
 
 def test_the_package_brings_colmap_and_no_library_of_an_extra() -> None:
