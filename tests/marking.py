@@ -98,7 +98,7 @@ class Marking:
 
     @property
     def chosen(self) -> str:
-        """The chosen point."""
+        """The chosen point; "None" where the next click makes a new one."""
         return str(self.page.evaluate(f"() => {PAGE}.model.chosen"))
 
     def next_point(self, pane: int) -> Any:

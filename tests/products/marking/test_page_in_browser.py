@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -282,6 +284,45 @@ def test_everything_is_done_by_keys(discs: Marking) -> None:
         assert outline
 
 
+def test_the_filmstrip_and_the_list_are_walked_through_by_keys(discs: Marking) -> None:
+    page = discs.page
+    discs.key(".")
+    discs.ready()
+    for place in DISCS[[0, 5, 9]]:
+        discs.click(0, place)
+    page.locator(".m-frame[aria-current]").focus()
+    page.keyboard.press("End")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Enter")
+    assert discs.images[0] == len(discs.state["photographs"]) - 2
+    page.get_by_role("region", name="points; arrow keys select a row").focus()
+    for key, point in (("Home", "P1"), ("ArrowDown", "P2"), ("End", "P3")):
+        page.keyboard.press(key)
+        assert discs.chosen == point
+    page.keyboard.press("Escape")
+    assert discs.chosen == "None"
+    discs.key("k")
+    assert discs.chosen == "P1"
+
+
+def test_a_photograph_that_changed_is_named(browser: Any, folder: Path, tmp_path: Path) -> None:
+    for path in folder.iterdir():
+        shutil.copy(path, tmp_path)
+    survey, marks = tmp_path / "survey.toml", tmp_path / "marks.csv"
+    for changed in (False, True):
+        if changed:
+            cv2.imwrite(str(tmp_path / "photo 1.png"), picture(DISCS + 3))
+        with served(survey, marks) as server:
+            marking = open_page(browser, server)
+            pane_of(marking, "photo 1.png")
+            if not changed:
+                marking.click(0, DISCS[0])
+            frame = marking.page.get_by_role("button", name=re.compile("^photo 1.png: changed since"))
+            assert frame.count() == int(changed)
+            assert marking.page.locator(".m-warning:visible").count() == int(changed)
+            marking.close()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 800])
 def test_the_page_is_readable(browser: Any, folder: Path, tmp_path: Path, scheme: str, width: int) -> None:
@@ -423,6 +464,11 @@ def test_a_click_in_the_left_photograph_is_matched_in_the_right(
             state = marking.adjusted()
             (line,) = (line for line in state["lines"] if line["point"] == marking.chosen)
             assert line["image"] == 1 and distance_to(np.array(line["xy"]), seen) < 0.1
+            page.mouse.move(*page.evaluate(PLACE, [0, left["x"], left["y"]]))  # the ray of sight there
+            marking.tab.until(f"() => {PAGE}.panes[1].sight.length")
+            page.wait_for_timeout(150)
+            ray = np.array(page.evaluate(f"() => {PAGE}.panes[1].sight[0]"))
+            assert distance_to(ray, seen) < 2  # as exact as a place on the screen
             marking.click(1, seen + off)
             right = marks_of(marking, marking.chosen)[1]
             np.testing.assert_allclose([right["x"], right["y"]], seen, atol=0.2)

@@ -241,9 +241,11 @@ class Page {
     if (this.buttons) this.strip.refresh(this.panes.map((pane) => pane.image), this.pane.image)
   }
 
+  /** Show a photograph in a pane. One that another pane shows changes places, or stays there if a place in it is asked for. */
   showIn(pane, image, place = null) {
-    const there = place && this.panes.find((other) => other.image === image)
-    const target = there ?? pane
+    const there = this.panes.find((other) => other.image === image) ?? null
+    const target = place && there ? there : pane
+    if (there && there !== target) there.show(pane.image)
     target.show(image, place)
     this.activate(target.number)
     this.strip.reveal(image)
