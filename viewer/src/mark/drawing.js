@@ -30,26 +30,36 @@ export function drawOverlay(context, frame, model, image, shown) {
   const own = model.markOf(image, told)
   if (own) labels.keep(told, ...frame.at([own.x, own.y])) // the chosen name comes first
   for (const proposal of model.proposals.get(image) ?? []) drawProposal(context, frame, proposal, labels, inside, proposal.point === told)
-  const worst = model.state.adjustment.worst
-  for (const mark of model.marks.get(image) ?? []) {
-    const flagged = worst?.flagged && worst.image === image && worst.point === mark.point
-    if (mark !== own) drawMark(context, frame, mark, { labels, inside, flagged })
-  }
-  if (own) drawMark(context, frame, own, { labels, inside, flagged: worst?.flagged && worst.image === image && worst.point === told, chosen: true })
-  if (shown.residuals) drawResiduals(context, frame, model, image)
+  const marks = (model.marks.get(image) ?? []).map((mark) => ({ mark, place: frame.at([mark.x, mark.y]) })).filter(({ place }) => inside(place))
+  const { worst } = model.state.adjustment
+  const isFlagged = (mark) => Boolean(worst?.flagged) && worst.image === image && worst.point === mark.point
+  const [special, plain] = [[], []]
+  for (const one of marks) (one.mark === own || isFlagged(one.mark) ? special : plain).push(one)
+  drawPlain(context, plain, labels)
+  for (const { mark, place } of special) drawSpecial(context, mark, place, labels, isFlagged(mark), mark === own)
+  if (shown.residuals) drawResiduals(context, frame, marks, model.usualResidual)
   for (const place of shown.pending) drawPending(context, frame.at(place))
   if (shown.cursor) drawCursor(context, frame, shown.cursor)
 }
 
-function drawMark(context, frame, mark, { labels, inside, flagged, chosen = false }) {
-  const place = frame.at([mark.x, mark.y])
-  if (!inside(place)) return
-  const colour = flagged ? RED : GREEN
+/** Draw all marks that do not stand out with one path, because a photograph may have thousands. */
+function drawPlain(context, marks, labels) {
+  for (const automatic of [true, false]) {
+    const alike = marks.filter(({ mark }) => mark.automatic === automatic)
+    outlined(context, GREEN, automatic ? 1 : 1.5, () => alike.forEach(({ mark, place }) => symbol(context, mark, place)))
+  }
+  for (const { mark, place: [x, y] } of marks) labels.put(mark.point, x + AWAY[0], y + AWAY[1], GREEN, false)
+}
+
+function symbol(context, mark, [x, y]) {
+  if (mark.by === "hand") context.rect(x - 7, y - 7, 14, 14) // a place that a person stated
+  else cross(context, x, y, mark.automatic ? 8 : ARM)
+}
+
+function drawSpecial(context, mark, place, labels, flagged, chosen) {
   const [x, y] = place
-  outlined(context, colour, chosen ? 2.2 : mark.automatic ? 1 : 1.5, () => {
-    if (mark.by === "hand") context.rect(x - 7, y - 7, 14, 14) // a place that a person stated
-    else cross(context, x, y, mark.automatic ? 8 : ARM)
-  })
+  const colour = flagged ? RED : GREEN
+  outlined(context, colour, 2.2, () => symbol(context, mark, place))
   if (chosen) outlined(context, WHITE, 1.5, () => context.arc(x, y, ARM + 5, 0, 2 * Math.PI))
   if (flagged) outlined(context, RED, 2, () => context.arc(x, y, ARM + 9, 0, 2 * Math.PI))
   labels.put(flagged ? `${mark.point}, w ${significant(mark.test, 2)}` : mark.point, x + AWAY[0], y + AWAY[1], chosen ? WHITE : colour, chosen || flagged)
@@ -66,19 +76,17 @@ function drawProposal(context, frame, proposal, labels, inside, chosen) {
   labels.put(proposal.measured ? `${proposal.point}?` : `(${proposal.point})`, x + AWAY[0], y + AWAY[1], BLUE, chosen)
 }
 
-function drawResiduals(context, frame, model, image) {
-  const usual = model.usualResidual
+function drawResiduals(context, frame, marks, usual) {
   if (!usual) return
   const perPixel = ARROW / usual // px of the screen for 1 px of residual
-  for (const mark of model.marks.get(image) ?? []) {
-    if (!mark.residual) continue
-    const [x, y] = frame.at([mark.x, mark.y])
-    const [u, v] = frame.direction(mark.residual)
-    outlined(context, YELLOW, 1.5, () => {
+  outlined(context, YELLOW, 1.5, () => {
+    for (const { mark, place: [x, y] } of marks) {
+      if (!mark.residual) continue
+      const [u, v] = frame.direction(mark.residual)
       context.moveTo(x, y)
       context.lineTo(x + perPixel * u, y + perPixel * v)
-    })
-  }
+    }
+  })
   const round = roundStep((60 / ARROW) * usual) // the scale, at most 60 px of the screen long
   const [left, low] = [12, frame.height - 12]
   outlined(context, YELLOW, 2, () => {

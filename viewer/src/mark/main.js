@@ -1,7 +1,7 @@
 // The page of `kolinear mark`: photographs side by side, what is marked in them, and what is to be done next.
 
 import { button, choice, Hub, make, tick } from "../page.js"
-import { byName, counted, significant } from "../numbers.js"
+import { counted, significant } from "../numbers.js"
 import { ask } from "./dialogs.js"
 import { keysOf, listenToKeys, showHelp } from "./keys.js"
 import { KINDS, Model } from "./model.js"
@@ -460,7 +460,7 @@ class Page {
   }
 
   step(by) {
-    const names = this.model.names().sort(byName)
+    const names = this.model.names
     if (!names.length) return
     const from = names.indexOf(this.model.chosen)
     const to = from < 0 ? (by > 0 ? 0 : names.length - 1) : (from + by + names.length) % names.length
@@ -503,7 +503,7 @@ class Page {
   }
 
   bar() {
-    const names = this.model.names()
+    const names = this.model.names
     const { unit } = this.model.state
     const fields = [
       { key: "start", words: "from point", value: this.model.chosen ?? "", list: names },

@@ -12,6 +12,7 @@ export class Model {
     this.kind = null // of the next click; null: whatever fits
     this.sigma_px = 1 // of a mark by hand
     this.hovered = null // photograph under the pointer
+    this.names = [] // of all points, in natural order
   }
 
   take(state) {
@@ -22,6 +23,8 @@ export class Model {
     this.proposals = grouped(state.proposals, "image")
     this.proposed = grouped(state.proposals, "point")
     this.lines = grouped(state.lines, "image")
+    this.names = [...new Set([...this.pointOf.keys(), ...this.rays.keys()])].sort(byName)
+    this.usualResidual = usualResidual(state.marks)
     const known = (name) => this.pointOf.has(name) || this.rays.has(name)
     if (this.chosen !== null && !known(this.chosen)) this.chosen = null
   }
@@ -51,11 +54,6 @@ export class Model {
     return { words: needs ? `needs ${needs}` : "not oriented", look: "m-fair" }
   }
 
-  /** Names of all points, in natural order. */
-  names() {
-    return [...new Set([...this.pointOf.keys(), ...this.rays.keys()])].sort(byName)
-  }
-
   /**
    * The point that a click in a photograph measures; null: a new one.
    * A chosen point that is marked there already is left alone. In a photograph that is not oriented a point with
@@ -69,7 +67,7 @@ export class Model {
     const place = (name) => this.pointOf.get(name)?.X ?? this.pointOf.get(name)?.control?.X
     const marked = (this.marks.get(image) ?? []).map((mark) => place(mark.point)).filter(Boolean)
     let best = { name: null, away: -Infinity }
-    for (const name of this.names()) {
+    for (const name of this.names) {
       if (!place(name) || this.markOf(image, name)) continue
       const away = distanceFrom(marked, place(name))
       if (away > best.away) best = { name, away }
@@ -93,15 +91,15 @@ export class Model {
     const { unit, bars, points } = this.state
     return bars.length || points.some((point) => point.control || point.automatic) ? unit : ""
   }
+}
 
-  /** A usual residual in px: the RMS, or the median sigma of the marks where that is larger; 0 without residuals. */
-  get usualResidual() {
-    const adjusted = this.state.marks.filter((mark) => mark.residual)
-    if (!adjusted.length) return 0
-    const squares = adjusted.flatMap((mark) => mark.residual.map((v) => v * v))
-    const sigmas = adjusted.map((mark) => Math.max(...mark.sigma)).sort((a, b) => a - b)
-    return Math.max(Math.sqrt(squares.reduce((sum, square) => sum + square, 0) / squares.length), sigmas[sigmas.length >> 1])
-  }
+/** A usual residual in px: the RMS, or the median sigma of the marks where that is larger; 0 without residuals. */
+function usualResidual(marks) {
+  const adjusted = marks.filter((mark) => mark.residual)
+  if (!adjusted.length) return 0
+  const squares = adjusted.flatMap((mark) => mark.residual.map((v) => v * v))
+  const sigmas = adjusted.map((mark) => Math.max(...mark.sigma)).sort((a, b) => a - b)
+  return Math.max(Math.sqrt(squares.reduce((sum, square) => sum + square, 0) / squares.length), sigmas[sigmas.length >> 1])
 }
 
 /** The least distance of a point from the lines through others; from the point, if there is one other only. */

@@ -1,7 +1,7 @@
 // Beside the photographs: the chosen point with the pictures of its fits, all points, the adjustment and the scale bars.
 
 import { button, facts, make } from "../page.js"
-import { byName, counted, fixed, signed, significant, toPrecision } from "../numbers.js"
+import { counted, fixed, signed, significant, toPrecision } from "../numbers.js"
 import { Table } from "../tables.js"
 
 const SIGMA_DIGITS = 2
@@ -33,7 +33,7 @@ export class Panel {
 
   refresh() {
     const { model } = this
-    this.table.renew(model.names().sort(byName), model.chosen)
+    this.table.renew(model.names, model.chosen)
     this.refreshPoint()
     this.refreshAdjustment()
     this.refreshBars()
