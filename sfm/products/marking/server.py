@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hmac
 import math
+import os
 import secrets
 import socket
 from collections.abc import Awaitable, Callable, Mapping
@@ -330,6 +331,8 @@ class MarkingServer:
             OutputError: another program has the port.
         """
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        if os.name == "posix":  # a port whose last server has just ended; elsewhere it would share the port
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self.socket.bind((HOST, port))
         except OSError as error:

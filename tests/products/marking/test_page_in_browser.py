@@ -155,6 +155,10 @@ def test_marks_are_renamed_measured_again_deleted_and_all_is_undone(discs: Marki
     discs.click(0, DISCS[0])
     discs.click(0, DISCS[1])
     assert {mark["point"] for mark in discs.state["marks"]} == {"P1", "P2"}
+    page.mouse.dblclick(*page.evaluate(PLACE, [0, *DISCS[2]]))
+    discs.settled()
+    assert {mark["point"] for mark in discs.state["marks"]} == {"P1", "P2", "P3"}
+    discs.key("z")
     discs.click(0, DISCS[0])  # chooses what is there
     assert page.locator(".m-aim b").inner_text() == "P1" and len(discs.state["marks"]) == 2
     discs.key("r")

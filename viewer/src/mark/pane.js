@@ -10,6 +10,7 @@ const SHARP = 3 // magnification from which single pixels are shown
 const CURSOR_STEP = 10 // px of the screen, of the crosshair that the arrow keys move
 const EDGE = 40 // px of the screen, from which the view follows the crosshair
 const NEAR = 9 // px of the screen within which a click chooses what is marked or proposed there
+const DOUBLE_MS = 400 // between the clicks of a double click
 const GESTURES = { clickToZoom: false, dblClickToZoom: false, dblClickDragToZoom: false, flickEnabled: false }
 
 export class Pane {
@@ -59,7 +60,7 @@ export class Pane {
     const { viewer, view, actions } = this
     viewer.addHandler("canvas-click", (event) => {
       event.preventDefaultAction = true
-      if (!event.quick) return
+      if (!event.quick || this.isAgain(event.position)) return
       const place = this.placeAt(event.position.x, event.position.y)
       const there = event.shift ? null : this.pointAt(event.position.x, event.position.y)
       if (there !== null && there !== this.model.pointFor(this.image)) actions.choose(this, there)
@@ -175,6 +176,13 @@ export class Pane {
   contains(place) {
     const { width, height } = this.model.photograph(this.image)
     return Boolean(place) && place[0] >= -0.5 && place[1] >= -0.5 && place[0] <= width - 0.5 && place[1] <= height - 0.5
+  }
+
+  /** Whether a click is the second one of a double click, which is meant as one. */
+  isAgain({ x, y }) {
+    const [before, now] = [this.clicked, performance.now()]
+    this.clicked = { x, y, now }
+    return Boolean(before) && now - before.now < DOUBLE_MS && Math.hypot(x - before.x, y - before.y) < NEAR
   }
 
   /** The point that is marked or proposed at a place of the canvas, or null. */
