@@ -399,6 +399,9 @@ def test_from_nothing_to_a_report_by_clicks_and_keys(
         report = opened.value
         report.wait_for_load_state()
         assert "12 photographs" in report.inner_text("body")
+        (tmp_path / "other.txt").write_text("not of the report", encoding="utf-8")
+        for name, status in (("points.csv", 200), ("..%2F..%2Fother.txt", 404), ("%2Fetc%2Fhostname", 404)):
+            assert report.request.get(f"{server.address.url}report/{name}").status == status
         result = read_result(Path(marking.state["run"]["report"]).parent)
         rows = [result.network.points.index(point["name"]) for point in state["points"]]
         assert len(result.network.points) > 60 and result.point_covariance is not None
