@@ -143,6 +143,7 @@ def test_nothing_to_measure_is_said_and_by_hand_it_is_marked(discs: Marking) -> 
     discs.key("7")
     discs.page.get_by_label("sigma").fill("0.5")
     discs.page.get_by_label("sigma").press("Tab")
+    discs.page.wait_for_timeout(400)  # no double click
     discs.click(0, empty)
     (mark,) = discs.state["marks"]
     assert (mark["kind"], mark["by"], mark["sigma"]) == ("hand", "hand", [0.5, 0.5])
