@@ -228,6 +228,8 @@ def measure_predicted(
         family: codes of rings.
     """
     gate = float(np.sqrt(chi2_isf(GATE, 2) * np.linalg.eigvalsh(predicted.covariance)[-1]))
+    if not np.isfinite(gate):  # marks that contradict one another predict nothing
+        return None
     if look.size_px > 0 and gate > MOST_SIZES * look.size_px:  # a neighbour may be there
         return None
     reach = float(np.clip(gate, LEAST_REACH_PX, MOST_REACH_PX))

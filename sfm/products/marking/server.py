@@ -302,7 +302,19 @@ def _only(
 
 
 def _json(content: dict[str, Any], status: int = 200) -> JSONResponse:
-    return JSONResponse(content, status, headers=SAFE)
+    try:
+        return JSONResponse(content, status, headers=SAFE)
+    except ValueError:  # JSON has no word for what is not finite
+        return JSONResponse(_finite(content), status, headers=SAFE)
+
+
+def _finite(value: Any) -> Any:
+    """Return JSON content with None for what is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _refused(status: int) -> Response:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -519,9 +519,17 @@ class MarkingSession:
                 following = follow(self.project, marking, self._evidence, last)
                 proposals = propose(following, marking, self.pixels.grey, self.project, fits, known=known)
                 proposals |= match_single(following, latest, marking, self.pixels.grey, self.project, fits)
+                proposals = {**_of_single_marks(known, marking), **proposals}
                 failed = ""
             except KolinearError as error:
                 following, proposals, failed = last, {}, str(error)
+            except Exception as error:  # a fault is said; the next change is followed again
+                fault = f"{type(error).__name__}: {error}"
+                following, proposals, failed = (
+                    last,
+                    {},
+                    f"Nothing follows from the marks, which are saved ({fault}).",
+                )
             with self._changed:
                 self._followed, self._failed = changes, failed
                 if changes == self._changes:
@@ -757,3 +765,12 @@ class MarkingSession:
                 f"{a.sigma0_px:.2f} px, redundancy {a.redundancy}."
             )
         return shown
+
+
+def _of_single_marks(
+    known: Mapping[tuple[str, str], Proposal], marking: Marking
+) -> dict[tuple[str, str], Proposal]:
+    """Return the proposals of points with one mark, which stay until a person decides."""
+    rays = Counter(point for _, point in marking.marks)
+    gone = marking.marks.keys() | marking.refused.keys()
+    return {key: proposal for key, proposal in known.items() if rays[key[1]] == 1 and key not in gone}

@@ -487,4 +487,10 @@ def test_a_click_in_the_left_photograph_is_matched_in_the_right(
             assert (np.abs(point["X"] - truth[0]) < 5 * np.array(point["sigma"])).all()
             shown = page.locator(".m-card").first.inner_text()
             assert all(f"{axis}\t" in shown or f"{axis}\n" in shown for axis in "XYZ") and "sigma" in shown
+        for xy in ((520.0, 350.0), (650.0, 560.0)):  # proposals stay until all are accepted
+            marking.click(0, xy)
+            marking.adjusted()
+        assert sum(proposal["measured"] for proposal in marking.state["proposals"]) == 2
+        marking.key("Shift+Enter")
+        assert all(len(marks_of(marking, f"P{k + 1}")) == 2 for k in range(5))
         marking.close()
