@@ -29,7 +29,7 @@ from sfm.model.camera import (
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
-from sfm.model.distributions import chi2_isf, f_isf, level_of_single, t_ppf
+from sfm.model.distributions import chi2_isf, f_isf, level_of_single, normal_ppf, t_ppf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import InteriorObservations, Network
@@ -194,11 +194,17 @@ def _contradicting(network: Network, adjustment: Adjustment, options: Adjustment
 
 
 def _is_doubtful(adjustment: Adjustment, false_alarm: float) -> bool:
-    """Return whether the test of all marks together rejects one, by Pope's tau."""
+    """Return whether the test of all marks together rejects one, by Pope's tau and by Baarda's w.
+
+    Residuals of marks that fit far better than stated differ, and contradict nothing.
+    """
     r = adjustment.redundancy
     if r < 2 or not adjustment.sigma0 > 0:
         return False
-    t = float(t_ppf(1 - level_of_single(false_alarm, adjustment.standardised.size) / 2, r - 1))
+    level = level_of_single(false_alarm, adjustment.standardised.size)
+    if not np.nanmax(np.abs(adjustment.standardised)) > normal_ppf(1 - level / 2):
+        return False
+    t = float(t_ppf(1 - level / 2, r - 1))
     limit = t * np.sqrt(r) / np.sqrt(r - 1 + t * t)
     return bool(np.nanmax(np.abs(adjustment.tau)) > limit)
 
