@@ -92,6 +92,7 @@ def mark(
             raise MissingLibraryError(
                 f"mark: {error.name} is not installed; install it with: pip install 'kolinear[mark]'"
             ) from None
+        from sfm.files.user_cache import scratch_folder
         from sfm.products.marking.session import MarkingSession
 
     compile_first()
@@ -118,10 +119,16 @@ def mark(
         server = MarkingServer(session, port)
         print(f"Marks: {out or marks}")
         print(f"Page: {server.address.url}", flush=True)
-        if browser and not webbrowser.open(server.address.url):
-            print("No browser could be opened; open the page yourself.", flush=True)
-        print("Ctrl-C ends it; every mark is saved.", flush=True)
-        server.serve()
+        with (
+            scratch_folder() as folder
+        ):  # only of this user: a command line, and so its address, is seen by all
+            start = folder / "start.html"
+            start.touch(mode=0o600)
+            start.write_text(f'<meta http-equiv="refresh" content="0; url={server.address.url}">', "utf-8")
+            if browser and not webbrowser.open(start.as_uri()):
+                print("No browser could be opened; open the page yourself.", flush=True)
+            print("Ctrl-C ends it; every mark is saved.", flush=True)
+            server.serve()
     finally:
         session.close()
 

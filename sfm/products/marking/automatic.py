@@ -12,10 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sfm.files.open_folders import path_inside
 from sfm.files.plain_text import read_toml
 from sfm.files.whole_files import whole_file
-from sfm.model.errors import SurveyFileError
+from sfm.model.errors import KolinearError, SurveyFileError
 from sfm.report.output import folder_name, path_from
+from sfm.survey.inputs.survey import read_survey
 
 KOLINEAR = (sys.executable, "-m", "sfm.cli")
 STAGE = re.compile(r"[A-Za-z].*")
@@ -72,8 +74,11 @@ class AutomaticRun:
             tell(Run("running", "running the survey"))
             images = ["--images", str(self._photographs)]
             status, last = self._call(["run", str(file), *images, "--out", str(self._out)], tell)
-        except (OSError, SurveyFileError) as error:
+        except (OSError, KolinearError) as error:
             tell(Run("failed", sentence=str(error)))
+            return
+        except Exception as error:  # else the page would wait for ever
+            tell(Run("failed", sentence=f"{type(error).__name__}: {error}"))
             return
         report = self._out / "report.html"
         shown = str(report.resolve()) if report.is_file() and not self._stopped else None
@@ -118,7 +123,8 @@ def name_marks(survey_file: Path, marks: Path) -> None:
         marks: the marks file.
 
     Raises:
-        SurveyFileError: it names another marks file.
+        SurveyFileError: it names another marks file, cannot name any, or the marks file is outside its
+            folder; the survey file is what it was.
         OutputError: it cannot be written.
     """
     text, table = read_toml(survey_file, "a survey file")
@@ -128,10 +134,19 @@ def name_marks(survey_file: Path, marks: Path) -> None:
         if (survey_file.parent / str(named.get("file"))).resolve() != marks.resolve():
             raise SurveyFileError(f"{survey_file}: names the marks file '{named.get('file')}', not {marks}")
         return
-    more = "" if text.endswith("\n") else "\n"
+    path_inside(survey_file.parent, path, str(survey_file))
+    before = survey_file.read_bytes()
+    line = "\r\n" if b"\r\n" in before else "\n"
+    more = "" if text.endswith("\n") else line
     quoted = path.replace("\\", "/").replace('"', '\\"')
     with whole_file(survey_file, replaces=True) as part:
-        part.write_text(f'{text}{more}\n[marks]\nfile = "{quoted}"\n', encoding="utf-8")
+        part.write_bytes(before + f'{more}{line}[marks]{line}file = "{quoted}"{line}'.encode())
+    try:
+        read_survey(survey_file)
+    except SurveyFileError:  # such as one with [observations] in place of photographs
+        with whole_file(survey_file, replaces=True) as part:
+            part.write_bytes(before)
+        raise
 
 
 def _use_control(survey_file: Path) -> None:

@@ -36,6 +36,7 @@ from sfm.targets.outlines import MIN_STEP, STEP_SIGMAS, estimate_noise, scale_of
 
 REACH_PX = 12.0  # from a click to the outline of a target, or to another feature
 WINDOW_REACH_PX = 6.0  # from a click to a natural point
+ROUNDING_NOISE = 12**-0.5  # grey values, of photographs without noise, such as rendered or overexposed ones
 TARGET_HALVES_PX = (60, 160, 400)  # half sides of the parts in which targets are found; large ones need more
 SADDLE_HALVES_PX = (4, 6, 9, 13)
 CORNER_REACHES_PX = (7.0, 10.0, 14.0, 19.0)  # lengths of the edges that are fitted
@@ -159,7 +160,8 @@ def _part(photograph: AnyArray, at: FloatArray, half: int) -> _Part:
     right, bottom = min(left + 2 * half + 1, width), min(top + 2 * half + 1, height)
     pixels = np.ascontiguousarray(photograph[top:bottom, left:right])
     origin = np.array([left, top], dtype=float)
-    return _Part(pixels, as_grey(pixels), at - origin, origin, estimate_noise(pixels), scale_of(pixels))
+    noise = max(estimate_noise(pixels), ROUNDING_NOISE)
+    return _Part(pixels, as_grey(pixels), at - origin, origin, noise, scale_of(pixels))
 
 
 def _target(photograph: AnyArray, asked: _Asked) -> Measured | None:

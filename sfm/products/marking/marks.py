@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers
-from sfm.model.errors import FolderInUseError
+from sfm.model.errors import FolderInUseError, OutputError
 from sfm.products.marking.project import MarkedProject, refuse_other_survey
 from sfm.survey.inputs.marks_file import Marking, read_marks, write_marks
 
@@ -41,6 +41,7 @@ class SavedMarks:
             name = project.survey.name
             self.now = read_marks(path) if path.exists() else Marking(name)
             refuse_other_survey(self.now.survey, name, path)
+            self._written = _content(path)
         except BaseException:
             self.close()
             raise
@@ -51,9 +52,11 @@ class SavedMarks:
         """Save a new state.
 
         Raises:
-            OutputError: the file cannot be written; the state is what it was.
+            OutputError: the file cannot be written, or another program has changed it; the state is what it
+                was.
+            SurveyFileError: a mark is not one that is read again.
         """
-        write_marks(self.path, marking)
+        self._write(marking)
         self._before.append(self.now)
         self._undone.clear()
         self.now = marking
@@ -79,11 +82,32 @@ class SavedMarks:
     def _step(self, source: list[Marking], other: list[Marking]) -> bool:
         if not source:
             return False
-        write_marks(self.path, source[-1])
+        self._write(source[-1])
         other.append(self.now)
         self.now = source.pop()
         return True
 
+    def _write(self, marking: Marking) -> None:
+        """Write the file, unless another program has changed it since."""
+        there = _content(self.path)
+        if there not in (None, self._written):
+            raise OutputError(
+                f"{self.path}: was changed by another program, and is left as it is; end this page and begin "
+                "again"
+            )
+        write_marks(self.path, marking)
+        self._written = _content(self.path)
+
     def close(self) -> None:
         """Give the file free."""
         self._held.close()
+
+
+def _content(path: Path) -> bytes | None:
+    """Return the content of a file; None if there is none."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror}") from error

@@ -347,6 +347,7 @@ class MarkingServer:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self.socket.bind((HOST, port))
+            self.socket.listen()
         except OSError as error:
             self.socket.close()
             raise OutputError(

@@ -407,12 +407,14 @@ class MarkingSession:
         if usual == "window" and kind in (None, "window"):
             first = next(mark for mark in marks if mark.kind == "window")
             template = template_of(first, self.pixels.grey, self.project)
-            if template is not None:
-                return measure_click(pixels, x, y, "window", template=template)
-        if kind is None and usual is not None:
-            with suppress(KolinearError):
-                return measure_click(pixels, x, y, usual, family=family)
-        return measure_click(pixels, x, y, kind, family=family)
+            if template is None:
+                raise MarkError(f"{first.photograph}, which shows the window of '{point}', cannot be read")
+            return measure_click(pixels, x, y, "window", template=template)
+        if marks and kind == "window":
+            raise MarkError(f"'{point}' is a {usual} in {marks[0].photograph}, not a window")
+        if kind is None and usual == "ring":  # its code may be unreadable here
+            usual = "target"
+        return measure_click(pixels, x, y, kind or usual, family=family)
 
     def _new_name(self, marking: Marking, photograph: str, measured: Measured) -> str:
         """Return the code of a ring, or the next free name."""
@@ -450,6 +452,8 @@ class MarkingSession:
 
     def _with_hash(self, marking: Marking, image: int) -> Marking:
         name = self.project.photographs.names[image]
+        if name in marking.hashes and any(photograph == name for photograph, _ in marking.marks):
+            return marking  # the marks that are there were made in that file
         if name not in self._hashes:
             self._hashes[name] = content_hash(self.project.photographs.paths[image])
         return replace(marking, hashes={**marking.hashes, name: self._hashes[name] or ""})
@@ -462,6 +466,8 @@ class MarkingSession:
             return self._state()
 
     def _change(self, marking: Marking) -> None:
+        if self._closed:
+            raise MarkError("the page has been ended; nothing was saved")
         before = self._marking
         self._saved.change(marking)
         self._follow(before)
@@ -484,9 +490,13 @@ class MarkingSession:
         }
         last = self._following
         now_following = None if last is None else without_moved(last, marking, self.project)
-        if now_following is not None and len(changed) == 1:
-            self._propose_again(now_following, changed)
-        self._changed.notify_all()
+        try:
+            if now_following is not None and len(changed) == 1:
+                self._propose_again(now_following, changed)
+        except Exception as error:  # what is saved is saved; all proposals follow in the background
+            self._failed = f"No proposals yet ({type(error).__name__}: {error})."
+        finally:
+            self._changed.notify_all()
 
     def _propose_again(self, following: Following, changed: set[str]) -> None:
         """Propose the places of points from their rays and the orientation so far."""
@@ -551,7 +561,7 @@ class MarkingSession:
                     return
             if self.pixels.is_full or self.pixels.is_decoded(i):
                 continue
-            with suppress(KolinearError):
+            with suppress(Exception):  # told when it is needed
                 self.pixels.grey(i)
 
     def _look_for_changed_files(self) -> None:
@@ -560,7 +570,7 @@ class MarkingSession:
             if name not in self._index:
                 continue
             path = self.project.photographs.paths[self._index[name]]
-            with suppress(PhotographError):
+            with suppress(PhotographError, OSError):
                 if content_hash(path) != stated:
                     self._changed_files[name] = "changed since it was marked: check its marks"
 

@@ -222,7 +222,12 @@ def write_marks(path: Path, marking: Marking) -> None:
 
     Raises:
         OutputError: the file cannot be written.
+        SurveyFileError: a mark is not one that `read_marks` reads.
     """
+    for mark in (*marking.marks.values(), *marking.refused.values()):
+        finite = np.isfinite([mark.x, mark.y, mark.sxx, mark.sxy, mark.syy]).all()
+        if not (finite and mark.sxx > 0 and mark.syy > 0 and mark.sxy**2 < mark.sxx * mark.syy):
+            raise SurveyFileError(f"mark of '{mark.point}' in '{mark.photograph}': no place with a precision")
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
 
