@@ -39,7 +39,7 @@ def test_numbers_are_scaled_and_conditions_turned() -> None:
 
 
 def test_a_text_with_a_computed_part_is_changed_as_a_whole() -> None:
-    module = Module("sfm/model/remarks/remark.py")
+    module = Module("sfm/model/remarks/row.py")
     texts = [
         module.changed(old, new)
         for _, node, old, new in changes_of(module)

@@ -26,7 +26,7 @@ from sfm.comparison.camera_conversion import convert_cameras
 from sfm.files.plain_text import read_json
 from sfm.files.whole_files import whole_file
 from sfm.model.conventions import FloatArray
-from sfm.model.display import listed
+from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -85,11 +85,13 @@ def read_marks_of_others(
     here = [row for row in rows if row[0] in size_of]
     if not here:
         raise SurveyFileError(
-            f"{path}: none of its {len(rows)} image points is in these photographs, expected names as "
+            f"{path}: of {counted(len(rows), 'image point')} none is in these photographs, expected names as "
             f"{photographs[0]}"
         )
     if len(here) > MAX_MARKS:
-        raise SurveyFileError(f"{path}: {len(here)} image points, at most {MAX_MARKS} are taken as marks")
+        raise SurveyFileError(
+            f"{path}: {counted(len(here), 'image point')}, at most {MAX_MARKS} are taken as marks"
+        )
     when = now()
     for image, point, x, y, C in here:
         mark = Mark(

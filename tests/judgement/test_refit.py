@@ -50,7 +50,7 @@ def rounds(
     """Return how many rounds a refit takes whose further steps gain so much of v'Pv, and the refit."""
     taken = []
 
-    def stepped(*given: Any) -> tuple[Adjustment, Any, int]:
+    def stepped(*given: Any, **_: Any) -> tuple[Adjustment, Any, int]:
         taken.append(given)
         return a, given[3] + given[4], adjustments
 
@@ -86,7 +86,7 @@ def test_rounds_that_do_not_end_are_few_and_those_of_a_search_fewer(
 def test_an_adjustment_that_has_no_solution_ends_a_refit(
     a: Adjustment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(refitting, "_stepped", lambda *_: None)
+    monkeypatch.setattr(refitting, "_stepped", lambda *_, **__: None)
     assert refit(a, held("K1", a), a) is None
     monkeypatch.undo()
 
@@ -128,7 +128,7 @@ def test_a_step_is_halved_where_it_loses_likelihood(
         refitting, "log_likelihood_of", lambda one: 0.0 if one is a else value[one.iterations]
     )
     D = np.ones((len(a.rejected), 2, 1))
-    stepped = refitting._stepped(a, D, a, np.array([3.0]), np.array([2.0]))
+    stepped = refitting._stepped(a, D, a, np.array([3.0]), np.array([2.0]), least=0.0)
     assert stepped is not None
     taken, beta, count = stepped
     assert taken is found[halved] and count == 1 + halved
@@ -143,7 +143,7 @@ def test_where_every_step_loses_the_first_that_was_solved_is_taken(
     monkeypatch.setattr(refitting, "readjusted", lambda *_: next(tried))
     monkeypatch.setattr(refitting, "log_likelihood_of", lambda one: 0.0 if one is a else -9.0)
     D = np.ones((len(a.rejected), 2, 1))
-    stepped = refitting._stepped(a, D, a, np.zeros(1), np.ones(1))
+    stepped = refitting._stepped(a, D, a, np.zeros(1), np.ones(1), least=0.0)
     assert stepped is not None and stepped[0] is found[1] and stepped[1].tolist() == [0.5]
 
 

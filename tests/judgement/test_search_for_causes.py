@@ -233,7 +233,10 @@ def test_earlier_causes_stay_while_the_others_do_not_explain_them(
     asked: list[list[float]] = []
 
     def without(losses: dict[float, float]) -> Callable[..., Refit]:
-        def alone(plain: Adjustment, one: Alternative, start: Adjustment, others: Any) -> Refit:
+        def alone(
+            plain: Adjustment, one: Alternative, start: Adjustment, others: Any, *, least: float
+        ) -> Refit:
+            assert least == -np.inf  # without a cause, likelihood is lost
             kept = {other.search for other, _ in others}
             asked.append([float(beta[0]) for _, beta in others])
             left = 0.0 if kept == {1.0} else 1.0
@@ -252,7 +255,7 @@ def test_earlier_causes_stay_while_the_others_do_not_explain_them(
     monkeypatch.setattr(hypotheses, "refit", without({0.0: limit - 0.1, 1.0: limit + 0.1}))
     kept = hypotheses._still_needed(a, (first, second), new)
     assert [one.alternative.search for one in kept[:-1]] == [1.0]
-    monkeypatch.setattr(hypotheses, "refit", lambda *_: None)  # what has no solution without it is needed
+    monkeypatch.setattr(hypotheses, "refit", lambda *_, **__: None)  # unsolved: needed
     assert len(hypotheses._still_needed(a, (first, second), new)) == 3
 
 

@@ -124,6 +124,12 @@ def scene(folder: Path) -> Path:
     return path
 
 
+def marks_of_others(folder: Path) -> Path:
+    path = folder / "gcp_list.txt"
+    path.write_text("WGS84 UTM 32N\n0 0 0 10 10 0.png a\n0 0 0 12 10 1.png a\n", encoding="utf-8")
+    return path
+
+
 def lengths(folder: Path) -> Path:
     path = folder / "lengths.csv"
     path.write_text("line,from,to,length,sigma\n1,1,2,1,0.001\n", encoding="utf-8")
@@ -213,6 +219,13 @@ COMMANDS: dict[str, Command] = {
     "run of a folder": (
         lambda f: ("run", photographs(f)[0].parent, "--out", "new/out/s"),
         ("new",),
+    ),
+    "mark": (
+        lambda f: (
+            *("mark", photographs(f)[0].parent, "--import", marks_of_others(f)),
+            *("--out", "new/marks.csv", "--export", "new/a.xml"),
+        ),
+        ("new", "new/marks.csv", "new/a.xml"),
     ),
     "view": (lambda f: ("view", model(f), "--no-open", "--out", "new/a.html"), ("new", "new/a.html")),
     "view beside the model": (lambda f: ("view", model(f), "--no-open"), ("model.html",)),

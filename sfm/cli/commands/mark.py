@@ -100,13 +100,14 @@ def mark(
         project, marks = _project(source, images, allow_outside=allow_outside)
         session = MarkingSession(project, out or marks)
     try:
+        said = ""
         if import_from is not None:
             from sfm.cli.other_marks import read_marks_of_others
 
             names, sizes = project.photographs.names, project.sizes
             with working_on(str(import_from)):
                 added = session.add(read_marks_of_others(import_from, names, sizes, project.survey.unit))
-            print(f"{import_from}: {counted(added, 'mark')} added")
+            said = f"{import_from}: {counted(added, 'mark')} added\n"
         if export_to is not None:
             from sfm.cli.other_marks import write_marks_of_others
 
@@ -114,10 +115,10 @@ def mark(
                 network, estimate = session.exported()
                 before = import_from if import_from and import_from.suffix == export_to.suffix else None
                 write_marks_of_others(export_to, network, estimate, ground_control=before)
-            print(f"{export_to}: {counted(len(network.image_points), 'mark')}")
+            print(f"{said}{export_to}: {counted(len(network.image_points), 'mark')}")
             return
         server = MarkingServer(session, port)
-        print(f"Marks: {out or marks}")
+        print(f"{said}Marks: {out or marks}")
         print(f"Page: {server.address.url}", flush=True)
         with (
             scratch_folder() as folder

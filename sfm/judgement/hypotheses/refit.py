@@ -119,7 +119,8 @@ def refit(
         except np.linalg.LinAlgError:
             return None
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
-        out_of_reach = likelihoods[-1] + gain.value < before_all + least  # even with the next step
+        # even with the next step; the first one may be far off, with image points rejected that return
+        out_of_reach = number > 0 and likelihoods[-1] + gain.value < before_all + least
         finished = out_of_reach or gain.value < LAST_GAIN or number == ROUNDS - 1
         if finished or taken >= most:
             break

@@ -9,9 +9,9 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 
-from sfm.files.open_folders import locked
+from sfm.files.open_folders import locked, refuse_links
 from sfm.files.whole_files import remove_leftovers
-from sfm.model.errors import FolderInUseError, OutputError
+from sfm.model.errors import FolderInUseError, OutputError, SurveyFileError
 from sfm.products.marking.project import MarkedProject, refuse_other_survey
 from sfm.survey.inputs.marks_file import Marking, read_marks, write_marks
 
@@ -30,6 +30,7 @@ class SavedMarks:
             SurveyFileError: the file is not a marks file, or of another survey.
             FolderInUseError: another server has the file.
         """
+        refuse_links(path)
         self.path = path
         self._held = ExitStack()
         try:
@@ -39,7 +40,7 @@ class SavedMarks:
         try:
             remove_leftovers(path)
             name = project.survey.name
-            self.now = read_marks(path) if path.exists() else Marking(name)
+            self.now = self._read() if path.exists() else Marking(name)
             refuse_other_survey(self.now.survey, name, path)
             self._written = _content(path)
         except BaseException:
@@ -47,6 +48,13 @@ class SavedMarks:
             raise
         self._undone: list[Marking] = []
         self._before: list[Marking] = []
+
+    def _read(self) -> Marking:
+        """Return what is in the file."""
+        try:
+            return read_marks(self.path)
+        except SurveyFileError as error:
+            raise SurveyFileError(f"{error}; it is left alone") from error
 
     def change(self, marking: Marking) -> None:
         """Save a new state.

@@ -20,7 +20,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.judgement.survey_result import LeftOutPoint, PhotographTargets
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
-from sfm.model.distributions import LEVEL, chi2_isf
+from sfm.model.distributions import chi2_isf
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ScaleBars, rows_of, without_given
@@ -179,7 +179,7 @@ def _of_one_source(survey: Survey, network: Network) -> Network:
     return replace(network, sources=tuple(row.source for row in declared(survey)))
 
 
-def _named_as_given(completed: Sequence[Correspondences]) -> list[Correspondences]:
+def _named_as_given(survey: Survey, completed: Sequence[Correspondences]) -> list[Correspondences]:
     """Return the points of all sources, where those without a name that others name have this name.
 
     A target without a code that a person marked too is one point. It is that of the mark where both are at
@@ -190,7 +190,7 @@ def _named_as_given(completed: Sequence[Correspondences]) -> list[Correspondence
         names = dict[str, str]()
         for j, other in enumerate(completed):
             if j != k:
-                names = _same_points(matched, other) | names
+                names = _same_points(survey, matched, other) | names
         points = tuple(names.get(name, name) for name in matched.network.points)
         named.append(replace(matched, network=replace(matched.network, points=points)))
     return named
@@ -209,7 +209,7 @@ def _naming_of(
     return NO_NAMES
 
 
-def _same_points(matched: Correspondences, other: Correspondences) -> dict[str, str]:
+def _same_points(survey: Survey, matched: Correspondences, other: Correspondences) -> dict[str, str]:
     """Return the names that another source has for points of one without a name."""
     running, given = _running(matched), set(other.network.points) - _running(other)
     a, b = matched.network, other.network
@@ -235,7 +235,7 @@ def _same_points(matched: Correspondences, other: Correspondences) -> dict[str, 
         d = of_a.xy[first][:, None] - of_b.xy[second]
         C = of_a.covariance[first][:, None] + of_b.covariance[second] + SAME_PX**2 * np.eye(2)
         square = np.einsum("abi,abij,abj->ab", d, np.linalg.inv(C), d)
-        alike[pairs] += square <= chi2_isf(LEVEL, 2)
+        alike[pairs] += square <= chi2_isf(survey.adjust.levels.question, 2)
     names = dict[str, str]()
     for p, q in np.argwhere((alike >= MIN_SAME) & (2 * alike > both)).tolist():
         names.setdefault(a.points[p], b.points[q])
@@ -394,7 +394,7 @@ def _joined_correspondences(
     if len(completed) == 1:
         return replace(completed[0], network=_of_one_source(survey, completed[0].network))
     without_names = [matched.network.points for matched in completed]
-    completed = _named_as_given(completed)
+    completed = _named_as_given(survey, completed)
     named = [matched.network.points for matched in completed]
     completed = [
         replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
