@@ -421,6 +421,9 @@ class MarkingSession:
         if measured.code is not None and (photograph, str(measured.code)) not in marking.marks:
             return str(measured.code)
         taken = {*marking.points, *marking.control, *self._given_names()}
+        taken |= {point for _, point in (*marking.refused, *self._automatic)}
+        taken |= {end for bar in scale_bars(self.project, marking) for end in (bar.start, bar.end)}
+        taken |= {named.name for named in self.project.survey.marks}
         number = 1
         while f"P{number}" in taken:
             number += 1

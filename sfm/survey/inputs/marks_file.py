@@ -27,7 +27,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from sfm.files.csv_tables import read_comments, read_table
-from sfm.files.plain_text import as_cell, csv_text
+from sfm.files.plain_text import as_cell, csv_text, from_cell
 from sfm.files.whole_files import whole_file
 from sfm.model.errors import SurveyFileError
 from sfm.survey.inputs.given_values import KnownPoints, Observations, ScaleBar
@@ -163,11 +163,12 @@ def read_marks(path: Path) -> Marking:
     control: dict[str, StatedPoint] = {}
     bars: dict[tuple[str, str], ScaleBar] = {}
     for line, text in comments[1:]:
-        key, _, value = text.partition(": ")
+        is_hash = text.startswith("sha256 ")  # of a photograph, whose name may contain ": "
+        key, _, value = text.rpartition(": ") if is_hash else text.partition(": ")
         cells = next(csv.reader([value]), [])
         if key == "survey":
             survey = value
-        elif key.startswith("sha256 "):
+        elif is_hash:
             hashes[key.removeprefix("sha256 ")] = value
         elif key == "control":
             name, *xyz = _stated(path, line, cells, 6)
@@ -207,7 +208,7 @@ def _stated(path: Path, line: int, cells: Sequence[str], count: int, names: int 
     try:
         values = [float(cell) for cell in cells[names:]]
         if len(values) == count and np.isfinite(values).all() and all(cells[:names]):
-            return [*cells[:names], *values]
+            return [*map(from_cell, cells[:names]), *values]
     except ValueError:
         pass
     raise SurveyFileError(f"{path}, line {line}: needed {names} name(s) and {count} numbers")

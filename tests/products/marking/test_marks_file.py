@@ -60,6 +60,20 @@ def test_what_is_written_is_read_back_and_written_identical(tmp_path: Path) -> N
     assert again.read_bytes() == path.read_bytes()
 
 
+@pytest.mark.parametrize("name", ["+1", "=A1", "@a", "-b", "'+1", "a;=b", 'say "x"', "a: b"])
+def test_names_that_spreadsheets_would_compute_are_read_back(tmp_path: Path, name: str) -> None:
+    mark = Mark(f"{name}.jpg", name, 1.0, 2.0, 1.0, 0.0, 1.0, "hand", "hand", when="t")
+    marking = Marking(
+        "hall",
+        {mark.key: mark},
+        control={name: StatedPoint((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))},
+        bars={(name, "b"): ScaleBar(name, "b", 1.0, 0.01), ("b", name): ScaleBar("b", name, 2.0, 0.01)},
+        hashes={mark.photograph: "00ff"},
+    )
+    write_marks(tmp_path / "marks.csv", marking)
+    assert read_marks(tmp_path / "marks.csv") == marking
+
+
 def test_a_file_without_marks_is_read(tmp_path: Path) -> None:
     write_marks(tmp_path / "marks.csv", Marking("hall"))
     read = read_marks(tmp_path / "marks.csv")
