@@ -470,6 +470,7 @@ NOT_IN_THE_TABLE = {
     "source",
     "copied",
     "other_moments",
+    "refused",
     "equipment",
     "diameters",
     "start_orientations",

@@ -135,6 +135,11 @@ class Marking:
         """Names of the marked points, in the order of their first marks."""
         return tuple(dict.fromkeys(point for _, point in self.marks))
 
+    @property
+    def left_out(self) -> tuple[Mark, ...]:
+        """The refused image points, without those that were marked again."""
+        return tuple(row for key, row in self.refused.items() if key not in self.marks)
+
     def known_points(self) -> KnownPoints | None:
         """Return the stated coordinates as control; None without any."""
         if not self.control:

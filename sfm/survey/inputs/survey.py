@@ -47,7 +47,7 @@ from sfm.survey.inputs.given_values import (
     read_start_cameras,
 )
 from sfm.survey.inputs.ground_control import GroundControl, read_ground_control
-from sfm.survey.inputs.marks_file import Marking, image_points_of, read_marks
+from sfm.survey.inputs.marks_file import Mark, Marking, image_points_of, read_marks
 from sfm.survey.inputs.settings import (
     AdjustSettings,
     CameraSettings,
@@ -129,6 +129,7 @@ class Survey:
     # measured image points: one table in place of photographs, or tables beside them
     observations: Observations | tuple[Observations, ...] | None = None
     marks: tuple[PointSettings, ...] = ()  # natural points that a person names in photographs
+    refused: tuple[Mark, ...] = ()  # image points that a person refused, which take no part
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
@@ -297,7 +298,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         return None if name is None else reader(file.beside(name))
 
     equipment = _given_by_equipment(file)
-    marking = read(read_marks, file.marked.file if file.marked else None)
+    marking = _marking_of(file)
     control = (
         read_ground_control(file.beside(file.control.file), file.control, file.unit) if file.control else None
     )
@@ -331,11 +332,14 @@ def survey_of_file(file: SurveyFile) -> Survey:
         )
         + equipment.frames,
         equipment=equipment.placed,
-        scale_bars=tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
-        + equipment.bars
-        + (() if marking is None else tuple(marking.bars.values())),
+        scale_bars=_with_stated_bars(
+            tuple(ScaleBar(bar.start, bar.end, bar.length, bar.sigma) for bar in file.scale_bars)
+            + equipment.bars,
+            marking,
+        ),
         observations=_given_image_points(file, control, marking),
         marks=file.marks,
+        refused=() if marking is None else marking.left_out,
         diameters=read(read_diameters, file.targets.diameters),
         masks=file.masks,
         start_orientations=read(read_exterior, file.approximate.images),
@@ -345,6 +349,32 @@ def survey_of_file(file: SurveyFile) -> Survey:
         allow_outside=file.allow_outside,
         source=file.source,
     )
+
+
+def _marking_of(file: SurveyFile) -> Marking | None:
+    """Return the marks that a survey file names.
+
+    Raises:
+        SurveyFileError: the marks file is unreadable, or has the marks of another survey.
+    """
+    if file.marked is None:
+        return None
+    path = file.beside(file.marked.file)
+    marking = read_marks(path)
+    if marking.survey not in ("", file.name):
+        raise SurveyFileError(
+            f"{path}: has the marks of survey '{marking.survey}', but {file.source} is '{file.name}'"
+        )
+    return marking
+
+
+def _with_stated_bars(bars: tuple[ScaleBar, ...], marking: Marking | None) -> tuple[ScaleBar, ...]:
+    """Return the scale bars, with those that a person states in the marks file in place of the same ones."""
+    if marking is None:
+        return bars
+    stated = {frozenset(ends) for ends in marking.bars}
+    kept = (bar for bar in bars if frozenset((bar.start, bar.end)) not in stated)
+    return (*kept, *marking.bars.values())
 
 
 def _with_stated(control: KnownPoints | None, marking: Marking | None) -> KnownPoints | None:

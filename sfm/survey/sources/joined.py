@@ -44,6 +44,7 @@ from sfm.survey.sources.repeated import without_repeated
 from sfm.survey.sources.source import Correspondences, SurveySource
 
 SAME_PX = 0.1  # by which two measurements of one target differ, whatever their stated precision
+REFUSED_PX = 1.0  # by which a target that a person refused may be elsewhere in a later run
 MIN_SAME = 2  # photographs in which a point without a name is where another is
 
 
@@ -148,9 +149,10 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
     if len(parts) == 1:
         return replace(parts[0], network=_of_one_source(survey, parts[0].network))
     named = [part.network.points for part in parts]
+    used = [_not_refused(survey, part) for part in parts]
     networks = _renamed(parts)
     parts = [replace(part, network=renamed) for part, renamed in zip(parts, networks, strict=True)]
-    network, repeated = _joined(survey, networks, named)
+    network, repeated = _joined(survey, networks, named, used)
     lost = {failed.image: failed for part in parts for failed in part.failed}
     seen = set(network.images)
     by_points = [  # they take part with given image points
@@ -177,6 +179,25 @@ def _joined_measurements(survey: Survey, parts: Sequence[Measurements]) -> Measu
 
 def _of_one_source(survey: Survey, network: Network) -> Network:
     return replace(network, sources=tuple(row.source for row in declared(survey)))
+
+
+def _not_refused(survey: Survey, part: Measurements | Correspondences) -> BoolArray:
+    """Return which image points of a source no person refused, (k,).
+
+    A point that is numbered anew in each run is the refused one only at the same place.
+    """
+    network, running = part.network, _running(part)
+    seen = network.image_points
+    used: BoolArray = np.ones(len(seen), dtype=bool)
+    image = {name: i for i, name in enumerate(network.images)}
+    point = {name: j for j, name in enumerate(network.points)}
+    for mark in survey.refused:
+        if mark.photograph in image and mark.point in point:
+            refused = (seen.image == image[mark.photograph]) & (seen.point == point[mark.point])
+            if mark.point in running:
+                refused &= np.linalg.norm(seen.xy - (mark.x, mark.y), axis=1) <= REFUSED_PX
+            used &= ~refused
+    return used
 
 
 def _named_as_given(survey: Survey, completed: Sequence[Correspondences]) -> list[Correspondences]:
@@ -293,11 +314,12 @@ class _Repeated:
 
 
 def _joined(
-    survey: Survey, networks: Sequence[Network], named: Sequence[Sequence[str]]
+    survey: Survey, networks: Sequence[Network], named: Sequence[Sequence[str]], used: Sequence[BoolArray]
 ) -> tuple[Network, _Repeated]:
     """Return the network of the image points of all sources, with everything else that the survey gives.
 
     named: names that the points of each network had before running names were changed.
+    used: which image points of each network take part.
     """
     sources = tuple(row.source for row in declared(survey))
     images = tuple(dict.fromkeys(name for network in networks for name in network.images))
@@ -309,7 +331,8 @@ def _joined(
         camera[of_image] = network.camera
         seen = network.image_points
         source = np.full(len(seen), k)
-        parts.append(replace(seen, image=of_image[seen.image], point=of_point[seen.point], source=source))
+        every = replace(seen, image=of_image[seen.image], point=of_point[seen.point], source=source)
+        parts.append(every.select(used[k]))
         stated = len(scale_bars(survey.scale_bars, before))  # all others are of the source alone
         bars.append(
             network.scale_bars.select(np.arange(stated, len(network.scale_bars))).renumbered(of_point)
@@ -392,14 +415,17 @@ def _joined_correspondences(
 ) -> Correspondences:
     """Return the image points of all sources in the orientation of all photographs."""
     if len(completed) == 1:
-        return replace(completed[0], network=_of_one_source(survey, completed[0].network))
+        alone = completed[0].network
+        seen = alone.image_points.select(_not_refused(survey, completed[0]))
+        return replace(completed[0], network=_of_one_source(survey, replace(alone, image_points=seen)))
     without_names = [matched.network.points for matched in completed]
     completed = _named_as_given(survey, completed)
     named = [matched.network.points for matched in completed]
+    used = [_not_refused(survey, matched) for matched in completed]
     completed = [
         replace(matched, network=part) for matched, part in zip(completed, _renamed(completed), strict=True)
     ]
-    network, repeated = _joined(survey, [matched.network for matched in completed], named)
+    network, repeated = _joined(survey, [matched.network for matched in completed], named, used)
     repeated = repeated.after(measured)
     images = _indices(network.images, measured.network.images)
     position, rotation = start.estimate.position[images].copy(), start.estimate.rotation[images].copy()
