@@ -243,11 +243,18 @@ class MarkingSession:
         """Delete the mark of a point in a photograph, or all of the point."""
         with self._changed:
             name = None if image is None else self._photograph(image)
-            rows = (*self._marking.marks, *self._marking.refused)
-            keys = [key for key in rows if key[1] == point and (name is None or key[0] == name)]
+            marking = self._marking
+            found = marking.marks.keys() | marking.refused.keys()
+            if name is None:  # what was measured automatically does not come back
+                found = (found | self._automatic.keys()) - (marking.refused.keys() & self._automatic.keys())
+            keys = {key for key in found if key[1] == point and (name is None or key[0] == name)}
             if not keys:
                 raise MarkError(f"point '{point}' has no mark {'there' if name else 'in any photograph'}")
-            self._change(self._marking.without(keys))
+            marking = marking.without(keys)
+            for key in self._automatic if name is None else ():
+                if key in keys:
+                    marking = marking.with_refused(self._mark_of_automatic(key))
+            self._change(marking)
             return self._state()
 
     def rename(self, point: str, name: str) -> dict[str, Any]:
@@ -259,19 +266,23 @@ class MarkingSession:
             automatic = [key for key in self._automatic if key[1] == point and key not in marking.refused]
             if point not in marking.points and point not in marking.control and not automatic:
                 raise MarkError(f"there is no point '{point}'")
+            if name == point:
+                return self._state()
+            shown = marking.marks.keys() | (self._automatic.keys() - marking.refused.keys())
             both = sorted(
-                photograph for photograph, marked in marking.marks if marked == point
-                and (photograph, name) in marking.marks
-            )  # fmt: skip
-            if both and name != point:
+                photograph for photograph, of in shown if of == point and (photograph, name) in shown
+            )
+            if both:
                 raise MarkError(f"'{name}' has a mark in {both[0]} already, a point has one there")
-            if point in marking.control and name in marking.control and name != point:
+            if point in marking.control and name in marking.control:
                 raise MarkError(f"'{name}' has stated coordinates already")
+            if any({bar.start, bar.end} == {point, name} for bar in marking.bars.values()):
+                raise MarkError(f"a scale bar is between '{point}' and '{name}', which are two points")
             for key in automatic:  # the new name is a mark, and the old one is left out
                 if key not in marking.marks:
                     mark = self._mark_of_automatic(key)
                     marking = self._with_hash(marking.with_mark(mark), self._index[key[0]])
-            renamed = marking.renamed(point, name)
+            renamed = marking.renamed(point, name, self._automatic.keys())
             for key in automatic:
                 old = marking.marks[key]
                 renamed = replace(renamed, refused={**renamed.refused, key: replace(old, state="refused")})

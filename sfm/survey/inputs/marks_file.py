@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -113,16 +113,24 @@ class Marking:
         )
         return replace(self, marks=marks, refused=refused)
 
-    def renamed(self, point: str, name: str) -> Marking:
-        """Return the marking with another name of a point, in marks, control and bars."""
+    def renamed(self, point: str, name: str, automatic: Collection[tuple[str, str]] = frozenset()) -> Marking:
+        """Return the marking with another name of a point, in marks, control and bars.
+
+        Args:
+            point: the present name.
+            name: the new one.
+            automatic: image points that were measured automatically; their refusals keep the old name.
+        """
 
         def of(old: str) -> str:
             return name if old == point else old
 
-        marks, refused = (
-            {(row.photograph, of(row.point)): replace(row, point=of(row.point)) for row in rows.values()}
-            for rows in (self.marks, self.refused)
-        )
+        def with_name(row: Mark) -> Mark:
+            return replace(row, point=of(row.point))
+
+        marks = {row.key: row for row in map(with_name, self.marks.values())}
+        kept = (row if key in automatic else with_name(row) for key, row in self.refused.items())
+        refused = {row.key: row for row in kept if row.key not in marks}
         bars = {
             (of(bar.start), of(bar.end)): ScaleBar(of(bar.start), of(bar.end), bar.length, bar.sigma)
             for bar in self.bars.values()

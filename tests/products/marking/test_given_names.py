@@ -12,7 +12,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.errors import SurveyFileError
 from sfm.pipeline import run_survey
 from sfm.products.marking.project import project_of_survey
-from sfm.products.marking.session import MarkingSession
+from sfm.products.marking.session import MarkError, MarkingSession
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Mark, Marking, write_marks
 from sfm.survey.inputs.survey import read_survey
@@ -60,6 +60,48 @@ def test_a_new_point_has_no_name_that_the_survey_gives(
     session: MarkingSession, given: tuple[Path, FloatArray]
 ) -> None:
     assert session.click(0, *given[1][0, 9])["mark"]["point"] == "P8"
+
+
+def shown(session: MarkingSession) -> set[tuple[int, str]]:
+    return {(mark["image"], mark["point"]) for mark in session.state()["marks"]}
+
+
+def test_what_was_refused_stays_refused_after_a_rename(session: MarkingSession) -> None:
+    session.refuse(1, "P4")
+    before = shown(session)
+    session.rename("P4", "bolt")
+    assert shown(session) == before - {(0, "P4")} | {(0, "bolt")}
+    session.rename("bolt", "P4")
+    assert shown(session) == before
+
+
+def test_a_whole_point_is_deleted_and_comes_back_in_one_step(
+    session: MarkingSession, given: tuple[Path, FloatArray]
+) -> None:
+    session.refuse(0, "P3")
+    session.click(1, *given[1][1, 2], point="P3")
+    before = shown(session)
+    session.delete("P3")
+    assert not {(0, "P3"), (1, "P3")} & shown(session)
+    session.undo()
+    assert shown(session) == before
+    session.delete("P2")  # without a mark
+    assert not {(0, "P2"), (1, "P2")} & shown(session)
+    with pytest.raises(MarkError, match="has no mark"):
+        session.delete("P2")
+
+
+def test_two_points_do_not_become_one(session: MarkingSession, given: tuple[Path, FloatArray]) -> None:
+    before = shown(session)
+    with pytest.raises(MarkError, match=r"has a mark in i0\.png already"):
+        session.rename("P3", "P2")
+    session.rename("P3", "P3")
+    assert shown(session) == before and not session.state()["can_undo"]
+    session.click(0, *given[1][0, 9], point="A")
+    session.click(1, *given[1][1, 9], point="B")
+    session.set_bar("A", "B", ScaleBar("A", "B", 1.0, 0.1))
+    with pytest.raises(MarkError, match="a scale bar is between 'A' and 'B'"):
+        session.rename("A", "B")
 
 
 def mark_at(photograph: str, point: str, xy: FloatArray) -> Mark:
