@@ -439,10 +439,7 @@ class Page {
 
   remove() {
     const point = this.model.chosen
-    if (!this.hasChosen()) return
-    const automatic = (this.model.rays.get(point) ?? []).filter((mark) => mark.automatic)
-    for (const { image } of automatic) this.change("refuse", { image, point }, `${point} refused.`)
-    if (!this.model.pointOf.get(point)?.automatic) this.change("delete", { point }, `${point} deleted; Z undoes it.`)
+    if (this.hasChosen()) this.change("delete", { point }, `${point} deleted; Z undoes it.`)
   }
 
   undo() {
