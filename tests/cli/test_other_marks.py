@@ -89,5 +89,5 @@ def test_nothing_is_replaced_and_wrong_files_are_named(project: MarkedProject, t
     with pytest.raises(SurveyFileError, match=r"unknown ending '\.doc'"):
         read(project, tmp_path / "marks.doc")
     path.write_text(GCP_LIST.replace("i0", "k0").replace("i1", "k1"), encoding="utf-8")
-    with pytest.raises(SurveyFileError, match="none of its 4 image points is in these photographs"):
+    with pytest.raises(SurveyFileError, match="of 4 image points none is in these photographs"):
         read(project, path)
