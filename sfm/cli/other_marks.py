@@ -25,7 +25,7 @@ from adapters.formats.registry import ENDINGS, format_named, read_any, write_any
 from sfm.comparison.camera_conversion import convert_cameras
 from sfm.files.plain_text import read_json
 from sfm.files.whole_files import whole_file
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import FloatArray, pixel_from_longer_side
 from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
@@ -114,10 +114,10 @@ def _stated(
 
 def _in_pixels(xy: Sequence[float], unit: str, size: tuple[int, int] | None) -> tuple[float, float]:
     """Return a position in px, of parts of the longer side from the middle if that is the unit."""
-    if unit == "px" or size is None:
-        return float(xy[0]), float(xy[1])
-    x, y = (float(v) * max(size) + (side - 1) / 2 for v, side in zip(xy, size, strict=True))
-    return x, y
+    place = np.array([xy], dtype=float)
+    if unit != "px" and size is not None:
+        place = pixel_from_longer_side(place, np.array([size], dtype=float))
+    return float(place[0, 0]), float(place[0, 1])
 
 
 def write_marks_of_others(

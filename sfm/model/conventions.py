@@ -111,6 +111,18 @@ def image_from_pixel(xy_px: FloatArray, size_px: tuple[int, int], pixel_mm: Floa
     return (np.asarray(xy_px, dtype=float) - centre) * np.asarray(pixel_mm) * (1.0, -1.0)
 
 
+def pixel_from_longer_side(xy: FloatArray, size_px: FloatArray) -> FloatArray:
+    """Return pixel coordinates of positions from the middle of a photograph, in parts of its longer side.
+
+    Args:
+        xy: positions, x right and y down, (k, 2).
+        size_px: width and height of the photograph of each, px, (k, 2).
+
+    Source: documentation of OpenSfM, "Normalized image coordinates".
+    """
+    return np.asarray(xy * size_px.max(axis=1, keepdims=True) + (size_px - 1) / 2)
+
+
 def pixel_from_image(xy_mm: FloatArray, size_px: tuple[int, int], pixel_mm: FloatArray) -> FloatArray:
     """Convert image-frame coordinates to pixel coordinates; the inverse of `image_from_pixel`.
 

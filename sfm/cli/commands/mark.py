@@ -120,9 +120,8 @@ def mark(
         server = MarkingServer(session, port)
         print(f"{said}Marks: {out or marks}")
         print(f"Page: {server.address.url}", flush=True)
-        with (
-            scratch_folder() as folder
-        ):  # only of this user: a command line, and so its address, is seen by all
+        with scratch_folder() as folder:
+            # a file that only this user can read: all users see the command line of the browser
             start = folder / "start.html"
             start.touch(mode=0o600)
             start.write_text(f'<meta http-equiv="refresh" content="0; url={server.address.url}">', "utf-8")

@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm.judgement.survey_result import FailedImage, LeftOutPoint, PhotographTargets
 from sfm.model.camera import Camera
-from sfm.model.conventions import BoolArray, FloatArray, IntArray, pixel_from_image
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, pixel_from_image, pixel_from_longer_side
 from sfm.model.display import listed
 from sfm.model.errors import SurveyFileError
 from sfm.model.network import ImagePoints, Network, Source, rows_of
@@ -214,7 +214,7 @@ def in_pixels(
     s = np.full(xy.shape, sigma_px) if sigma is None else sigma.copy()
     if given.unit == "of the longer side":
         size = np.array([lens.size_px for lens in cameras], dtype=float)[camera]
-        xy_px = xy * size.max(axis=1, keepdims=True) + (size - 1) / 2
+        xy_px = pixel_from_longer_side(xy, size)
     if given.unit == "mm":
         for lens, rows in zip(cameras, rows_of(camera, len(cameras)), strict=True):
             xy_px[rows] = pixel_from_image(xy[rows], lens.size_px, lens.pixel_mm)

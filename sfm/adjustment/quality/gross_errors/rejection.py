@@ -325,8 +325,7 @@ def _snoop_all(run: Run, optimum: Optimum, weight: FloatArray, alpha: float) -> 
         )
         back = would_pass(seen, v, complement, used, vPv=vPv, redundancy=redundancy, alpha=alpha)
         back &= layout.active & ~returned & ~loose
-        if out.any():
-            back &= _stays_right(layout.observations, v, complement, out, vPv=vPv, redundancy=redundancy)
+        back &= _stays_right(seen, v, complement, out, vPv=vPv, redundancy=redundancy)
         if not (out.any() or back.any()):
             break
         changed = np.where(out, 0.0, np.where(back, 1.0, weight))
