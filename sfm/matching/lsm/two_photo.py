@@ -70,6 +70,7 @@ COARSE_STEP = 0.5  # bilinear interpolation is good enough while steps are longe
 CONTRACTION = 0.04  # largest ratio of a step to the previous one; 0.01 to 0.03 on texture with noise
 # Next step after the last one allowed, up to which a match is accepted; along edges, steps shrink slowly.
 LAST_PX = 0.002
+MIN_ALONG = 0.1  # of the square of a shift: Gauss-Newton's shift must shrink by so much along it
 CHUNK = 256  # patches that a thread processes at a time
 
 
@@ -302,10 +303,15 @@ def _match_all(
 
 @compiled
 def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, out: FloatArray) -> int:
-    """Improve H by Gauss-Newton steps; return the flag, keep J^T S and the solution in the workspace."""
+    """Improve H by Gauss-Newton steps; return the flag, keep J^T S and the solution in the workspace.
+
+    The steps have the derivatives of the template, with its noise and its blur: alone they would come nearer
+    by a constant ratio. How the steps of a shift change says what the derivatives really are.
+    """
     half, q, rhs = work.half, work.q, work.rhs
     x0, y0 = H[0, 2], H[1, 2]
     coarse = work.kind > BILINEAR
+    secant, shift = np.eye(SHIFT), np.zeros((2, SHIFT))
     previous, following = np.inf, np.inf
     for step in range(1, limits.max_steps + 1):
         out[STEPS] = step
@@ -315,7 +321,10 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         for a in range(len(q)):
             rhs[a] = q[a] = dot(work.J[a], work.patch)
         solve_factorised(work.L, q)
-        length = put_step(H, q, half, work.geometric)
+        if work.geometric == SHIFT and not coarse:
+            length = _put_secant_step(H, q, half, secant, shift, previous < np.inf)
+        else:
+            length = put_step(H, q, half, work.geometric)
         if not length < np.inf:
             return DIVERGED
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
@@ -327,6 +336,45 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
             previous = length
         coarse = coarse and length > COARSE_STEP
     return MATCHED if following < LAST_PX else DIVERGED
+
+
+@compiled
+def _put_secant_step(
+    H: FloatArray, q: FloatArray, half: int, secant: FloatArray, shift: FloatArray, follows: bool
+) -> float:
+    """Apply a shift by Broyden's method, H <- H dH^-1; return it in px, inf if the gain becomes degenerate.
+
+    Args:
+        H: warp.
+        q: solution of the normal equations, in which the shift is that of Gauss-Newton.
+        half: half the side of the window, px.
+        secant: shifts to apply per shift of Gauss-Newton, changed, (2, 2).
+        shift: last shift of Gauss-Newton, and as applied, changed, (2, 2).
+        follows: whether there is a last one.
+
+    Source: Broyden (1965), Mathematics of Computation 19(92), with the first of his updates.
+    """
+    x, y = q[0] / q[SHIFT + 1], q[1] / q[SHIFT + 1]
+    if follows:
+        dx, dy = shift[0, 0] - x, shift[0, 1] - y
+        sx, sy = shift[1, 0], shift[1, 1]
+        mx, my = secant[0, 0] * dx + secant[0, 1] * dy, secant[1, 0] * dx + secant[1, 1] * dy
+        tx, ty = sx * secant[0, 0] + sy * secant[1, 0], sx * secant[0, 1] + sy * secant[1, 1]
+        along = tx * dx + ty * dy
+        if along > MIN_ALONG * (sx * sx + sy * sy):
+            rx, ry = (sx - mx) / along, (sy - my) / along
+            secant[0, 0] += rx * tx
+            secant[0, 1] += rx * ty
+            secant[1, 0] += ry * tx
+            secant[1, 1] += ry * ty
+    shift[0, 0], shift[0, 1] = x, y
+    shift[1, 0] = secant[0, 0] * x + secant[0, 1] * y
+    shift[1, 1] = secant[1, 0] * x + secant[1, 1] * y
+    own_x, own_y = q[0], q[1]
+    q[0], q[1] = shift[1, 0] * q[SHIFT + 1], shift[1, 1] * q[SHIFT + 1]
+    length = put_step(H, q, half, SHIFT)
+    q[0], q[1] = own_x, own_y
+    return length
 
 
 @compiled
