@@ -22,6 +22,7 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray
 LAST_CHANGE = 1e-3  # relative change of a variance component at which the estimation ends
 LAST_CHANGE_OF_PARTS = 0.01  # the same for a covariance of two parts, and for the share of one part
 MAX_ROUNDS = 20
+MAX_LONGER = 5.0  # ratio of a step by the secant to a plain one
 # Redundancy of a group of image points below which its variance component is not estimated.
 MIN_REDUNDANCY = 1.0
 IMAGE_POINTS = "image points"
@@ -175,7 +176,7 @@ def estimate_components(
     covariance = adjustment.network.image_points.covariance
     stated = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
     least = np.array([least_factor(float(np.median(stated[group == g]))) for g in range(len(names))])
-    tried, rejected = [factor], [adjustment.rejected]
+    tried, rejected, missing = [factor], [adjustment.rejected], list[FloatArray]()
     for _ in range(MAX_ROUNDS):
         sigma0 = _components(adjustment, adjustment.image_covariance, group, names, few=MIN_REDUNDANCY).sigma0
         sigma0 = np.where(np.isfinite(sigma0) & (sigma0 > 0), sigma0, 1.0)
@@ -183,7 +184,8 @@ def estimate_components(
         if np.abs(sigma0 - 1).max() <= LAST_CHANGE:
             at_least = (factor <= least).any() and adjustment.sigma0 < 1
             return _as_weighted(adjustment) if at_least else adjustment, factor, True
-        factor = factor * sigma0
+        missing.append(np.log(sigma0))
+        factor = np.maximum(factor * np.exp(_secant_steps(np.log(tried), missing)), least)
         first = _cycle_start(tried, rejected, factor)
         if first is not None:
             chosen = min(range(first, len(tried)), key=lambda at: int(rejected[at].sum()))
@@ -194,6 +196,23 @@ def estimate_components(
         tried.append(factor)
         rejected.append(adjustment.rejected)
     return adjustment, factor, False
+
+
+def _secant_steps(tried: FloatArray, missing: list[FloatArray]) -> FloatArray:
+    """Return the next steps of the logarithms of factors, (g,).
+
+    A group with little of the redundancy gets its own variance factor only in part in each round, as its
+    residuals follow its weights. The secant of the last two rounds says which part.
+
+    Args:
+        tried: logarithms of the factors of each round, (rounds, g).
+        missing: logarithms of the variance factors found with them, (g,) each, which are to vanish.
+    """
+    if len(missing) < 2:
+        return missing[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        longer = (tried[-1] - tried[-2]) / (missing[-2] - missing[-1])
+    return missing[-1] * np.clip(np.where(np.isfinite(longer), longer, 1.0), 1.0, MAX_LONGER)
 
 
 def estimate_common_part(

@@ -45,6 +45,7 @@ from sfm.survey.sources.source import Correspondences, SurveySource
 
 SAME_PX = 0.1  # by which two measurements of one target differ, whatever their stated precision
 REFUSED_PX = 1.0  # by which a target that a person refused may be elsewhere in a later run
+RAYS_OF_SOURCE = 5_000  # about so many rays of a source give its weight to one percent
 MIN_SAME = 2  # photographs in which a point without a name is where another is
 
 
@@ -477,55 +478,68 @@ def _balanced(network: Network, estimate: Estimate, min_rays: IntArray, settings
     The median covariance does not change: sigma0 still shows how much worse the image points are than
     expected. A source with errors in common gets its design effect. Of very many points only some take part.
     """
-    seen = network.image_points
-    step = np.ones(len(network.points), dtype=np.int64)
-    for k in range(len(network.sources)):
-        of_source = network.source == k
-        step[seen.point[of_source]] = max(1, int(of_source.sum()) // RAYS_OF_NOISE)
-    chosen = estimate.determined & (np.arange(len(step)) % step == 0)
-    rays = np.ones(len(seen), dtype=bool)
-    try:
-        images, points = select_determined(
-            network,
-            replace(estimate, points=np.where(chosen[:, None], estimate.points, np.nan)),
-            rays,
-            min_rays,
+    seen, start = network.image_points, estimate
+
+    def adjust_with(part: Network, factor: FloatArray) -> Adjustment:
+        nonlocal start
+        # rejection with weights that are far off would lose the image points of the less precise source
+        adjustment = adjust(
+            part,
+            start,
+            false_alarm=settings.false_alarm,
+            reject="huber",
+            options=AdjustmentOptions(sigma_px=settings.sigma_px, image_sigma_factor=factor),
         )
-        part, start = reduce_network(without_given(network), estimate, images, points, rays)
+        start = adjustment.estimate
+        return adjustment
 
-        def adjust_with(factor: FloatArray) -> Adjustment:
-            nonlocal start
-            # rejection with weights that are far off would lose the image points of the less precise source
-            adjustment = adjust(
-                part,
-                start,
-                false_alarm=settings.false_alarm,
-                reject="huber",
-                options=AdjustmentOptions(sigma_px=settings.sigma_px, image_sigma_factor=factor),
-            )
-            start = adjustment.estimate
-            return adjustment
-
+    try:
+        part, start = _thinned(network, estimate, min_rays, RAYS_OF_SOURCE)
         present, group = np.unique(part.source, return_inverse=True)
         names = tuple(network.sources[k].name for k in present)
-        balanced, of_groups, converged = estimate_components(adjust_with, group, names)
+        _, of_groups, converged = estimate_components(lambda factor: adjust_with(part, factor), group, names)
         if not converged:
             return network
+        factors = np.ones(len(network.sources))
+        factors[present] = of_groups
         common = np.array([source.has_common_errors for source in network.sources])
         effect = 1.0
         if common.any() and not common.all():
+            part, start = _thinned(network, estimate, min_rays, RAYS_OF_NOISE)
             natural = common[part.source]
             if not natural.any():  # no natural point fits the orientation by the others
                 return network
             density = common[network.source].sum() / natural.sum()
-            effect = design_effect_of_neighbours(balanced, density=density)
+            effect = design_effect_of_neighbours(adjust_with(part, factors[part.source]), density=density)
     except GeometryError:  # the adjustment of the survey reports or repairs it
         return network
-    factors = np.ones(len(network.sources))
-    factors[present] = of_groups
     network = with_weights(network, factors[network.source][:, None, None] ** 2 * seen.covariance)
     sources = tuple(
         replace(source, design_effect=effect) if source.has_common_errors else source
         for source in network.sources
     )
     return replace(network, sources=sources)
+
+
+def _thinned(
+    network: Network, estimate: Estimate, min_rays: IntArray, rays_of_source: int
+) -> tuple[Network, Estimate]:
+    """Return a part of the image points without given values, with about so many rays of each source.
+
+    Raises:
+        GeometryError: fewer than two photographs keep enough points.
+    """
+    seen = network.image_points
+    step = np.ones(len(network.points), dtype=np.int64)
+    for k in range(len(network.sources)):
+        of_source = network.source == k
+        step[seen.point[of_source]] = max(1, int(of_source.sum()) // rays_of_source)
+    chosen = estimate.determined & (np.arange(len(step)) % step == 0)
+    rays = np.ones(len(seen), dtype=bool)
+    images, points = select_determined(
+        network,
+        replace(estimate, points=np.where(chosen[:, None], estimate.points, np.nan)),
+        rays,
+        min_rays,
+    )
+    return reduce_network(without_given(network), estimate, images, points, rays)
