@@ -128,6 +128,22 @@ def test_weights_of_two_cameras_are_estimated() -> None:
     assert a.sigma0 == pytest.approx(1, abs=2e-3)
 
 
+def test_a_group_that_takes_over_its_own_variance_factor_in_part_is_weighted_in_few_rounds(
+    plain: Adjustment,
+) -> None:
+    """Each round shows a third of the logarithm of the factor that is missing; one by one they need 17."""
+    group, rounds = np.zeros(len(plain.rejected), dtype=np.int64), []
+
+    def run(factor: FloatArray) -> Adjustment:
+        rounds.append(float(factor[0]))
+        shown = factor[0] * (0.05 / factor[0]) ** (1 / 3)
+        return replace(plain, residuals=plain.residuals * shown, image_sigma_factor=factor)
+
+    _, factor, settled = estimate_components(run, group, ("all",))
+    assert settled and len(rounds) <= 5
+    assert by_camera(run(factor)).sigma0 / factor == pytest.approx([1, 1], abs=0.1)
+
+
 @pytest.mark.parametrize(("noise_px", "ends"), [(2e-3, 2e-3), (5e-4, 1e-3), (0.0, 1e-3)])
 def test_no_image_point_is_weighted_as_better_than_a_thousandth_of_a_pixel(
     noise_px: float, ends: float

@@ -131,6 +131,20 @@ def test_the_direction_of_the_start_is_forgotten() -> None:
     assert np.abs((one.xy - other.xy).mean(axis=0)).max() < 1e-4
 
 
+def test_noise_and_blur_do_not_slow_down_the_steps_of_a_shift() -> None:
+    """The derivatives of the template have its noise: with them alone, steps shrink by a constant ratio."""
+    pairs = affine_pairs(3, 100, distortion=0.0)
+    left, right = with_noise(pairs.left, 12.0, 1), with_noise(pairs.right, 12.0, 2)
+    start = pairs.centre + pairs.shift + 0.4
+    ends = [
+        match_lsm(left, right, pairs.centre, start, LsmSettings("shift", 15, blur=True, stop_px=stop_px))
+        for stop_px in (0.0002, 1e-8)
+    ]
+    good = ends[0].good & ends[1].good
+    assert good.mean() > 0.9 and ends[0].steps[good].mean() < 6
+    assert np.abs(ends[0].xy[good] - ends[1].xy[good]).max() < 0.002
+
+
 def test_converges_from_three_pixels_after_correlation() -> None:
     pairs, left, right = _pairs()
     angle = np.random.default_rng(6).uniform(0, 2 * np.pi, PATCHES)

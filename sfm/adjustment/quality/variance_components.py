@@ -182,7 +182,7 @@ def estimate_components(
         sigma0 = np.where(np.isfinite(sigma0) & (sigma0 > 0), sigma0, 1.0)
         sigma0 = np.maximum(sigma0, least / factor)
         if np.abs(sigma0 - 1).max() <= LAST_CHANGE:
-            at_least = (factor <= least).any() and adjustment.sigma0 < 1
+            at_least = (factor <= (1 + LAST_CHANGE) * least).any() and adjustment.sigma0 < 1
             return _as_weighted(adjustment) if at_least else adjustment, factor, True
         missing.append(np.log(sigma0))
         factor = np.maximum(factor * np.exp(_secant_steps(np.log(tried), missing)), least)
