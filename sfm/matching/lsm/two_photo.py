@@ -312,7 +312,7 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
     x0, y0 = H[0, 2], H[1, 2]
     coarse = work.kind > BILINEAR
     secant, shift = np.eye(SHIFT), np.zeros((2, SHIFT))
-    previous, following = np.inf, np.inf
+    previous, following, ratio = np.inf, np.inf, 0.0
     for step in range(1, limits.max_steps + 1):
         out[STEPS] = step
         kind = BILINEAR if coarse else work.kind
@@ -330,7 +330,8 @@ def _iterate(right: AnyArray, work: Workspace, limits: Limits, H: FloatArray, ou
         if np.hypot(H[0, 2] - x0, H[1, 2] - y0) > limits.max_shift_px:
             return TOO_FAR
         if not coarse:
-            following = length * max(CONTRACTION, length / previous)
+            before, ratio = ratio, length / previous
+            following = length * max(CONTRACTION, ratio, before)  # a secant may shorten one step by chance
             if following < limits.stop_px:
                 return MATCHED
             previous = length
