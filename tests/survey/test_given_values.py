@@ -291,6 +291,26 @@ def test_a_wrong_height_is_found(tmp_path: Path) -> None:
     assert findings_of(result).verdict.level == "fair"
 
 
+@pytest.mark.parametrize("mistake", ["axes", "depth", None])
+def test_the_mistake_in_coordinates_of_single_points_is_named(mistake: str | None) -> None:
+    """Other points fit. Where X alone is a fifth too short, no mistake explains it."""
+    network, truth = make_network(seed_of("depths"), images=8, points=30)
+    apart = np.abs(truth.points[:, 0] - truth.points[:, 1]) + np.abs(truth.points[:, 2])
+    far = np.argsort(-apart)[:12]
+    xyz = truth.points[far].copy()
+    xyz[:2] = {
+        "axes": xyz[:2][:, [1, 0, 2]],
+        "depth": xyz[:2] * [1, 1, -1],
+        None: xyz[:2] * [0.8, 1, 1],
+    }[mistake]
+    control = KnownPoints.from_arrays([network.points[j] for j in far], xyz, 1e-4)
+    result = run_survey(survey_of(network, truth, control=control, datum={"kind": "control"}))
+    left_out = next(said for said in remarks_on_given(result) if said.kind == "given_left_out")
+    assert set(left_out.names("given")) == {network.points[j] for j in far[:2]}
+    assert left_out.names("mistake") == (() if mistake is None else (mistake,))
+    assert ("They fit if" in left_out.text) == (mistake is not None)
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [

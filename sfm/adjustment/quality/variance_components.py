@@ -212,7 +212,8 @@ def _secant_steps(tried: FloatArray, missing: list[FloatArray]) -> FloatArray:
         return missing[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         longer = (tried[-1] - tried[-2]) / (missing[-2] - missing[-1])
-    return missing[-1] * np.clip(np.where(np.isfinite(longer), longer, 1.0), 1.0, MAX_LONGER)
+    longer = np.clip(np.where(np.isfinite(longer), longer, 1.0), 1.0, MAX_LONGER)
+    return np.asarray(missing[-1] * longer)
 
 
 def estimate_common_part(

@@ -26,6 +26,7 @@ from sfm.judgement.given.groups import (
     in_free,
     remarks_on_unchecked,
 )
+from sfm.judgement.given.mistakes import explanations
 from sfm.judgement.given.mounts import judge_mount_scales, judge_mounts
 from sfm.judgement.given.points import GivenPoints, judge_points, parameters_of
 from sfm.judgement.given.scales import judge_scales
@@ -285,7 +286,8 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
     if judgement.wrong:
-        yield _left_out(group, task.settings.unit)
+        mistake = next(iter(_mistakes_of_single(task, group)), None)
+        yield _left_out(group, task.settings.unit, mistake)
     if judgement.doubtful:
         yield _doubtful(task, group)
     if group.scatter:
@@ -309,7 +311,7 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
         yield remark("given_sigmas", of=of, factor=judgement.factor, used=used_factor)
 
 
-def _left_out(group: Group, unit: str) -> Remark:
+def _left_out(group: Group, unit: str, mistake: str | None = None) -> Remark:
     model, out = group.placed.model, group.out
     others = (model.kept(tuple(j for j in out if j != k)).difference(k) for k in out)
     d, covariance = max(others, key=lambda difference: float(np.linalg.norm(difference[0])))
@@ -320,7 +322,19 @@ def _left_out(group: Group, unit: str) -> Remark:
         given=[group.names[k] for k in out],
         distance=(distance, unit),
         sigmas=distance**2 / float(np.sqrt(d @ covariance @ d)),
+        mistake=mistake,
     )
+
+
+def _mistakes_of_single(task: Task, group: Group) -> dict[str, bool]:
+    """Return the mistakes whose correction makes the points fit that were left out."""
+    placed = group.placed
+
+    def fit(mended: list[CoordinateKind]) -> bool:
+        points = replace(placed.points, kind=mended[0])
+        return points.model(placed.placing, estimated=placed.model.estimated).fits(task.level)
+
+    return explanations([placed.points.kind], fit, [placed.points.kind.mistakes_at(np.array(group.out))])
 
 
 def _doubtful(task: Task, group: Group) -> Remark:

@@ -28,6 +28,8 @@ from sfm.model.estimate import Estimate
 # Units that tables have by mistake: the factor that corrects values and standard deviations.
 UNITS_OF_LENGTHS = {"thousandfold": 1e-3, "thousandth": 1e3, "feet": 0.3048}
 UNITS_OF_ANGLES = {"gon": 0.9, "radians": float(np.degrees(1.0))}
+# Mistakes in coordinates of single points: which coordinate is where, and its sign.
+MISTAKES_OF_ROWS = {"axes": ([1, 0, 2], [1.0, 1.0, 1.0]), "depth": ([0, 1, 2], [1.0, 1.0, -1.0])}
 NO_PARAMETERS = np.zeros(0)
 SINGULAR = 1e-9  # eigenvalue of the scaled normal equations of a group below which a parameter is open
 POINT, PHOTOGRAPH, PARAMETER, MOUNT = "point", "photograph", "parameter", "mount"  # types of unknowns
@@ -275,6 +277,20 @@ class CoordinateKind(Kind):
         return {
             "mirrored": mirrored.with_coordinate_covariance(self.coordinate_covariance * flip * flip[:, None])
         }
+
+    def mistakes_at(self, rows: IntArray) -> Mapping[str, Self]:
+        """Return the coordinates corrected in some rows for mistakes that single rows have, by their names.
+
+        Args:
+            rows: rows to correct, (r,).
+        """
+        corrected = {}
+        for mistake, (order, sign) in MISTAKES_OF_ROWS.items():
+            values, covariance = self.values.copy(), self.coordinate_covariance.copy()
+            values[rows, :3] = values[rows][:, order] * sign
+            covariance[rows] = covariance[rows][:, order][:, :, order] * np.outer(sign, sign)
+            corrected[mistake] = self.with_values(values).with_coordinate_covariance(covariance)
+        return corrected
 
 
 class TableKind(Kind):

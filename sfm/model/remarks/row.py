@@ -77,7 +77,9 @@ NOUNS = {  # subjects of remarks, by their names in the data
     "known handedness": "The handedness of codes or control",
     "most photographs": "The larger number of the others",
     # mistakes in tables of survey observations
+    "axes": "X and Y are exchanged",
     "counter-clockwise": "directions are counted counter-clockwise",
+    "depth": "Z has the other sign",
     "elevation": "angles are counted from the horizon",
     "exchanged": "both ends are exchanged",
     "feet": "lengths are in feet",

@@ -141,7 +141,8 @@ ROWS = (
         "given_left_out",
         "warning",
         "Of {of:@}, {given} {given:does|do} not fit the network of the image points, by up to "
-        "{distance}, {sigmas} standard deviations: {given:it was|they were} left out.",
+        "{distance}, {sigmas} standard deviations: {given:it was|they were} left out.[[ "
+        "{given:It fits|They fit} if {mistake:@}.]]",
         CHECK_THE_LIST,
         "Correct these coordinates or remove them.",
     ),
