@@ -16,7 +16,9 @@ from multiprocessing import get_context
 
 import numpy as np
 
+from sfm.adjustment.covariance import with_error_correlation
 from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.comparison.solutions import reprojection
 from sfm.comparison.two_adjusters.adjusters import common_problem
@@ -97,6 +99,10 @@ def compile_adjustment() -> None:
     judge_alternatives(adjustment)
     part, start, _, _ = common_problem(adjustment)
     compared = adjust(part, start, datum=Datum("free"), reject="none")
+    neighbours = ErrorCorrelation(alone=1.0, common=0.1, length_px=100.0)
+    assert (
+        with_error_correlation(adjustment, neighbours).solution.with_joint_covariance.covariance is not None
+    )
     reprojection(part, compared.estimate)
     every = np.ones((SINGLE_IMAGES, POINTS), dtype=bool)
     # normal matrices of three forms: factored by fronts, summed ray by ray, and a product in single precision

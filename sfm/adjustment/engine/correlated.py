@@ -198,7 +198,7 @@ class CorrelatedPart:
             lines = (3 * at[:, None] + np.arange(3)).ravel()
             KS = photograph.times(S, chosen)
             of_all[lines] += (O.transpose(0, 2, 1) @ KS).reshape(len(lines), -1) @ C[columns]
-            added[np.ix_(u + lines, u + lines)] += photograph.between(O, chosen)
+            photograph.add_between(added, u + 3 * at, O, chosen)
         added[u:] += of_all
         added[:, u:] += of_all.T
         return np.asarray(added)
@@ -302,13 +302,21 @@ class _Photograph:
         moved = moved.reshape(len(rows), *Z.shape[1:])
         return np.asarray((self.correlation.alone - 1.0) * Z[rows] + self.relative[rows] @ moved)
 
-    def between(self, O: FloatArray, rows: IntArray) -> FloatArray:
-        """Return O'(R - I) O for functions O of some image points, three each (s, 2, 3), as (3 s, 3 s)."""
+    def add_between(self, added: FloatArray, first: IntArray, O: FloatArray, rows: IntArray) -> None:
+        """Add O'(R - I) O for functions O of some image points, three each (s, 2, 3).
+
+        Args:
+            added: a matrix, changed.
+            first: its first row for each image point, (s,).
+            O: derivatives of the functions by the errors, (s, 2, 3).
+            rows: image points, (s,).
+        """
         of_shift = np.swapaxes(self.relative[rows], 1, 2) @ O
-        pairs = np.einsum("ocx,op,pcy->oxpy", of_shift, self.common(rows, rows), of_shift, optimize=True)
-        each = np.arange(len(rows))
-        pairs[each, :, each] += (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
-        return np.asarray(pairs.reshape(3 * len(rows), 3 * len(rows)))
+        alone = (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
+        _add_between(
+            *(added, first, np.ascontiguousarray(self.xy[rows]), np.ascontiguousarray(of_shift), alone),
+            *(float(self.correlation.common), float(self.correlation.length_px)),
+        )
 
     def variances(self) -> FloatArray:
         """Return the diagonal blocks of R - I, one per image point, (r, 2, 2)."""
@@ -322,6 +330,31 @@ class _Photograph:
         np.exp(C, out=C)
         C *= self.correlation.common
         return np.asarray(C)
+
+
+@kernel
+def _add_between(
+    added: FloatArray,
+    first: IntArray,
+    xy: FloatArray,
+    of_shift: FloatArray,
+    alone: FloatArray,
+    common: float,
+    length_px: float,
+) -> None:
+    """Add the covariances of three functions each of all pairs of image points of a photograph."""
+    for a in range(len(first)):
+        for b in range(a + 1):
+            distance = np.hypot(xy[a, 0] - xy[b, 0], xy[a, 1] - xy[b, 1])
+            shared = common * np.exp(-distance / length_px)
+            for x in range(3):
+                for y in range(3):
+                    both = of_shift[a, 0, x] * of_shift[b, 0, y] + of_shift[a, 1, x] * of_shift[b, 1, y]
+                    if a == b:
+                        added[first[a] + x, first[a] + y] += shared * both + alone[a, x, y]
+                    else:
+                        added[first[a] + x, first[b] + y] += shared * both
+                        added[first[b] + y, first[a] + x] += shared * both
 
 
 def _photographs(

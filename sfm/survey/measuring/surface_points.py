@@ -61,7 +61,7 @@ TRIAL_RAYS = 100  # with fewer rays the window stays as it is
 TRIAL_SIDES = 4  # distance of trial windows in sides: they need not cover the photograph
 # Residual of a ray of a tie point, over the spread of all residuals, beyond which it is not on the surface.
 TOLERANCE_FACTOR = 6.0
-RAYS_OF_NOISE = 20_000  # about so many rays estimate the noise of matching, to half a percent
+RAYS_OF_NOISE = 10_000  # about so many rays estimate the noise of matching, to a percent
 MIN_CONTROL = 3  # points that place the photographs in the system of the control
 
 
