@@ -313,10 +313,9 @@ class _Photograph:
         """
         of_shift = np.swapaxes(self.relative[rows], 1, 2) @ O
         alone = (self.correlation.alone - 1.0) * np.swapaxes(O, 1, 2) @ O
-        _add_between(
-            *(added, first, np.ascontiguousarray(self.xy[rows]), np.ascontiguousarray(of_shift), alone),
-            *(float(self.correlation.common), float(self.correlation.length_px)),
-        )
+        xy, of_shift = np.ascontiguousarray(self.xy[rows]), np.ascontiguousarray(of_shift)
+        common, length_px = float(self.correlation.common), float(self.correlation.length_px)
+        _add_between(added, first, xy, of_shift, alone, common, length_px)
 
     def variances(self) -> FloatArray:
         """Return the diagonal blocks of R - I, one per image point, (r, 2, 2)."""
