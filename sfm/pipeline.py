@@ -32,7 +32,7 @@ from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.measuring.measured_store import MeasuredStore
-from sfm.survey.measuring.targets import separate_sizes
+from sfm.survey.measuring.targets import find_changed_files, separate_sizes
 from sfm.survey.orientation import Oriented, orient_survey
 from sfm.survey.sources.joined import complete_sources, measure_sources
 from sfm.survey.sources.source import Correspondences
@@ -110,7 +110,12 @@ def _measure(
         measured,
         images=tuple(dict.fromkeys((*files.names, *measured.images))),
         failed=sizes.left_out + measured.failed,
-        remarks=named.remarks + clocks + positions + sizes.remarks + measured.remarks,
+        remarks=named.remarks
+        + find_changed_files(files, survey.marked_hashes)
+        + clocks
+        + positions
+        + sizes.remarks
+        + measured.remarks,
     )
 
 

@@ -84,6 +84,7 @@ def name_photographs(survey: Survey, files: PhotographList) -> NamedPhotographs:
         with_each_table(named, lambda table: _of_survey(table, survey, files)),
         marks=marks,
         refused=tuple(replace(mark, photograph=name_of(mark.photograph)) for mark in survey.refused),
+        marked_hashes={name_of(name): value for name, value in survey.marked_hashes.items()},
         exterior=_renamed(survey.exterior, name_of),
         start_orientations=_renamed(survey.start_orientations, name_of),
         moments=_moments_renamed(survey, name_of),

@@ -130,6 +130,7 @@ class Survey:
     observations: Observations | tuple[Observations, ...] | None = None
     marks: tuple[PointSettings, ...] = ()  # natural points that a person names in photographs
     refused: tuple[Mark, ...] = ()  # image points that a person refused, which take no part
+    marked_hashes: Mapping[str, str] = field(default_factory=dict)  # of photographs, when they were marked
     diameters: Diameters | None = None  # of single targets
     start_orientations: StartOrientations | None = None
     start_points: KnownPoints | None = None
@@ -340,6 +341,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         observations=_given_image_points(file, control, marking),
         marks=file.marks,
         refused=() if marking is None else marking.left_out,
+        marked_hashes={} if marking is None else marking.hashes,
         diameters=read(read_diameters, file.targets.diameters),
         masks=file.masks,
         start_orientations=read(read_exterior, file.approximate.images),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -269,6 +269,21 @@ def find_same_files(photographs: PhotographList) -> tuple[int, ...]:
             with suppress(PhotographError):  # an unreadable file is reported when it is measured
                 first[k] = seen.setdefault((sizes[k], content_hash(path)), k)
     return tuple(first)
+
+
+def find_changed_files(photographs: PhotographList, hashes: Mapping[str, str]) -> tuple[Remark, ...]:
+    """Return a remark on the photographs that are no longer the files in which points were marked.
+
+    Args:
+        photographs: all photographs.
+        hashes: SHA-256 of the files of photographs, when they were marked, by name.
+    """
+    changed = list[str]()
+    for name, path in zip(photographs.names, photographs.paths, strict=True):
+        if hashes.get(name):
+            with suppress(PhotographError):  # an unreadable file is reported when it is measured
+                changed += [name] if content_hash(path) != hashes[name] else []
+    return (remark("photographs_changed", photographs=changed),) if changed else ()
 
 
 def why_failed(error: PhotographError, path: Path) -> str:

@@ -218,6 +218,15 @@ ROWS = (
         "Copy them again, convert them to JPEG or TIFF, or remove them from the folder.",
     ),
     Kind(
+        "photographs_changed",
+        "warning",
+        "{photographs:photograph} {photographs:has|have} changed since points were marked in "
+        "{photographs:it|them}: {photographs}.",
+        "edited, turned, resampled or replaced after the marking",
+        "Put the original {photographs:file|files} back, or measure {photographs:its|their} marks again: M "
+        "in kolinear mark.",
+    ),
+    Kind(
         "photographs_not_drawn",
         "note",
         "{photographs} {photographs:has|have} no overlay: {photographs:the file|the files} could not be read "
