@@ -1,7 +1,7 @@
 """Marks of other programs, read into a marks file and written from one.
 
     .json   OpenSfM's ground_control_points.json
-    .txt    OpenDroneMap's gcp_list.txt, read only: its coordinates are in a projection
+    .txt    OpenDroneMap's gcp_list.txt, written from an earlier one, whose projection and coordinates stay
     .xml    Metashape: markers with their image points
     .db     COLMAP: key points with a match
 
@@ -30,7 +30,7 @@ from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
-from sfm.survey.inputs.ground_control import READERS, OpenSfmPoints, read_ground_control
+from sfm.survey.inputs.ground_control import COORDINATES, READERS, OpenSfmPoints, read_ground_control
 from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint, now
 from sfm.survey.inputs.settings import ControlSettings
 
@@ -38,7 +38,7 @@ SIGMA_PX = 1.0  # of pointing by hand
 PLACES = 12  # decimals of a part of the longer side: a millionth of a millionth of a photograph
 MAX_MARKS = 20_000  # more are no marks, but the image points of a survey
 READ = (*READERS, *ENDINGS)
-WRITTEN = (".json", ".xml", ".db")
+WRITTEN = (".json", ".txt", ".xml", ".db")
 
 
 def read_marks_of_others(
@@ -53,7 +53,8 @@ def read_marks_of_others(
         unit: object unit of the control.
 
     Raises:
-        SurveyFileError: an unknown ending, an unreadable file, no mark in these photographs, or too many.
+        SurveyFileError: an unknown ending, an unreadable file, no mark in these photographs, one outside its
+            photograph, or too many.
     """
     ending, size_of = path.suffix.lower(), dict(zip(photographs, sizes, strict=True))
     marking, control = Marking(), dict[str, StatedPoint]()
@@ -94,6 +95,12 @@ def read_marks_of_others(
         )
     when = now()
     for image, point, x, y, C in here:
+        width, height = size_of[image]
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise SurveyFileError(
+                f"{path}: '{point}' in {image} is at {x:.1f}, {y:.1f} px, outside the photograph of {width} "
+                f"x {height} px; it is of another size there"
+            )
         mark = Mark(
             image, point, x, y, float(C[0, 0]), float(C[0, 1]), float(C[1, 1]), "hand", "hand", when=when
         )
@@ -126,14 +133,18 @@ def write_marks_of_others(
     estimate: Estimate,
     *,
     ground_control: Path | None = None,
-) -> None:
+) -> int:
     """Write marks for another program.
 
     Args:
         path: the new file; its ending states the format.
         network: the marks, with control.
         estimate: cameras, and what is oriented.
-        ground_control: a file of the same format whose positions and further points stay; for .json.
+        ground_control: a file of the same format whose positions and further points stay; for .json, and
+            needed for .txt.
+
+    Returns:
+        Number of marks in the file.
 
     Raises:
         OutputError: the file exists or cannot be written, or no such format is written.
@@ -142,14 +153,53 @@ def write_marks_of_others(
     ending = path.suffix.lower()
     if ending not in WRITTEN:
         raise OutputError(f"{path}: marks are written as {listed(WRITTEN)}, not as '{ending}'")
-    if ending == ".json":
-        text = json.dumps(_opensfm(network, estimate, ground_control), indent=4) + "\n"
+    count = len(network.image_points)
+    if ending in READERS:
+        if ending == ".json":
+            text = json.dumps(_opensfm(network, estimate, ground_control), indent=4) + "\n"
+        elif ground_control is None:
+            raise OutputError(
+                f"{path}: states coordinates in a projection, --import names the file that has it"
+            )
+        else:
+            text, count = _gcp_list(network, ground_control)
         with whole_file(path, "the ground control") as part:
             part.write_text(text, encoding="utf-8")
-        return
+        return count
     form = format_named(ENDINGS[ending])
     converted = convert_cameras(estimate, form.models, held=form.lacks)[0] if form.models else estimate
     write_any(path, form.name, network, converted)
+    return count
+
+
+def _gcp_list(network: Network, before: Path) -> tuple[str, int]:
+    """Return marks as a gcp_list.txt, and how many; only points that the earlier file has are there.
+
+    Lines whose mark is as before stay as they are.
+    """
+    earlier, lines = READERS[".txt"](before), before.read_text("utf-8-sig").splitlines()
+    seen = network.image_points
+    own = {
+        (network.images[i], network.points[j]): f"{x:.4f} {y:.4f}"
+        for i, j, (x, y) in zip(seen.image.tolist(), seen.point.tolist(), seen.xy.tolist(), strict=True)
+        if network.points[j] in earlier.xyz
+    }
+    count, here = len(own), set(network.images)
+    first = dict[str, tuple[str, str]]()  # coordinates of each point, and its name if it has one
+    written = dict(enumerate(lines, 1))
+    for image, point, xy, number in zip(
+        earlier.image, earlier.point, earlier.xy, earlier.image_line, strict=True
+    ):
+        *fields, names = written[number].split(None, COORDINATES)
+        name = names.partition(image)[2]
+        first.setdefault(point, (" ".join(fields[:3]), name))
+        place = own.pop((image, point), None)
+        if place is None and image in here:
+            del written[number]
+        elif place not in (None, f"{xy[0]:.4f} {xy[1]:.4f}"):
+            written[number] = f"{' '.join(fields[:3])} {place} {names}"
+    new = [f"{first[point][0]} {place} {image}{first[point][1]}" for (image, point), place in own.items()]
+    return "\n".join([*written.values(), *new]) + "\n", count
 
 
 def _opensfm(network: Network, estimate: Estimate, ground_control: Path | None) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def mark(
         typer.Option(
             "--export",
             metavar="FILE",
-            help="Write the marks for another program as .json (OpenSfM), .xml (Metashape) or .db (COLMAP), "
-            "and end without a page.",
+            help="Write the marks for another program as .json (OpenSfM), .txt (OpenDroneMap), .xml "
+            "(Metashape) or .db (COLMAP), and end without a page.",
         ),
     ] = None,
     port: Annotated[
@@ -97,7 +97,7 @@ def mark(
 
     compile_first()
     with working_on(str(source)):
-        project, marks = _project(source, images, allow_outside=allow_outside)
+        project, marks, control = _project(source, images, allow_outside=allow_outside)
         session = MarkingSession(project, out or marks)
     try:
         said = ""
@@ -113,9 +113,12 @@ def mark(
 
             with working_on(str(export_to)):
                 network, estimate = session.exported()
-                before = import_from if import_from and import_from.suffix == export_to.suffix else None
-                write_marks_of_others(export_to, network, estimate, ground_control=before)
-            print(f"{said}{export_to}: {counted(len(network.image_points), 'mark')}")
+                given = [file for file in (import_from, control) if file and file.suffix == export_to.suffix]
+                before = next(iter(given), None)
+                count = write_marks_of_others(export_to, network, estimate, ground_control=before)
+            left = len(network.image_points) - count
+            without = f", {left} of points without coordinates in {before} left out" if left else ""
+            print(f"{said}{export_to}: {counted(count, 'mark')}{without}")
             return
         server = MarkingServer(session, port)
         print(f"{said}Marks: {out or marks}")
@@ -133,8 +136,10 @@ def mark(
         session.close()
 
 
-def _project(source: Path, images: Path | None, *, allow_outside: bool) -> tuple[MarkedProject, Path]:
-    """Return what is marked, and its marks file if none is named."""
+def _project(
+    source: Path, images: Path | None, *, allow_outside: bool
+) -> tuple[MarkedProject, Path, Path | None]:
+    """Return what is marked, its marks file if none is named, and its file of control if it has one."""
     from adapters.formats.result_tables import read_result
     from sfm.cli.survey_runs import SURVEY_FILE
     from sfm.files.globs import nearest_name
@@ -156,7 +161,7 @@ def _project(source: Path, images: Path | None, *, allow_outside: bool) -> tuple
         survey_file = source / SURVEY_FILE
     elif source.is_dir():
         name = folder_name(source.resolve().name)
-        return project_of_folder(source, sensor_widths(lambda _: None)), Path("out") / f"{name}{MARKS}"
+        return project_of_folder(source, sensor_widths(lambda _: None)), Path("out") / f"{name}{MARKS}", None
     described = read_survey_file(survey_file, allow_outside=allow_outside)
     marks = survey_file.with_name(f"{survey_file.stem}{MARKS}")
     if described.marked is not None:  # the session reads them itself
@@ -165,4 +170,5 @@ def _project(source: Path, images: Path | None, *, allow_outside: bool) -> tuple
     project = project_of_survey(
         survey_of_file(described), images_dir=images, survey_file=survey_file, solution=solution
     )
-    return project, marks
+    control = described.control
+    return project, marks, None if control is None else described.beside(control.file)

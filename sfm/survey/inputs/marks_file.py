@@ -18,7 +18,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
@@ -45,7 +45,7 @@ COVARIANCES = NUMBERS[2:]
 
 @dataclass(frozen=True)
 class Mark:
-    """An image point that a person measured, or a place that the person refused."""
+    """An image point that a person measured, or a place that the person refused; a row of the file."""
 
     photograph: str
     point: str
@@ -258,14 +258,11 @@ def write_marks(path: Path, marking: Marking) -> None:
         comment("control", name, *stated.xyz, *stated.sigma)
     for bar in marking.bars.values():
         comment("scale bar", bar.start, bar.end, bar.length, bar.sigma)
-    table = csv_text(COLUMNS, [_row(mark) for mark in (*marking.marks.values(), *marking.refused.values())])
+    table = csv_text(
+        COLUMNS, [astuple(mark) for mark in (*marking.marks.values(), *marking.refused.values())]
+    )
     with whole_file(path, "the marks file", replaces=True) as part:
         part.write_text(text.getvalue() + table, encoding="utf-8", newline="")
-
-
-def _row(mark: Mark) -> tuple[object, ...]:
-    numbers = (mark.x, mark.y, mark.sxx, mark.sxy, mark.syy)
-    return (mark.photograph, mark.point, *numbers, mark.kind, mark.by, mark.state, mark.when)
 
 
 def image_points_of(marking: Marking, path: Path, sigma_px: float) -> Observations | None:
