@@ -68,8 +68,10 @@ class AutomaticRun:
                     if status:
                         tell(Run("failed", sentence=last))
                         return
-                    if control:
-                        _use_control(file)
+                    if control:  # is its datum
+                        text = file.read_text(encoding="utf-8")
+                        with whole_file(file, replaces=True) as part:
+                            part.write_text(text.replace('kind = "free"', 'kind = "control"', 1), "utf-8")
             name_marks(file, self._marks)
             tell(Run("running", "running the survey"))
             images = ["--images", str(self._photographs)]
@@ -147,10 +149,3 @@ def name_marks(survey_file: Path, marks: Path) -> None:
         with whole_file(survey_file, replaces=True) as part:
             part.write_bytes(before)
         raise
-
-
-def _use_control(survey_file: Path) -> None:
-    """Let a drafted survey use control as its datum."""
-    text = survey_file.read_text(encoding="utf-8")
-    with whole_file(survey_file, replaces=True) as part:
-        part.write_text(text.replace('kind = "free"', 'kind = "control"', 1), encoding="utf-8")

@@ -10,6 +10,7 @@ Source: Longuet-Higgins (1981), Nature 293, for the epipolar constraint.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cache
 
 import cv2
@@ -40,8 +41,18 @@ class PictureEvidence:
         self._cameras = tuple(cameras)
         self._features: Callable[[int], Features] = cache(lambda i: sift_features(read(i)))
         self._targets: Callable[[int], FloatArray] = cache(lambda i: _reduced_targets(read(i)))
-        self.matches: Callable[[int, int], tuple[FloatArray, FloatArray]] = cache(self._match)
-        """tangents of features of two photographs that look alike, (k, 2) each"""
+        self._alike: Callable[[int, int], tuple[FloatArray, FloatArray]] = cache(self._match)
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> PictureEvidence:
+        """Return the same features with another interior orientation of each photograph."""
+        other = copy(self)
+        other._cameras = tuple(cameras)
+        return other
+
+    def matches(self, i: int, j: int) -> tuple[FloatArray, FloatArray]:
+        """Return the tangents of features of two photographs that look alike, (k, 2) each."""
+        a, b = self._alike(i, j)
+        return tangents_from_pixel(self._cameras[i], a), tangents_from_pixel(self._cameras[j], b)
 
     def support(self, i: int, j: int, first: Pose, second: Pose) -> float:
         """Return the number of features that lie on epipolar lines, beyond chance.
@@ -95,13 +106,10 @@ class PictureEvidence:
         return float(np.mean(beyond))
 
     def _match(self, i: int, j: int) -> tuple[FloatArray, FloatArray]:
-        """Return the tangents of features of two photographs that look alike, (k, 2) each."""
+        """Return the places of features of two photographs that look alike, px, (k, 2) each."""
         a, b = self._features(i), self._features(j)
         rows = match_features(a, b)
-        return (
-            tangents_from_pixel(self._cameras[i], a.xy[rows[:, 0]]),
-            tangents_from_pixel(self._cameras[j], b.xy[rows[:, 1]]),
-        )
+        return a.xy[rows[:, 0]], b.xy[rows[:, 1]]
 
 
 def _reduced_targets(photograph: AnyArray) -> FloatArray:

@@ -6,9 +6,9 @@ added, the last orientation is continued.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -16,19 +16,34 @@ import numpy as np
 
 from sfm.matching.radiometry import GreyPhotographs
 from sfm.model.camera import Camera
-from sfm.model.conventions import AnyArray, IntArray
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network, ObjectPoints, ScaleBars
-from sfm.products.marking.adjusting import MarkAdjustment, adjust_marks
+from sfm.model.network import ImagePoints, Network, empty_estimate
+from sfm.products.marking.adjusting import TOLERANCE, MarkAdjustment, adjust_marks
 from sfm.products.marking.clicks import Measured, Template
-from sfm.products.marking.guidance import Guide, Look, Predicted, is_same_place, measure_predicted
-from sfm.products.marking.orienting import MIN_COMMON, MIN_KNOWN, Evidence, HandOrientation, orient_by_hand
+from sfm.products.marking.guidance import (
+    SAME_PX,
+    Guide,
+    Look,
+    Predicted,
+    is_same_place,
+    measure_predicted,
+)
+from sfm.products.marking.orienting import (
+    MIN_COMMON,
+    MIN_KNOWN,
+    Evidence,
+    Frame,
+    HandOrientation,
+    orient_by_hand,
+)
 from sfm.products.marking.project import GivenImagePoint, MarkedProject
 from sfm.runtime.threads import cores
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Mark, Marking, StatedPoint
+from sfm.survey.inputs.start import scale_bars
 from sfm.survey.measuring.templates import TemplateScene, match_templates
 
 
@@ -39,7 +54,6 @@ class MarkedNetwork:
     network: Network
     cameras: tuple[Camera, ...]
     keys: tuple[tuple[str, str], ...]  # photograph and point of each image point
-    marks: int  # image points that are marks; the others were measured automatically
     control: Mapping[str, StatedPoint]
     bars: tuple[ScaleBar, ...]
 
@@ -56,6 +70,16 @@ class Proposal:
     predicted: Predicted
     point: str
     measured: Measured | None = None  # what is there
+
+    @property
+    def xy(self) -> FloatArray:
+        """Its place: measured, else predicted, px, (2,)."""
+        return self.predicted.xy if self.measured is None else np.array([self.measured.x, self.measured.y])
+
+    def is_as(self, shown: Proposal) -> bool:
+        """Return whether a person who looked at another proposal has seen this one."""
+        same = (self.measured is None) == (shown.measured is None)
+        return same and float(np.linalg.norm(self.xy - shown.xy)) <= SAME_PX
 
 
 @dataclass(frozen=True)
@@ -75,7 +99,29 @@ class Following:
     orientation: HandOrientation
     adjustment: MarkAdjustment | None
     estimate: Estimate  # adjusted, else oriented
-    proposals: Mapping[tuple[str, str], Proposal] = field(default_factory=dict)
+    # photograph with the mark that did not fit, and its marks, when all was oriented anew for the last time
+    tried: frozenset[tuple[str, str]] = frozenset()
+
+    @property
+    def doubted(self) -> frozenset[tuple[str, str]]:
+        """The marks of the photograph with the mark that does not fit; empty if all fit."""
+        worst = None if self.adjustment is None else self.adjustment.worst
+        if worst is None or not worst.flagged:
+            return frozenset()
+        return frozenset(key for key in self.marked.keys if key[0] == worst.photograph)
+
+    def is_better_than(self, other: Following) -> bool:
+        """Return whether more photographs are oriented, fewer marks rejected, or residuals smaller."""
+        a, b = self.adjustment, other.adjustment
+        if a is None or b is None:
+            return a is not None
+        ranks = [
+            (-int(row.images.sum()), int(row.adjustment.rejected.sum()) or int(row.named is not None))
+            for row in (a, b)
+        ]
+        sigma0, of_other = a.adjustment.sigma0, b.adjustment.sigma0
+        same = np.isclose(sigma0, of_other, rtol=TOLERANCE)  # both converged to the same
+        return ranks[0] < ranks[1] or (ranks[0] == ranks[1] and sigma0 < of_other and not same)
 
     @cached_property
     def residuals(self) -> dict[tuple[str, str], MarkFit]:
@@ -110,7 +156,7 @@ def stated_points(project: MarkedProject, marking: Marking) -> dict[str, StatedP
     return {**stated, **marking.control}
 
 
-def scale_bars(project: MarkedProject, marking: Marking) -> tuple[ScaleBar, ...]:
+def bars_of(project: MarkedProject, marking: Marking) -> tuple[ScaleBar, ...]:
     """Return the scale bars of the survey, and those that the person states, which come first."""
     own = marking.bars
     given = [bar for bar in project.bars if not {(bar.start, bar.end), (bar.end, bar.start)} & own.keys()]
@@ -121,56 +167,42 @@ def network_of_marks(project: MarkedProject, marking: Marking) -> MarkedNetwork:
     """Return the network of marks and of automatic image points, which marks of the same point replace."""
     names = project.photographs.names
     index = {name: i for i, name in enumerate(names)}
-    control, bars = stated_points(project, marking), scale_bars(project, marking)
-    rows = [mark for mark in marking.marks.values() if mark.photograph in index]
-    keys = [mark.key for mark in rows]
-    xy = [(mark.x, mark.y) for mark in rows]
-    sigma_px = project.survey.adjust.sigma_px
-    C = [
-        np.array(mark.covariance) + (sigma_px**2 * np.eye(2) if mark.by == "measured" else 0.0)
-        for mark in rows
-    ]
-    replaced = marking.marks.keys() | marking.refused.keys()
-    for row in automatic_image_points(project):
-        key = row.photograph, row.point
-        if row.photograph in index and key not in replaced:
-            keys.append(key)
-            xy.append(row.xy)
-            C.append(row.covariance)
+    control, bars = stated_points(project, marking), bars_of(project, marking)
+    rows = [row for row in image_points_of(project, marking) if row.photograph in index]
     solved = () if project.solution is None else project.solution.network.points
-    shown = {point for _, point in keys}
-    points = tuple(
-        dict.fromkeys((*control, *(name for name in solved if name in shown), *(p for _, p in keys)))
-    )
+    shown = dict.fromkeys(row.point for row in rows)
+    points = tuple(dict.fromkeys((*control, *(name for name in solved if name in shown), *shown)))
     number = {name: j for j, name in enumerate(points)}
     seen = ImagePoints(
-        np.array([index[photograph] for photograph, _ in keys], dtype=np.int64),
-        np.array([number[point] for _, point in keys], dtype=np.int64),
-        np.array(xy, dtype=float).reshape(-1, 2),
-        np.array(C, dtype=float).reshape(-1, 2, 2),
+        np.array([index[row.photograph] for row in rows], dtype=np.int64),
+        np.array([number[row.point] for row in rows], dtype=np.int64),
+        np.array([row.xy for row in rows], dtype=float).reshape(-1, 2),
+        np.array([row.covariance for row in rows], dtype=float).reshape(-1, 2, 2),
     )
     network = Network(names, project.photographs.camera, points, seen)
     if control:
-        variance = np.zeros((len(control), 3, 3))
-        variance[:, range(3), range(3)] = np.array([known.sigma for known in control.values()]) ** 2
-        network = network.with_given(
-            ObjectPoints(
-                np.array([number[name] for name in control], dtype=np.int64),
-                np.array([known.xyz for known in control.values()], dtype=float),
-                variance,
-            )
+        stated = control.values()
+        network = network.with_control(
+            tuple(control), [known.xyz for known in stated], [known.sigma for known in stated]
         )
-    between = [bar for bar in bars if bar.start in number and bar.end in number]
-    if between:
-        network = network.with_given(
-            ScaleBars(
-                np.array([number[bar.start] for bar in between], dtype=np.int64),
-                np.array([number[bar.end] for bar in between], dtype=np.int64),
-                np.array([bar.length for bar in between], dtype=float),
-                np.array([bar.sigma for bar in between], dtype=float),
-            )
-        )
-    return MarkedNetwork(network, project.cameras, tuple(keys), len(rows), control, bars)
+    network = network.with_given(scale_bars(bars, points))
+    keys = tuple((row.photograph, row.point) for row in rows)
+    return MarkedNetwork(network, project.cameras, keys, control, bars)
+
+
+def image_points_of(project: MarkedProject, marking: Marking) -> list[GivenImagePoint]:
+    """Return the marks as image points, and the automatic ones that no person measured again or refused.
+
+    sigma_px of the survey is added to marks that were measured.
+    """
+    other = {"measured": project.survey.adjust.sigma_px**2, "hand": 0.0}  # px^2
+    replaced = marking.marks.keys() | marking.refused.keys()
+    marks = [
+        GivenImagePoint(*mark.key, (mark.x, mark.y), np.array(mark.covariance) + other[mark.by] * np.eye(2))
+        for mark in marking.marks.values()
+    ]
+    automatic = automatic_image_points(project)
+    return [*marks, *(row for row in automatic if (row.photograph, row.point) not in replaced)]
 
 
 def automatic_image_points(project: MarkedProject) -> tuple[GivenImagePoint, ...]:
@@ -203,14 +235,29 @@ def follow(
         last: what followed from earlier marks.
     """
     marked = network_of_marks(project, marking)
+    if last is None or not _continues(marked, last):
+        return _followed(project, marked, evidence, *_start(project, marked))
+    points = _renumbered(last.marked.network.points, last.estimate.points, marked)
+    earlier = replace(last.estimate, points=points), last.orientation.frame
+    continued = _followed(project, marked, evidence, *earlier)
+    doubted = continued.doubted
+    if doubted in (frozenset(), last.tried):
+        return replace(continued, tried=last.tried)
+    anew = _followed(project, marked, evidence, *_start(project, marked))
+    return replace(anew if anew.is_better_than(continued) else continued, tried=doubted)
+
+
+def _followed(
+    project: MarkedProject, marked: MarkedNetwork, evidence: Evidence, start: Estimate, frame: Frame
+) -> Following:
+    """Return the orientation and adjustment from what is oriented already."""
     network = marked.network
-    start, in_control = _start(project, marked, last)
-    orientation = orient_by_hand(network, start, evidence, in_control=in_control)
+    orientation = orient_by_hand(network, start, evidence, frame=frame)
     adjustment = adjust_marks(
         network,
         orientation.estimate,
         marked.cameras,
-        in_control=orientation.in_control,
+        in_control=orientation.frame == "control",
         false_alarm=project.survey.adjust.false_alarm,
     )
     estimate = orientation.estimate
@@ -225,31 +272,31 @@ def follow(
     return Following(marked, orientation, adjustment, estimate)
 
 
-def _start(project: MarkedProject, marked: MarkedNetwork, last: Following | None) -> tuple[Estimate, bool]:
-    """Return what is oriented already, and whether it is in the frame of the control."""
-    network = marked.network
-    m, n = len(network.images), len(network.points)
-    position, rotation = np.full((m, 3), np.nan), np.full((m, 3, 3), np.nan)
-    points, in_control, cameras = np.full((n, 3), np.nan), False, marked.cameras
+def _start(project: MarkedProject, marked: MarkedNetwork) -> tuple[Estimate, Frame]:
+    """Return what the result of the survey orients, nothing without one, and its frame."""
+    network, solution = marked.network, project.solution
+    estimate = empty_estimate(network, marked.cameras)
+    if solution is None:
+        return estimate, "model"
+    position, rotation = estimate.position.copy(), estimate.rotation.copy()
+    index = {name: i for i, name in enumerate(network.images)}
+    for i, name in enumerate(solution.network.images):
+        if name in index:
+            position[index[name]] = solution.estimate.position[i]
+            rotation[index[name]] = solution.estimate.rotation[i]
+    points = _renumbered(solution.network.points, solution.estimate.points, marked)
+    frame: Frame = "control" if solution.datum == "control" else "scaled" if solution.has_scale else "model"
+    return Estimate(marked.cameras, position, rotation, points), frame
+
+
+def _renumbered(names: Sequence[str], xyz: FloatArray, marked: MarkedNetwork) -> FloatArray:
+    """Return the coordinates of the points of a network from those of another, NaN for new ones, (n, 3)."""
     number = marked.point
-    if last is not None and _continues(marked, last):
-        position, rotation = last.estimate.position, last.estimate.rotation
-        in_control, cameras = last.orientation.in_control, last.estimate.cameras
-        for name, xyz in zip(last.marked.network.points, last.estimate.points, strict=True):
-            if name in number:
-                points[number[name]] = xyz
-    elif project.solution is not None:
-        solution = project.solution
-        in_control = solution.datum == "control"
-        index = {name: i for i, name in enumerate(network.images)}
-        for i, name in enumerate(solution.network.images):
-            if name in index:
-                position[index[name]] = solution.estimate.position[i]
-                rotation[index[name]] = solution.estimate.rotation[i]
-        for name, xyz in zip(solution.network.points, solution.estimate.points, strict=True):
-            if name in number:
-                points[number[name]] = xyz
-    return Estimate(cameras, position, rotation, points), in_control
+    points = np.full((len(number), 3), np.nan)
+    for name, place in zip(names, xyz, strict=True):
+        if name in number:
+            points[number[name]] = place
+    return points
 
 
 def _continues(marked: MarkedNetwork, last: Following) -> bool:
@@ -264,7 +311,7 @@ def _continues(marked: MarkedNetwork, last: Following) -> bool:
         key in new and np.array_equal(new[key], xy) for key, xy in zip(before.keys, old.xy, strict=True)
     )
     certain = not (last.orientation.open or last.orientation.contradicting)
-    placed = last.orientation.in_control or not marked.control
+    placed = last.orientation.frame == "control" or not marked.control
     return same and kept and certain and placed and bool(last.estimate.oriented.any())
 
 
@@ -273,7 +320,7 @@ def propose(
     marking: Marking,
     read: Callable[[int], AnyArray],
     project: MarkedProject,
-    fits: Mapping[tuple[str, str], Measured],
+    fit: Callable[[Mark], Measured | None],
     points: set[str] | None = None,
     known: Mapping[tuple[str, str], Proposal] = MappingProxyType({}),
 ) -> dict[tuple[str, str], Proposal]:
@@ -284,7 +331,7 @@ def propose(
         marking: the marks; refused places are not proposed.
         read: returns the intensities of a photograph, (H, W).
         project: gives names and codes.
-        fits: what was measured at the marks, by photograph and point.
+        fit: returns what was measured at a mark; None where that is not known.
         points: the points; all that are marked by hand if None.
         known: earlier proposals, which are not measured again where a place hardly moved.
     """
@@ -295,7 +342,7 @@ def propose(
     for point in wanted:
         if point not in number:
             continue
-        look = look_of(point, marking, read, project, fits)
+        look = look_of(point, marking, read, project, fit)
         for predicted in guide.predict(number[point]):
             key = names[predicted.image], point
             if key in marking.refused or key in marking.marks:
@@ -308,8 +355,8 @@ def propose(
                 asked += [] if look is None else [(key, predicted, look)]
     with ThreadPoolExecutor(cores()) as pool:
         measured = pool.map(lambda row: measure_predicted(read, row[1], row[2], family), asked)
-        for (key, predicted, _), fit in zip(asked, measured, strict=True):
-            found[key] = Proposal(predicted, key[1], fit)
+        for (key, predicted, _), there in zip(asked, measured, strict=True):
+            found[key] = Proposal(predicted, key[1], there)
     return found
 
 
@@ -319,7 +366,7 @@ def match_single(
     marking: Marking,
     read: Callable[[int], AnyArray],
     project: MarkedProject,
-    fits: Mapping[tuple[str, str], Measured],
+    fit: Callable[[Mark], Measured | None],
 ) -> dict[tuple[str, str], Proposal]:
     """Return the proposals of a point with one mark: its window matched along the ray of sight.
 
@@ -332,14 +379,14 @@ def match_single(
         marking: the marks; refused places are not proposed.
         read: returns the intensities of a photograph, (H, W).
         project: gives names and codes.
-        fits: what was measured at the marks, by photograph and point.
+        fit: returns what was measured at a mark; None where that is not known.
     """
     marks = [mark for mark in marking.marks.values() if mark.point == point]
     adjustment, network, estimate = following.adjustment, following.marked.network, following.estimate
     if len(marks) != 1 or adjustment is None or marks[0].photograph not in network.images:
         return {}
     mark, i = marks[0], network.images.index(marks[0].photograph)
-    look = look_of(point, marking, read, project, fits)
+    look = look_of(point, marking, read, project, fit)
     if look is None or not estimate.oriented[i]:
         return {}
     seen = network.image_points.select(adjustment.rows)
@@ -364,10 +411,10 @@ def match_single(
             continue
         predicted = Predicted(j, xy, C)
         if look.kind == "window":
-            fit: Measured | None = Measured(float(xy[0]), float(xy[1]), C, "window", xy + box)
+            there: Measured | None = Measured(float(xy[0]), float(xy[1]), C, "window", xy + box)
         else:
-            fit = measure_predicted(read, predicted, look, project.survey.family)
-        found[key] = Proposal(predicted, point, fit)
+            there = measure_predicted(read, predicted, look, project.survey.family)
+        found[key] = Proposal(predicted, point, there)
     return found
 
 
@@ -376,22 +423,24 @@ def look_of(
     marking: Marking,
     read: Callable[[int], AnyArray],
     project: MarkedProject,
-    fits: Mapping[tuple[str, str], Measured],
+    fit: Callable[[Mark], Measured | None],
 ) -> Look | None:
-    """Return how a point looks at its marks; None if it was never measured."""
+    """Return how a point looks at its marks; None if that is not known.
+
+    Without the size and code of a target, a neighbour would be taken for it.
+    """
     marks = [mark for mark in marking.marks.values() if mark.point == point and mark.by == "measured"]
     if not marks:
         return None
     kinds = [mark.kind for mark in marks]
     kind = max(dict.fromkeys(kinds), key=kinds.count)
-    first = next(mark for mark in marks if mark.kind == kind)
-    fit = fits.get(first.key)
+    alike = [mark for mark in marks if mark.kind == kind]
     if kind == "window":
-        return Look(kind, template=template_of(first, read, project))
-    size = 0.0
-    if fit is not None and kind in ("target", "ring"):
-        size = fit.size_px
-    return Look(kind, None if fit is None else fit.code, size_px=size)
+        return Look(kind, template=template_of(alike[0], read, project))
+    if kind not in ("target", "ring"):
+        return Look(kind)
+    measured = next(filter(None, map(fit, alike)), None)
+    return None if measured is None else Look(kind, measured.code, size_px=measured.size_px)
 
 
 def template_of(mark: Mark, read: Callable[[int], AnyArray], project: MarkedProject) -> Template | None:
@@ -441,9 +490,10 @@ def sentence_of(following: Following, proposals: Mapping[tuple[str, str], Propos
         return f"Check {worst.point} in {worst.photograph}: it does not fit the other marks."
     waiting = sum(proposal.measured is not None for proposal in proposals.values())
     if waiting:
-        return f"{counted(waiting, 'proposed mark')}: Enter accepts those of the point, x refuses."
+        marks = counted(waiting, "proposed mark")
+        return f"{marks}: Enter accepts those of the chosen point, Shift+Enter all; X refuses the one here."
     for i in orientation.open:
-        return f"{names[i]} has two orientations that fit its marks: mark one more point."
+        return f"{names[i]} has several orientations that fit its marks: mark one more point."
     if not estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
         return _pair_sentence(following)
     waiting_photographs = np.flatnonzero(needed > 0)

@@ -7,6 +7,8 @@ nothing has changed.
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from sfm.files.open_folders import locked, refuse_links
@@ -14,6 +16,15 @@ from sfm.files.whole_files import remove_leftovers
 from sfm.model.errors import FolderInUseError, OutputError, SurveyFileError
 from sfm.products.marking.project import MarkedProject, refuse_other_survey
 from sfm.survey.inputs.marks_file import Marking, read_marks, write_marks
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of the marks, which can be undone."""
+
+    number: int
+    what: str  # as the page names it
+    page: str  # the page that made it; empty if none did
 
 
 class SavedMarks:
@@ -40,24 +51,26 @@ class SavedMarks:
         try:
             remove_leftovers(path)
             name = project.survey.name
-            self.now = self._read() if path.exists() else Marking(name)
+            self.now = read_marks(path) if path.exists() else Marking(name)
             refuse_other_survey(self.now.survey, name, path)
             self._written = _content(path)
+        except SurveyFileError as error:
+            self.close()
+            raise SurveyFileError(f"{error}; it is left alone") from error
         except BaseException:
             self.close()
             raise
-        self._undone: list[Marking] = []
-        self._before: list[Marking] = []
+        self._numbers = count(1)
+        self._before: list[tuple[Change, Marking]] = []  # changes, and the states before them
+        self._undone: list[tuple[Change, Marking]] = []  # undone changes, and the states after them
 
-    def _read(self) -> Marking:
-        """Return what is in the file."""
-        try:
-            return read_marks(self.path)
-        except SurveyFileError as error:
-            raise SurveyFileError(f"{error}; it is left alone") from error
-
-    def change(self, marking: Marking) -> None:
+    def change(self, marking: Marking, what: str, page: str) -> None:
         """Save a new state.
+
+        Args:
+            marking: the new state.
+            what: what was done, as the page names it.
+            page: the page that did it; empty if none did.
 
         Raises:
             OutputError: the file cannot be written, or another program has changed it; the state is what it
@@ -65,35 +78,34 @@ class SavedMarks:
             SurveyFileError: a mark is not one that is read again.
         """
         self._write(marking)
-        self._before.append(self.now)
+        self._before.append((Change(next(self._numbers), what, page), self.now))
         self._undone.clear()
         self.now = marking
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is a change to undo."""
-        return bool(self._before)
+    def last(self) -> Change | None:
+        """The last change, which `undo` undoes."""
+        return self._before[-1][0] if self._before else None
 
     @property
-    def can_redo(self) -> bool:
-        """Whether there is an undone change."""
-        return bool(self._undone)
+    def last_undone(self) -> Change | None:
+        """The change that was undone last, which `redo` makes again."""
+        return self._undone[-1][0] if self._undone else None
 
-    def undo(self) -> bool:
-        """Return to the state before the last change; return whether there was one."""
-        return self._step(self._before, self._undone)
+    def undo(self) -> None:
+        """Return to the state before the last change."""
+        self._step(self._before, self._undone)
 
-    def redo(self) -> bool:
-        """Make the last undone change again; return whether there was one."""
-        return self._step(self._undone, self._before)
+    def redo(self) -> None:
+        """Make the last undone change again."""
+        self._step(self._undone, self._before)
 
-    def _step(self, source: list[Marking], other: list[Marking]) -> bool:
-        if not source:
-            return False
-        self._write(source[-1])
-        other.append(self.now)
-        self.now = source.pop()
-        return True
+    def _step(self, source: list[tuple[Change, Marking]], other: list[tuple[Change, Marking]]) -> None:
+        change, marking = source[-1]
+        self._write(marking)
+        source.pop()
+        other.append((change, self.now))
+        self.now = marking
 
     def _write(self, marking: Marking) -> None:
         """Write the file, unless another program has changed it since."""

@@ -11,16 +11,18 @@ Source: Fischler and Bolles (1981), Comm. ACM 24(6); Nister (2004), IEEE PAMI 26
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import Protocol
+from itertools import combinations, islice
+from typing import Literal, Protocol
 
 import numpy as np
 
 from sfm.adjustment.solve import AdjustmentOptions, adjust
+from sfm.model.camera import Camera
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import Role
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -37,6 +39,7 @@ from sfm.orientation.relative import (
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_triples
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.products.marking.evidence import Pose
+from sfm.survey.free_parameters import C_SIGMA
 from sfm.survey.placing import object_scale
 
 MIN_KNOWN, MIN_COMMON = 3, 5  # marks of known points that orient a photograph, and common points of a pair
@@ -46,7 +49,15 @@ MIN_SHARE = 0.6  # of the known points of a photograph that must fit; a few mark
 AGAIN = 1.3  # photographs over those of the last adjustment, from which all are adjusted again
 # Part of its support, and features, by which the best orientation leads if it is clear.
 CLEAR, LEAD = 0.25, 2.0
+# Principal distances that are tried, in parts of the nominal one, which is the first: two standard deviations
+# to each side. With steps of a quarter of one, features support the right orientation with one of them.
+C_FACTORS = (1.0, *(1 + sign * C_SIGMA * k / 4 for k in range(1, 9) for sign in (-1, 1)))
+MOST_TRIED = 4  # photographs that decide on the principal distance
 ALIKE_DEG = 15.0  # between orientations that are no rivals, but one with and without further features
+
+
+Frame = Literal["model", "scaled", "control"]
+"""coordinates of an orientation: of its own, of its own in the object unit, or those of the control"""
 
 
 class Evidence(Protocol):
@@ -64,6 +75,10 @@ class Evidence(Protocol):
         """Return the number of points that are seen where an orientation predicts them."""
         ...
 
+    def with_cameras(self, cameras: Sequence[Camera]) -> Evidence:
+        """Return the evidence with another interior orientation of each photograph."""
+        ...
+
 
 @dataclass(frozen=True)
 class HandOrientation:
@@ -72,11 +87,11 @@ class HandOrientation:
     estimate: Estimate  # NaN where nothing is determined
     open: tuple[int, ...] = ()  # photographs with several orientations of which none is clearly better
     contradicting: tuple[int, ...] = ()  # photographs whose marks fit no orientation
-    in_control: bool = False  # whether the frame is that of the control
+    frame: Frame = "model"
 
 
 def orient_by_hand(
-    network: Network, start: Estimate, evidence: Evidence, *, in_control: bool = False
+    network: Network, start: Estimate, evidence: Evidence, *, frame: Frame = "model"
 ) -> HandOrientation:
     """Return the orientation of the photographs that have enough marks, and the points that follow.
 
@@ -84,9 +99,9 @@ def orient_by_hand(
         network: marks of m photographs and n points, with control and scale bars.
         start: cameras, and what is oriented already; NaN elsewhere.
         evidence: decides between orientations that fit the marks.
-        in_control: whether what is oriented already is in the frame of the control.
+        frame: frame of what is oriented already.
     """
-    work = _Work(network, start, evidence, in_control=in_control)
+    work = _Work(network, start, evidence, frame)
     if not work.estimate.oriented.any() and len(network.control.complete) < MIN_KNOWN:
         work.orient_pair()
     work.grow()
@@ -94,25 +109,48 @@ def orient_by_hand(
         work.orient_pair()
         work.grow()
     work.place()
-    if work.in_control:
+    if work.frame == "control":
         work.grow()  # on the other known points
+    undecided = {i for i in work.undecided if not work.estimate.oriented[i]}
     return HandOrientation(
-        work.estimate, tuple(sorted(work.open)), tuple(sorted(work.contradicting)), work.in_control
+        work.estimate, tuple(sorted(work.open | undecided)), tuple(sorted(work.contradicting)), work.frame
     )
+
+
+@dataclass(frozen=True)
+class _Threes:
+    """Orientations of photographs from three known points each."""
+
+    poses: dict[int, Pose]
+    support: float  # of all of them
+    open: set[int]  # of which none is clearly better
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The relative orientation of two photographs that their features support most."""
+
+    support: float
+    points: IntArray  # common points
+    solution: RelativeOrientation
+    clear: bool  # whether it leads over those that differ from it
+    alone: bool  # whether there is no other
 
 
 class _Work:
     """An orientation that grows."""
 
-    def __init__(self, network: Network, start: Estimate, evidence: Evidence, *, in_control: bool) -> None:
+    def __init__(self, network: Network, start: Estimate, evidence: Evidence, frame: Frame) -> None:
         self.network, self.evidence, self.estimate = network, evidence, start
         self.known = np.zeros(len(network.points), dtype=bool)  # whose coordinates are given
-        self.in_control = in_control and bool(start.oriented.any())
+        self.frame: Frame = frame if start.oriented.any() else "model"
         self.given, self.adjusted = start.oriented, 0
-        if self.in_control or (not start.oriented.any() and len(network.control.complete) >= MIN_KNOWN):
+        begins = not start.oriented.any() and len(network.control.complete) >= MIN_KNOWN
+        if self.frame == "control" or begins:
             self.use_control()
-        self.uv = image_tangents(network.image_points, network.camera, start.cameras)
+        self.use_cameras(start.cameras)
         self.open: set[int] = set()
+        self.undecided: set[int] = set()  # on which nothing is built
         self.contradicting: set[int] = set()
         self.intersect()
 
@@ -121,7 +159,7 @@ class _Work:
         control, points = self.network.control.complete, self.estimate.points.copy()
         points[control.point] = control.xyz
         self.known[control.point] = True
-        self.estimate, self.in_control = replace(self.estimate, points=points), True
+        self.estimate, self.frame = replace(self.estimate, points=points), "control"
 
     def grow(self) -> None:
         """Orient all photographs that have enough points, and determine the points that follow."""
@@ -171,36 +209,89 @@ class _Work:
         return self.resect_threes({i: k for i, k in rows.items() if len(k) == MIN_KNOWN})
 
     def resect_threes(self, rows: dict[int, IntArray]) -> int:
-        """Orient the photographs with three known points, all at once: each supports the others."""
-        seen = self.network.image_points
+        """Orient the photographs with three known points, all at once: each supports the others.
+
+        Three points fit with any principal distance. Where c is free, and no photograph determines it yet, it
+        is the one with which the features support the orientations most clearly.
+        """
+        undecided = self.undecided_c(rows)
+        if undecided:
+            first = dict(islice(rows.items(), MOST_TRIED))
+            trials = [self.scaled_cameras(undecided, factor) for factor in C_FACTORS]
+            support = [self.of_threes(first, cameras).support for cameras in trials]
+            best = int(np.argmax(support))
+            if _is_clear(support[best] - support[0], support[best]):
+                self.use_cameras(trials[best])
+        threes = self.of_threes(rows, self.estimate.cameras)
+        self.open |= threes.open
+        self.contradicting |= rows.keys() - threes.poses.keys()
+        for i, pose in threes.poses.items():
+            self.put(i, pose)
+        return len(threes.poses)
+
+    def undecided_c(self, rows: dict[int, IntArray]) -> set[int]:
+        """Return the cameras of photographs whose c is free, and is not determined by other photographs."""
+        cameras, owner = self.estimate.cameras, self.network.camera
+        known = set(owner[self.estimate.oriented].tolist())
+        return {
+            k
+            for k in {int(owner[i]) for i in rows} - known
+            if (cameras[k].free & cameras[k].plays(Role.FOCAL)).any()
+        }
+
+    def scaled_cameras(self, which: set[int], factor: float) -> tuple[Camera, ...]:
+        """Return the cameras, of which some have another principal distance."""
+        return tuple(
+            replace(camera, parameters=np.where(camera.plays(Role.FOCAL), factor, 1.0) * camera.parameters)
+            if k in which
+            else camera
+            for k, camera in enumerate(self.estimate.cameras)
+        )
+
+    def use_cameras(self, cameras: tuple[Camera, ...]) -> None:
+        """Take the interior orientations from which everything follows."""
+        owner = self.network.camera
+        self.estimate = replace(self.estimate, cameras=cameras)
+        self.evidence = self.evidence.with_cameras([cameras[k] for k in owner])
+        self.uv = image_tangents(self.network.image_points, owner, cameras)
+
+    def of_threes(self, rows: dict[int, IntArray], cameras: tuple[Camera, ...]) -> _Threes:
+        """Return the orientations of photographs from three known points each."""
+        seen, owner = self.network.image_points, self.network.camera
+        evidence = self.evidence.with_cameras([cameras[k] for k in owner])
+        uv = image_tangents(seen, owner, cameras)
         poses: dict[int, list[Pose]] = {
             i: [(self.estimate.position[i], self.estimate.rotation[i])]
             for i in np.flatnonzero(self.estimate.oriented).tolist()
         }
         for i, k in rows.items():
-            found = resect_triples(
-                rays_from_tangents(self.uv[k])[None], self.estimate.points[seen.point[k]][None]
-            )
+            found = resect_triples(rays_from_tangents(uv[k])[None], self.estimate.points[seen.point[k]][None])
             poses[i] = [(found.position[0, s], found.rotation[0, s]) for s in range(found.count[0])]
             if not poses[i]:
-                self.contradicting.add(i)
                 del poses[i]
-        new = [i for i in rows if i in poses]
+        new, not_clear = [i for i in rows if i in poses], set[int]()
         while any(len(poses[i]) > 1 for i in new):
-            self.decide(poses)
-        for i in new:
-            self.put(i, poses[i][0])
-        return len(new)
+            not_clear |= self.decide(poses, evidence)
+        support = sum(evidence.places(i, poses[i][0], self.estimate.points) for i in new)
+        support += sum(
+            evidence.support(j, i, poses[j][0], poses[i][0])
+            for i in new
+            for j in poses
+            if j < i or j not in new
+        )
+        return _Threes({i: poses[i][0] for i in new}, support, not_clear)
 
-    def decide(self, poses: dict[int, list[Pose]]) -> None:
-        """Keep one pose of the photograph, or of the two, that the others support most clearly."""
+    def decide(self, poses: dict[int, list[Pose]], evidence: Evidence) -> set[int]:
+        """Keep one pose of the photograph, or of the two, that the others support most clearly.
+
+        Returns:
+            Those of them whose poses are not clearly better than others.
+        """
         best: tuple[float, float, dict[int, int]] | None = None
         for i in [i for i in poses if len(poses[i]) > 1]:
-            own = np.array([self.evidence.places(i, p, self.estimate.points) for p in poses[i]])
+            own = np.array([evidence.places(i, p, self.estimate.points) for p in poses[i]])
             for j in [j for j in poses if j != i]:
-                support = own[:, None] + [
-                    [self.evidence.support(j, i, q, p) for q in poses[j]] for p in poses[i]
-                ]
+                support = own[:, None] + [[evidence.support(j, i, q, p) for q in poses[j]] for p in poses[i]]
                 k, q = divmod(int(np.argmax(support)), support.shape[1])
                 rival = max((float(support[a].max()) for a in range(len(support)) if a != k), default=0.0)
                 row = float(support[k, q]) - rival, float(support[k, q]), {i: k, j: q}
@@ -210,32 +301,27 @@ class _Work:
                 best = float(own[first] - np.sort(own)[-2]), float(own[first]), {i: first}
         assert best is not None
         lead, support_of_best, chosen = best
+        open_ones = {i for i in chosen if len(poses[i]) > 1 and not _is_clear(lead, support_of_best)}
         for i, k in chosen.items():
-            if len(poses[i]) > 1 and not _is_clear(lead, support_of_best):
-                self.open.add(i)
             poses[i] = [poses[i][k]]
+        return open_ones
 
     def orient_pair(self) -> None:
         """Orient the two photographs with the best common points, in the frame of the first."""
-        candidates = []
+        best: tuple[int, int, _Chosen] | None = None
         for i, j in self.pairs()[:MOST_PAIRS]:
-            of_pair = [
-                (support, i, j, points, solution) for support, points, solution in self.solutions(i, j)
-            ]
-            candidates += of_pair
-            if len(of_pair) == 1 and len(of_pair[0][3]) >= MANY_COMMON:
+            chosen = self.choose(i, j)
+            if chosen is not None and (best is None or chosen.support > best[2].support):
+                best = i, j, chosen
+            if chosen is not None and chosen.alone and len(chosen.points) >= MANY_COMMON:
                 break  # its marks determine it
-        if not candidates:
+        if best is None:
             return
-        support, i, j, _, solution = max(candidates, key=lambda row: row[0])
-        rivals = [
-            row[0]
-            for row in candidates
-            if row[1:3] == (i, j) and _angle_deg(row[4].rotation, solution.rotation) > ALIKE_DEG
-        ]
-        if rivals and not _is_clear(support - max(rivals), support):
+        i, j, chosen = best
+        solution = chosen.solution
+        if not chosen.clear:
             self.open |= {i, j}
-        self.known[:], self.in_control = False, False
+        self.known[:], self.frame = False, "model"
         self.estimate = replace(self.estimate, points=np.full_like(self.estimate.points, np.nan))
         self.put(i, (np.zeros(3), np.eye(3)))
         self.put(j, (solution.base, solution.rotation))
@@ -243,27 +329,40 @@ class _Work:
         self.adjust()
 
     def attach_pair(self) -> bool:
-        """Orient a photograph on one that is oriented, by common points some of which are known."""
-        seen = self.network.image_points
+        """Orient a photograph on one that is oriented, by common points some of which are known.
+
+        One that several orientations fit stays open: others would follow from a wrong one.
+        """
         for i, j in self.pairs():
             if self.estimate.oriented[i] == self.estimate.oriented[j]:
                 continue
             i, j = (i, j) if self.estimate.oriented[i] else (j, i)
-            best: tuple[float, Pose] | None = None
-            for support, points, solution in self.solutions(i, j):
-                a, b = (self.tangents_of(k, points) for k in (i, j))
-                model = model_points(a, b, solution)
-                X0, R = self.estimate.position[i], self.estimate.rotation[i]
-                away = np.linalg.norm(self.estimate.points[points] - X0, axis=1)
-                scale = (
-                    np.nanmedian(away / np.linalg.norm(model, axis=1)) if np.isfinite(away).any() else np.nan
-                )
-                if scale > 0 and (best is None or support > best[0]):
-                    best = support, (X0 + scale * R @ solution.base, R @ solution.rotation)
-            if best is not None and seen is not None:
-                self.put(j, best[1])
-                return True
+            chosen = self.choose(i, j)
+            if chosen is None:
+                continue
+            solution, points = chosen.solution, chosen.points
+            a, b = (self.tangents_of(k, points) for k in (i, j))
+            model = model_points(a, b, solution)
+            X0, R = self.estimate.position[i], self.estimate.rotation[i]
+            ratio = np.linalg.norm(self.estimate.points[points] - X0, axis=1) / np.linalg.norm(model, axis=1)
+            if not np.isfinite(ratio).any():
+                continue
+            if not chosen.clear:
+                self.undecided.add(j)
+                continue
+            self.put(j, (X0 + np.nanmedian(ratio) * R @ solution.base, R @ solution.rotation))
+            return True
         return False
+
+    def choose(self, i: int, j: int) -> _Chosen | None:
+        """Return the relative orientation of two photographs with the largest support; None without any."""
+        candidates = list(self.solutions(i, j))
+        if not candidates:
+            return None
+        support, points, solution = max(candidates, key=lambda row: row[0])
+        rivals = [row[0] for row in candidates if _angle_deg(row[2].rotation, solution.rotation) > ALIKE_DEG]
+        clear = not rivals or _is_clear(support - max(rivals), support)
+        return _Chosen(support, points, solution, clear, alone=len(candidates) == 1)
 
     def pairs(self) -> list[tuple[int, int]]:
         """Return the pairs with enough common points, those with most of them first."""
@@ -349,7 +448,7 @@ class _Work:
             return
         images, points, used = determined_part(self.network, self.estimate)
         given = int(self.known[points].sum())
-        control = self.in_control and given >= MIN_KNOWN
+        control = self.frame == "control" and given >= MIN_KNOWN
         unknowns = 6 * images.sum() + 3 * (points.sum() - given) - (0 if control else 7)
         if images.sum() < 2 or 2 * used.sum() <= unknowns:
             return
@@ -378,7 +477,7 @@ class _Work:
 
     def place(self) -> None:
         """Bring a free orientation to its control, or to the scale of its bars."""
-        if self.in_control or not self.estimate.oriented.any():
+        if self.frame == "control" or not self.estimate.oriented.any():
             return
         control = self.network.control.complete
         determined = self.estimate.determined[control.point]
@@ -388,10 +487,9 @@ class _Work:
                 self.estimate = fit_similarity(points, control.xyz[determined]).apply_estimate(self.estimate)
                 self.use_control()
                 return
-        if self.given.any():
-            return
-        scale = object_scale(self.network, self.estimate)
+        scale = object_scale(self.network, self.estimate) if self.frame == "model" else 0.0
         if scale > 0:
+            self.frame = "scaled"
             self.estimate = replace(
                 self.estimate, position=scale * self.estimate.position, points=scale * self.estimate.points
             )

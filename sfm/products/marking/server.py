@@ -16,7 +16,7 @@ import math
 import os
 import secrets
 import socket
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,8 +30,8 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from sfm.files.plain_text import MAX_NAME
-from sfm.model.errors import GeometryError, KolinearError, OutputError, PhotographError
-from sfm.products.marking.session import MarkError, MarkingSession
+from sfm.model.errors import KolinearError, OutputError
+from sfm.products.marking.session import MarkingSession
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.marks_file import Kind, StatedPoint
 
@@ -63,12 +63,15 @@ Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Sigma = Annotated[float, Field(ge=0, le=1e12)]
 Positive = Annotated[float, Field(ge=1e-9, le=1e12)]
 Index = Annotated[int, Field(ge=0, le=1_000_000)]
+Version = Annotated[int, Field(ge=0, le=10**15)]
+Answer = Callable[[Request], Awaitable[Response]]
 
 
 class Body(BaseModel):
     """What a request states; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    page: Annotated[str, Field(max_length=MAX_NAME)] = ""  # which page asks, a name that it chose itself
 
 
 class Click(Body):
@@ -83,10 +86,11 @@ class Click(Body):
 
 
 class Chosen(Body):
-    """A point in a photograph, a point, or everything."""
+    """A point in a photograph, a point, or everything, as the page shows it."""
 
     image: Index | None = None
     point: Name | None = None
+    version: Version  # of the state that the person looked at
 
 
 class Deleted(Body):
@@ -124,34 +128,42 @@ class Bar(Body):
     remove: bool = False
 
 
+class Step(Body):
+    """The change that is undone or made again."""
+
+    number: Version
+    anyway: bool = False  # also if another page made it
+
+
 class Nothing(Body):
     """A request without content."""
 
 
-def _control(session: MarkingSession, body: Control) -> dict[str, Any]:
-    stated = None if body.remove else StatedPoint((body.X, body.Y, body.Z), body.sigma)
-    return session.set_control(body.point, stated)
+def _click(session: MarkingSession, b: Click) -> dict[str, Any]:
+    return session.click(b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px, page=b.page)
 
 
-def _bar(session: MarkingSession, body: Bar) -> dict[str, Any]:
-    bar = None if body.remove else ScaleBar(body.start, body.end, body.length, body.sigma)
-    return session.set_bar(body.start, body.end, bar)
+def _control(session: MarkingSession, b: Control) -> dict[str, Any]:
+    stated = None if b.remove else StatedPoint((b.X, b.Y, b.Z), b.sigma)
+    return session.set_control(b.point, stated, page=b.page)
+
+
+def _bar(session: MarkingSession, b: Bar) -> dict[str, Any]:
+    bar = None if b.remove else ScaleBar(b.start, b.end, b.length, b.sigma)
+    return session.set_bar(b.start, b.end, bar, page=b.page)
 
 
 CHANGES: dict[str, tuple[type[Body], Callable[[MarkingSession, Any], dict[str, Any]]]] = {
-    "click": (
-        Click,
-        lambda session, b: session.click(b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px),
-    ),
-    "accept": (Chosen, lambda session, b: session.accept(b.image, b.point)),
-    "refuse": (Chosen, lambda session, b: session.refuse(b.image, b.point)),
-    "delete": (Deleted, lambda session, b: session.delete(b.point, b.image)),
-    "rename": (Renamed, lambda session, b: session.rename(b.point, b.name)),
+    "click": (Click, _click),
+    "accept": (Chosen, lambda session, b: session.accept(b.image, b.point, seen=b.version, page=b.page)),
+    "refuse": (Chosen, lambda session, b: session.refuse(b.image, b.point, seen=b.version, page=b.page)),
+    "delete": (Deleted, lambda session, b: session.delete(b.point, b.image, page=b.page)),
+    "rename": (Renamed, lambda session, b: session.rename(b.point, b.name, page=b.page)),
     "control": (Control, _control),
     "bar": (Bar, _bar),
     "automatic": (Nothing, lambda session, b: session.automatic()),
-    "undo": (Nothing, lambda session, b: session.undo()),
-    "redo": (Nothing, lambda session, b: session.redo()),
+    "undo": (Step, lambda session, b: session.undo(b.number, page=b.page, anyway=b.anyway)),
+    "redo": (Step, lambda session, b: session.redo(b.number, page=b.page, anyway=b.anyway)),
 }
 
 
@@ -173,82 +185,96 @@ class Address:
         return f"{HOST}:{self.port}", f"localhost:{self.port}"
 
 
-def application(session: MarkingSession, address: Address) -> Starlette:
-    """Return the application.
+@dataclass(frozen=True)
+class Guard:
+    """What a request must have, before anything else is read from it."""
 
-    Args:
-        session: the session that answers.
-        address: port and secret.
-    """
+    address: Address
 
-    def refusal(request: Request) -> Response | None:
-        """Return the answer to a request that is refused, before anything is read from it."""
+    def refusal(self, request: Request) -> Response | None:
+        """Return the answer to a request that is refused."""
         host = request.headers.get("host", "")
-        if host not in address.hosts:
+        if host not in self.address.hosts:
             return _refused(403)
-        given = request.path_params.get("secret", "")
-        if not hmac.compare_digest(given.encode(), address.secret.encode()):
+        if not self._is_secret(request.path_params.get("secret", "")):
             return _refused(404)
-        origin = request.headers.get("origin")
-        if origin is not None and origin != f"http://{host}":
+        if request.headers.get("origin", f"http://{host}") != f"http://{host}":
             return _refused(403)
         if request.headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
             return _refused(403)
         if request.method == "POST":
-            stated = request.headers.get(HEADER, "")
             kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-            if not hmac.compare_digest(stated.encode(), address.secret.encode()):
-                return _refused(403)
-            if kind != "application/json":
+            if kind != "application/json" or not self._is_secret(request.headers.get(HEADER, "")):
                 return _refused(403)
         return None
 
-    def guarded(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    def _is_secret(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self.address.secret.encode())
+
+    def guarded(self, answer: Answer) -> Answer:
+        """Return a function that answers only what is not refused, and says why a request cannot be done."""
+
         async def guarded_answer(request: Request) -> Response:
-            refused = refusal(request)
+            refused = self.refusal(request)
             if refused is not None:
                 return refused
             try:
                 return await answer(request)
-            except (MarkError, GeometryError, PhotographError, OutputError) as error:
-                return _json({"error": str(error)}, 422)
             except KolinearError as error:
                 return _json({"error": str(error)}, 422)
 
         return guarded_answer
 
-    async def page(request: Request) -> Response:
-        name, kind = FILES[request.path_params.get("file", "")]
+
+@dataclass(frozen=True)
+class Answers:
+    """The answers of a session to requests."""
+
+    session: MarkingSession
+
+    async def page(self, request: Request) -> Response:
+        """Return the page, its script or its style sheet."""
+        name, kind = FILES.get(request.path_params.get("file", ""), ("", ""))
+        if not name:
+            return _refused(404)
         return Response((PAGE / name).read_bytes(), media_type=f"{kind}; charset=utf-8", headers=SAFE)
 
-    async def state(request: Request) -> Response:
+    async def state(self, request: Request) -> Response:
+        """Return the state, newer than a version if one is stated."""
         after = request.query_params.get("after", "")
         version = int(after) if after.isascii() and after.isdecimal() and len(after) < 16 else None
-        return _json(await run_in_threadpool(session.state, version))
+        return _json(await run_in_threadpool(self.session.state, version))
 
-    async def descriptor(request: Request) -> Response:
+    async def descriptor(self, request: Request) -> Response:
+        """Return the DZI descriptor of a photograph."""
         i = request.path_params["image"]
-        if i >= len(session.project.photographs):
+        if i >= len(self.session.project.photographs):
             return _refused(404)
-        return Response(session.pixels.descriptor(i), media_type="application/xml", headers=SAFE)
+        return Response(self.session.pixels.descriptor(i), media_type="application/xml", headers=SAFE)
 
-    async def tile(request: Request) -> Response:
+    async def tile(self, request: Request) -> Response:
+        """Return a tile of a photograph."""
         at = request.path_params
-        data = await run_in_threadpool(session.pixels.tile, at["image"], at["level"], at["column"], at["row"])
+        data = await run_in_threadpool(
+            self.session.pixels.tile, at["image"], at["level"], at["column"], at["row"]
+        )
         if data is None:
             return _refused(404)
         return Response(data, media_type="image/jpeg", headers={**SAFE, **KEPT})
 
-    async def fit(request: Request) -> Response:
+    async def fit(self, request: Request) -> Response:
+        """Return the picture of the fit of a mark."""
         at = request.path_params
-        data = await run_in_threadpool(session.fit_picture, at["image"], at["point"])
+        data = await run_in_threadpool(self.session.fit_picture, at["image"], at["point"])
         return _refused(404) if data is None else Response(data, media_type="image/png", headers=SAFE)
 
-    async def report(request: Request) -> Response:
-        path = await run_in_threadpool(session.report_file, request.path_params["path"])
+    async def report(self, request: Request) -> Response:
+        """Return a file of the report."""
+        path = await run_in_threadpool(self.session.report_file, request.path_params["path"])
         return _refused(404) if path is None else FileResponse(path, headers=OF_REPORT)
 
-    async def sight(request: Request) -> Response:
+    async def sight(self, request: Request) -> Response:
+        """Return a ray of sight in the other photographs."""
         try:
             image = int(request.query_params["image"])
             x, y = (float(request.query_params[name]) for name in ("x", "y"))
@@ -256,9 +282,10 @@ def application(session: MarkingSession, address: Address) -> Starlette:
             return _refused(422)
         if not (math.isfinite(x) and math.isfinite(y)):
             return _refused(422)
-        return _json({"lines": await run_in_threadpool(session.sight, image, x, y)})
+        return _json({"lines": await run_in_threadpool(self.session.sight, image, x, y)})
 
-    async def change(request: Request) -> Response:
+    async def change(self, request: Request) -> Response:
+        """Do what a request asks for, and return what became of it."""
         row = CHANGES.get(request.path_params["change"])
         if row is None:
             return _refused(404)
@@ -274,31 +301,33 @@ def application(session: MarkingSession, address: Address) -> Starlette:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             return _json({"error": f"{where}: {first['msg']}"[:300]}, 422)
-        return _json(await run_in_threadpool(change_session, session, body))
+        return _json(await run_in_threadpool(change_session, self.session, body))
 
+
+def application(session: MarkingSession, address: Address) -> Starlette:
+    """Return the application.
+
+    Args:
+        session: the session that answers.
+        address: port and secret.
+    """
+    answers, guarded = Answers(session), Guard(address).guarded
     routes = [
-        Route("/{secret}/", guarded(page)),
-        Route("/{secret}/state", guarded(state)),
-        Route("/{secret}/sight", guarded(sight)),
-        Route("/{secret}/{file:str}", guarded(_only(page, FILES))),
-        Route("/{secret}/tiles/{image:int}.dzi", guarded(descriptor)),
-        Route("/{secret}/tiles/{image:int}_files/{level:int}/{column:int}_{row:int}.jpg", guarded(tile)),
-        Route("/{secret}/fit/{image:int}/{point:path}.png", guarded(fit)),
-        Route("/{secret}/report/{path:path}", guarded(report)),
-        Route("/{secret}/{change:str}", guarded(change), methods=["POST"]),
+        Route("/{secret}/", guarded(answers.page)),
+        Route("/{secret}/state", guarded(answers.state)),
+        Route("/{secret}/sight", guarded(answers.sight)),
+        Route("/{secret}/{file:str}", guarded(answers.page)),
+        Route("/{secret}/tiles/{image:int}.dzi", guarded(answers.descriptor)),
+        Route(
+            "/{secret}/tiles/{image:int}_files/{level:int}/{column:int}_{row:int}.jpg", guarded(answers.tile)
+        ),
+        Route("/{secret}/fit/{image:int}/{point:path}.png", guarded(answers.fit)),
+        Route("/{secret}/report/{path:path}", guarded(answers.report)),
+        Route("/{secret}/{change:str}", guarded(answers.change), methods=["POST"]),
     ]
     made = Starlette(routes=routes, exception_handlers={404: _not_there, 405: _not_there, 500: _failed})
     made.router.redirect_slashes = False  # it would answer before the secret is compared
     return made
-
-
-def _only(
-    answer: Callable[[Request], Awaitable[Response]], names: Mapping[str, object]
-) -> Callable[[Request], Awaitable[Response]]:
-    async def known(request: Request) -> Response:
-        return await answer(request) if request.path_params["file"] in names else _refused(404)
-
-    return known
 
 
 def _json(content: dict[str, Any], status: int = 200) -> JSONResponse:

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm.files.plain_text import is_name, or_none
-from sfm.model.errors import KolinearError, PhotographError
+from sfm.model.display import counted
+from sfm.model.errors import GeometryError, KolinearError, PhotographError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.products.marking.automatic import AutomaticRun, Run
@@ -28,18 +30,18 @@ from sfm.products.marking.following import (
     Following,
     Proposal,
     automatic_image_points,
+    bars_of,
     follow,
     marks_needed,
     match_single,
     propose,
-    scale_bars,
     sentence_of,
     stated_points,
     template_of,
     without_moved,
 )
-from sfm.products.marking.guidance import Guide
-from sfm.products.marking.marks import SavedMarks
+from sfm.products.marking.guidance import SAME_PX, Guide
+from sfm.products.marking.marks import Change, SavedMarks
 from sfm.products.marking.pixels import PhotographPixels
 from sfm.products.marking.project import MarkedProject
 from sfm.survey.inputs.given_values import ScaleBar
@@ -48,6 +50,10 @@ from sfm.survey.measuring.measured_store import content_hash
 
 HAND_SIGMA_PX = 1.0  # of a place that a person states without measuring
 WAIT_S = 25.0  # for which a page waits for a newer state
+MOST_WAITING = 3  # pages that wait at a time: a browser opens six connections, and clicks need some
+
+
+LATER = "what is proposed there came later than what the page shows: look at it, then decide"
 
 
 class MarkError(KolinearError):
@@ -74,9 +80,10 @@ class MarkingSession:
         self._changed = threading.Condition(threading.RLock())
         self._version = 1
         self._closed = False
-        self._fits: dict[tuple[str, str], Measured] = {}
-        self._hashes: dict[str, str] = {}
-        self._changed_files: dict[str, str] = {}
+        self._turns, self._waiting = count(), list[int]()  # requests that wait for a newer state
+        self._fits: dict[tuple[str, float, float], Measured | None] = {}  # by photograph and place
+        self._new: set[Mark] = set()  # marks of this session
+        self._hashes: dict[str, str] = {}  # of photographs, as they are now
         self._run: Run | None = None
         self._running: AutomaticRun | None = None
         self._evidence = PictureEvidence(
@@ -85,6 +92,7 @@ class MarkingSession:
         self._automatic = {(row.photograph, row.point): row for row in automatic_image_points(project)}
         self._following: Following | None = None
         self._proposals: dict[tuple[str, str], Proposal] = {}
+        self._since: dict[tuple[str, str], int] = {}  # version of the state that showed a proposal first
         self._changes = 1  # of the marks, since the beginning
         self._followed = 0  # changes that the orientation follows
         self._failed = ""  # why the orientation failed
@@ -97,13 +105,24 @@ class MarkingSession:
     def state(self, after: int | None = None, *, wait_s: float = WAIT_S) -> dict[str, Any]:
         """Return the state; with `after`, wait for a newer one.
 
+        Where many requests wait, the oldest is answered.
+
         Args:
             after: a version; None not to wait.
             wait_s: longest time to wait, s.
         """
         with self._changed:
             if after is not None:
-                self._changed.wait_for(lambda: self._version > after or self._closed, wait_s)
+                turn = next(self._turns)
+                self._waiting.append(turn)
+                self._changed.notify_all()
+                self._changed.wait_for(
+                    lambda: (
+                        self._version > after or self._closed or turn not in self._waiting[-MOST_WAITING:]
+                    ),
+                    wait_s,
+                )
+                self._waiting.remove(turn)
             return self._state()
 
     def fit_picture(self, image: int, point: str) -> bytes | None:
@@ -111,16 +130,13 @@ class MarkingSession:
         name = self._photograph(image)
         with self._changed:
             mark = self._marking.marks.get((name, point))
-            row = self._automatic.get((name, point))
-            fit = self._fits.get((name, point))
-        if mark is not None:
-            x, y = mark.x, mark.y
-        elif row is not None:
-            x, y = row.xy
-        else:
+            if mark is None and (name, point) in self._automatic:
+                mark = self._mark_of_automatic((name, point))
+        if mark is None:
             return None
-        outline = fit.outline if fit is not None and (fit.x, fit.y) == (x, y) else np.zeros((0, 2))
-        return picture_of_mark(self.pixels.grey(image), x, y, outline)
+        fit = self._fit(mark)
+        outline = np.zeros((0, 2)) if fit is None else fit.outline
+        return picture_of_mark(self.pixels.grey(image), mark.x, mark.y, outline)
 
     # --- changes -----------------------------------------------------------------------------------
 
@@ -133,6 +149,7 @@ class MarkingSession:
         point: str | None = None,
         kind: Kind | None = None,
         sigma_px: float | None = None,
+        page: str = "",
     ) -> dict[str, Any]:
         """Measure at a click and save the mark.
 
@@ -143,9 +160,11 @@ class MarkingSession:
             point: name of the point; None for a new one.
             kind: what to measure; None for what fits; "hand" for the click itself.
             sigma_px: standard deviation of a click that is not measured, px.
+            page: the page that asks, as in all changes.
 
         Raises:
-            KolinearError: nothing can be measured there, or the point cannot have that name.
+            KolinearError: nothing can be measured there, it is another ring than at the other marks of the
+                point, or the point cannot have that name.
         """
         name = self._photograph(image)
         if kind is not None and kind not in KINDS:
@@ -160,6 +179,7 @@ class MarkingSession:
             measured = Measured(x, y, sigma**2 * np.eye(2), "hand", np.zeros((0, 2)))
         else:
             measured = self._measure(image, x, y, point, kind)
+            self._refuse_other_ring(name, point, measured)
         with self._changed:
             marking = self._marking
             if point is None:
@@ -167,31 +187,56 @@ class MarkingSession:
             elif not is_name(point):
                 raise MarkError("a name of plain text is needed for the point")
             mark = self._mark_of(name, point, measured)
-            self._fits[mark.key] = measured
             self._latest = point
-            self._change(self._with_hash(marking.with_mark(mark), image))
+            again = " again" if mark.key in marking.marks else ""
+            self._change(
+                self._with_marks(marking, [(mark, measured)]), f"{point} marked in {name}{again}", page
+            )
             return {"mark": self._shown_mark(mark), "note": measured.note, "state": self._state()}
 
-    def accept(self, image: int | None = None, point: str | None = None) -> dict[str, Any]:
-        """Turn measured proposals into marks: one, all of a point, or all."""
-        with self._changed:
-            chosen = self._chosen(image, point)
-            measured = {key: proposal.measured for key, proposal in chosen.items() if proposal.measured}
-            if not measured:
-                raise MarkError("nothing was measured there: click it")
-            marking = self._marking
-            for (photograph, name), fit in measured.items():
-                self._fits[photograph, name] = fit
-                marking = self._with_hash(
-                    marking.with_mark(self._mark_of(photograph, name, fit)), self._index[photograph]
-                )
-            self._change(marking)
-            return self._state()
+    def accept(
+        self, image: int | None = None, point: str | None = None, *, seen: int | None = None, page: str = ""
+    ) -> dict[str, Any]:
+        """Turn measured proposals into marks: one, all of a point, or all.
 
-    def refuse(self, image: int | None = None, point: str | None = None) -> dict[str, Any]:
+        Args:
+            image: number of the photograph; None for all.
+            point: name of the point; None for all.
+            seen: version of the state that the page shows; what is proposed since then stays proposed.
+            page: the page that asks.
+
+        Returns:
+            The number of new marks, and the state.
+        """
+        with self._changed:
+            chosen, later = self._chosen(image, point, seen)
+            new = [
+                (self._mark_of(*key, proposal.measured), proposal.measured)
+                for key, proposal in chosen.items()
+                if proposal.measured is not None
+            ]
+            if not new:
+                raise MarkError(LATER if later else "nothing was measured there: click it")
+            self._change(
+                self._with_marks(self._marking, new), f"{_told([mark for mark, _ in new])} accepted", page
+            )
+            return {"count": len(new), "state": self._state()}
+
+    def refuse(
+        self, image: int | None = None, point: str | None = None, *, seen: int | None = None, page: str = ""
+    ) -> dict[str, Any]:
         """Refuse proposals: one, all of a point, or all; they are not proposed again.
 
         An image point that was measured automatically is refused too, by its photograph and point.
+
+        Args:
+            image: number of the photograph; None for all.
+            point: name of the point; None for all.
+            seen: version of the state that the page shows; what is proposed since then stays proposed.
+            page: the page that asks.
+
+        Returns:
+            The number of refused places, and the state.
         """
         with self._changed:
             refused: list[Mark] = []
@@ -200,31 +245,27 @@ class MarkingSession:
                 if key in self._automatic and key not in self._marking.marks:
                     refused.append(self._mark_of_automatic(key))
             if not refused:
-                for (photograph, name), proposal in self._chosen(image, point).items():
-                    place = proposal.measured or Measured(
-                        float(proposal.predicted.xy[0]),
-                        float(proposal.predicted.xy[1]),
-                        np.eye(2),
-                        "hand",
-                        np.zeros((0, 2)),
-                    )
-                    refused.append(self._mark_of(photograph, name, place))
-            if not refused:
-                raise MarkError("nothing is proposed there")
+                chosen, later = self._chosen(image, point, seen)
+                for key, proposal in chosen.items():
+                    x, y = proposal.xy.tolist()
+                    place = proposal.measured or Measured(x, y, np.eye(2), "hand", np.zeros((0, 2)))
+                    refused.append(self._mark_of(*key, place))
+                if not refused:
+                    raise MarkError(LATER if later else "nothing is proposed there")
             marking = self._marking
             for mark in refused:
                 marking = marking.with_refused(mark)
-            self._change(marking)
-            return self._state()
+            self._change(marking, f"{_told(refused)} refused", page)
+            return {"count": len(refused), "state": self._state()}
 
-    def _chosen(self, image: int | None, point: str | None) -> dict[tuple[str, str], Proposal]:
-        """Return the proposals of a photograph and point, of a point, or all."""
+    def _chosen(
+        self, image: int | None, point: str | None, seen: int | None
+    ) -> tuple[dict[tuple[str, str], Proposal], int]:
+        """Return the proposals of a photograph and point, of a point, or all, and how many came later."""
         photograph = None if image is None else self._photograph(image)
-        return {
-            key: proposal
-            for key, proposal in self._proposals.items()
-            if photograph in (None, key[0]) and point in (None, key[1])
-        }
+        meant = [key for key in self._proposals if photograph in (None, key[0]) and point in (None, key[1])]
+        shown = [key for key in meant if seen is None or self._since[key] <= seen]
+        return {key: self._proposals[key] for key in shown}, len(meant) - len(shown)
 
     def sight(self, image: int, x: float, y: float) -> list[dict[str, Any]]:
         """Return the ray of sight through a place of a photograph, in all other oriented photographs."""
@@ -239,7 +280,7 @@ class MarkingSession:
     def _guide(self) -> Guide | None:
         return None if self._following is None else self._following.guide
 
-    def delete(self, point: str, image: int | None = None) -> dict[str, Any]:
+    def delete(self, point: str, image: int | None = None, *, page: str = "") -> dict[str, Any]:
         """Delete the mark of a point in a photograph, or all of the point."""
         with self._changed:
             name = None if image is None else self._photograph(image)
@@ -254,10 +295,10 @@ class MarkingSession:
             for key in self._automatic if name is None else ():
                 if key in keys:
                     marking = marking.with_refused(self._mark_of_automatic(key))
-            self._change(marking)
+            self._change(marking, f"{point} deleted{f' in {name}' if name else ''}", page)
             return self._state()
 
-    def rename(self, point: str, name: str) -> dict[str, Any]:
+    def rename(self, point: str, name: str, *, page: str = "") -> dict[str, Any]:
         """Rename a point; with the name of another point, both become one."""
         with self._changed:
             marking = self._marking
@@ -278,47 +319,84 @@ class MarkingSession:
                 raise MarkError(f"'{name}' has stated coordinates already")
             if any({bar.start, bar.end} == {point, name} for bar in marking.bars.values()):
                 raise MarkError(f"a scale bar is between '{point}' and '{name}', which are two points")
-            for key in automatic:  # the new name is a mark, and the old one is left out
-                if key not in marking.marks:
-                    mark = self._mark_of_automatic(key)
-                    marking = self._with_hash(marking.with_mark(mark), self._index[key[0]])
+            # of what was measured automatically the new name is a mark, and the old one is left out
+            new = [self._mark_of_automatic(key) for key in automatic if key not in marking.marks]
+            marking = self._with_marks(marking, [(mark, None) for mark in new])
             renamed = marking.renamed(point, name, self._automatic.keys())
             for key in automatic:
                 old = marking.marks[key]
                 renamed = replace(renamed, refused={**renamed.refused, key: replace(old, state="refused")})
-            self._fits |= {(photo, name): fit for (photo, old), fit in self._fits.items() if old == point}
-            self._change(renamed)
+            self._change(renamed, f"{point} renamed {name}", page)
             return self._state()
 
-    def set_control(self, point: str, stated: StatedPoint | None) -> dict[str, Any]:
+    def set_control(self, point: str, stated: StatedPoint | None, *, page: str = "") -> dict[str, Any]:
         """State the coordinates of a point, or no longer state them."""
         with self._changed:
             if not is_name(point):
                 raise MarkError("a name of plain text is needed for the point")
+            if stated is None and point not in self._marking.control:
+                raise MarkError(f"the page states no coordinates of '{point}'; those of the survey stay")
             control = {name: known for name, known in self._marking.control.items() if name != point}
             if stated is not None:
                 control[point] = stated
             marking = replace(self._marking, control=control)
             marking.known_points()  # refuses what cannot be
-            self._change(marking)
+            self._change(
+                marking, f"coordinates of {point} {'stated' if stated else 'no longer stated'}", page
+            )
             return self._state()
 
-    def set_bar(self, start: str, end: str, bar: ScaleBar | None) -> dict[str, Any]:
+    def set_bar(self, start: str, end: str, bar: ScaleBar | None, *, page: str = "") -> dict[str, Any]:
         """State the distance of two points, or no longer state it."""
         with self._changed:
             if start == end or not (is_name(start) and is_name(end)):
                 raise MarkError("a scale bar needs two points")
-            kept = {key: old for key, old in self._marking.bars.items() if set(key) != {start, end}}
-            self._change(replace(self._marking, bars=kept if bar is None else {**kept, (start, end): bar}))
+            own = self._marking.bars
+            kept = {key: old for key, old in own.items() if set(key) != {start, end}}
+            if bar is None and len(kept) == len(own):
+                raise MarkError(f"the page states no bar {start} - {end}; one of the survey stays")
+            self._change(
+                replace(self._marking, bars=kept if bar is None else {**kept, (start, end): bar}),
+                f"bar {start} - {end} {'deleted' if bar is None else 'stated'}",
+                page,
+            )
             return self._state()
 
-    def undo(self) -> dict[str, Any]:
-        """Undo the last change."""
-        return self._step(self._saved.undo)
+    def undo(self, number: int | None = None, *, page: str = "", anyway: bool = False) -> dict[str, Any]:
+        """Undo the last change.
 
-    def redo(self) -> dict[str, Any]:
-        """Make the last undone change again."""
-        return self._step(self._saved.redo)
+        Args:
+            number: number of the change that the page shows as the last one; None for whatever is the last.
+            page: the page that asks.
+            anyway: whether it may be a change that another page made.
+
+        Raises:
+            MarkError: it is another change, or one of another page; or there is none.
+        """
+        return self._step(lambda: self._saved.last, self._saved.undo, number, None if anyway else page)
+
+    def redo(self, number: int | None = None, *, page: str = "", anyway: bool = False) -> dict[str, Any]:
+        """Make the change again that was undone last, as `undo`."""
+        return self._step(lambda: self._saved.last_undone, self._saved.redo, number, None if anyway else page)
+
+    def _step(
+        self,
+        last: Callable[[], Change | None],
+        step: Callable[[], None],
+        number: int | None,
+        page: str | None,
+    ) -> dict[str, Any]:
+        with self._changed:
+            before, change = self._marking, last()
+            if change is None:
+                raise MarkError("there is no such change any more")
+            if number not in (None, change.number):
+                raise MarkError(f"in between something else was changed: {change.what}; look at it first")
+            if page not in (None, change.page):
+                raise MarkError(f"another page made this change: {change.what}")
+            step()
+            self._follow(before)
+            return self._state()
 
     def add(self, other: Marking) -> int:
         """Add marks and control of another program; own ones stay.
@@ -328,11 +406,10 @@ class MarkingSession:
         """
         with self._changed:
             marking = self._marking
-            new = {key: mark for key, mark in other.marks.items() if key not in marking.marks}
-            for photograph in dict.fromkeys(photograph for photograph, _ in new):
-                marking = self._with_hash(marking, self._index[photograph])
+            new = [(mark, None) for key, mark in other.marks.items() if key not in marking.marks]
+            marking = self._with_marks(marking, new)
             control = {**other.control, **marking.control}
-            self._change(replace(marking, marks={**marking.marks, **new}, control=control))
+            self._change(replace(marking, control=control), f"{counted(len(new), 'mark')} added", "")
             return len(new)
 
     def exported(self) -> tuple[Network, Estimate]:
@@ -405,8 +482,12 @@ class MarkingSession:
 
     def _measure(self, image: int, x: float, y: float, point: str | None, kind: Kind | None) -> Measured:
         """Measure at a click, first what the point is in other photographs."""
-        pixels = self.pixels.grey(image)
         family, name = self.project.survey.family, self._photograph(image)
+        if kind == "ring" and family is None:
+            raise MarkError(
+                "the survey names no family of codes: mark the ring as target, and name the point"
+            )
+        pixels = self.pixels.grey(image)
         with self._changed:
             marks = [
                 mark
@@ -427,23 +508,50 @@ class MarkingSession:
             usual = "target"
         return measure_click(pixels, x, y, kind or usual, family=family)
 
+    def _refuse_other_ring(self, photograph: str, point: str | None, measured: Measured) -> None:
+        """Raise MarkError if a ring has another code than at the other marks of its point."""
+        with self._changed:
+            marks = [m for m in self._marking.marks.values() if m.point == point and m.kind == "ring"]
+        for mark in marks if measured.code is not None else ():
+            fit = self._fit(mark) if mark.photograph != photograph else None
+            if fit is not None and fit.code not in (None, measured.code):
+                raise MarkError(
+                    f"this is ring {measured.code}, but '{point}' is ring {fit.code} in {mark.photograph}"
+                )
+
+    def _fit(self, mark: Mark) -> Measured | None:
+        """Return what was measured at a mark, or is measured there again; None where that is not possible."""
+        place = mark.photograph, mark.x, mark.y
+        if place not in self._fits:
+            self._fits[place] = self._measured_again(mark)
+        return self._fits[place]
+
+    def _measured_again(self, mark: Mark) -> Measured | None:
+        if mark.photograph not in self._index or mark.kind in ("window", "hand"):
+            return None
+        kind: Kind = "target" if mark.kind == "ring" else mark.kind
+        family = self.project.survey.family
+        try:
+            pixels = self.pixels.grey(self._index[mark.photograph])
+            fit = measure_click(pixels, mark.x, mark.y, kind, family=family)
+        except (GeometryError, PhotographError):
+            return None
+        return fit if np.hypot(fit.x - mark.x, fit.y - mark.y) <= SAME_PX else None
+
     def _new_name(self, marking: Marking, photograph: str, measured: Measured) -> str:
         """Return the code of a ring, or the next free name."""
         if measured.code is not None and (photograph, str(measured.code)) not in marking.marks:
             return str(measured.code)
-        taken = {*marking.points, *marking.control, *self._given_names()}
+        control, solution = self.project.control, self.project.solution
+        taken = {*marking.points, *marking.control, *(() if control is None else control.names)}
+        taken |= set(() if solution is None else solution.network.points)
         taken |= {point for _, point in (*marking.refused, *self._automatic)}
-        taken |= {end for bar in scale_bars(self.project, marking) for end in (bar.start, bar.end)}
+        taken |= {end for bar in bars_of(self.project, marking) for end in (bar.start, bar.end)}
         taken |= {named.name for named in self.project.survey.marks}
         number = 1
         while f"P{number}" in taken:
             number += 1
         return f"P{number}"
-
-    def _given_names(self) -> set[str]:
-        control, solution = self.project.control, self.project.solution
-        names = set(() if control is None else control.names)
-        return names | set(() if solution is None else solution.network.points)
 
     def _mark_of(self, photograph: str, point: str, measured: Measured) -> Mark:
         C = measured.covariance
@@ -464,27 +572,43 @@ class MarkingSession:
         row = self._automatic[key]
         return self._mark_of(*key, Measured(*row.xy, row.covariance, "target", np.zeros((0, 2))))
 
-    def _with_hash(self, marking: Marking, image: int) -> Marking:
-        name = self.project.photographs.names[image]
-        if name in marking.hashes and any(photograph == name for photograph, _ in marking.marks):
-            return marking  # the marks that are there were made in that file
-        if name not in self._hashes:
-            self._hashes[name] = content_hash(self.project.photographs.paths[image])
-        return replace(marking, hashes={**marking.hashes, name: self._hashes[name] or ""})
+    def _with_marks(self, marking: Marking, new: Iterable[tuple[Mark, Measured | None]]) -> Marking:
+        """Return the marking with new marks and what was measured there, and the hashes of their photographs.
 
-    def _step(self, step: Callable[[], bool]) -> dict[str, Any]:
-        with self._changed:
-            before = self._marking
-            if step():
-                self._follow(before)
-            return self._state()
+        A hash stays that of the file in which older marks of the photograph were measured.
+        """
+        changed = dict[str, None]()
+        for mark, measured in new:
+            if measured is not None:
+                self._fits[mark.photograph, mark.x, mark.y] = measured
+            marking = marking.with_mark(mark)
+            self._new.add(mark)
+            changed[mark.photograph] = None
+        older = {mark.photograph for mark in marking.marks.values() if mark not in self._new}
+        hashes = {name: self._hash(name) for name in changed if name not in older & marking.hashes.keys()}
+        return replace(marking, hashes={**marking.hashes, **hashes})
 
-    def _change(self, marking: Marking) -> None:
+    def _hash(self, photograph: str) -> str:
+        """Return the hash of a photograph, as it was when the session first asked for it."""
+        if photograph not in self._hashes:
+            self._hashes[photograph] = content_hash(self.project.photographs.paths[self._index[photograph]])
+        return self._hashes[photograph]
+
+    def _change(self, marking: Marking, what: str, page: str) -> None:
         if self._closed:
             raise MarkError("the page has been ended; nothing was saved")
         before = self._marking
-        self._saved.change(marking)
+        self._saved.change(marking, what, page)
         self._follow(before)
+
+    def _show(self, proposals: dict[tuple[str, str], Proposal]) -> None:
+        """Show proposals in the state of this version; those that are where they were keep theirs."""
+        shown = self._proposals
+        self._since = {
+            key: self._since[key] if key in shown and proposal.is_as(shown[key]) else self._version
+            for key, proposal in proposals.items()
+        }
+        self._proposals = proposals
 
     def _follow(self, before: Marking) -> None:
         """Let what is known at once follow from a change, and the rest in the background.
@@ -495,7 +619,7 @@ class MarkingSession:
         self._version += 1
         self._changes += 1
         gone = marking.marks.keys() | marking.refused.keys()
-        self._proposals = {key: old for key, old in self._proposals.items() if key not in gone}
+        self._show({key: old for key, old in self._proposals.items() if key not in gone})
         changed = {
             key[1]
             for new, old in ((marking.marks, before.marks), (marking.refused, before.refused))
@@ -524,8 +648,8 @@ class MarkingSession:
         following = replace(following, estimate=replace(following.estimate, points=points))
         kept = {key: old for key, old in self._proposals.items() if key[1] not in changed}
         with suppress(KolinearError):
-            new = propose(following, self._marking, self.pixels.grey, self.project, self._fits, changed)
-            self._proposals = {**kept, **new}
+            new = propose(following, self._marking, self.pixels.grey, self.project, self._fit, changed)
+            self._show({**kept, **new})
 
     def _follow_changes(self) -> None:
         """Compute what follows from the marks whenever they changed, until the session ends."""
@@ -536,13 +660,13 @@ class MarkingSession:
                 if self._closed:
                     return
                 changes, marking, last = self._changes, self._marking, self._following
-                fits, known = dict(self._fits), dict(self._proposals)
-                latest = self._latest
+                known, latest = dict(self._proposals), self._latest
             following: Following | None
             try:
                 following = follow(self.project, marking, self._evidence, last)
-                proposals = propose(following, marking, self.pixels.grey, self.project, fits, known=known)
-                proposals |= match_single(following, latest, marking, self.pixels.grey, self.project, fits)
+                read, fit = self.pixels.grey, self._fit
+                proposals = propose(following, marking, read, self.project, fit, known=known)
+                proposals |= match_single(following, latest, marking, read, self.project, fit)
                 proposals = {**_of_single_marks(known, marking), **proposals}
                 failed = ""
             except KolinearError as error:
@@ -556,11 +680,12 @@ class MarkingSession:
                 )
             with self._changed:
                 self._followed, self._failed = changes, failed
+                self._version += 1
                 if changes == self._changes:
-                    self._following, self._proposals = following, proposals
+                    self._following = following
+                    self._show(proposals)
                 elif following is not None:
                     self._following = following  # the next round continues it
-                self._version += 1
                 self._changed.notify_all()
             self._read_ahead()
 
@@ -580,13 +705,9 @@ class MarkingSession:
 
     def _look_for_changed_files(self) -> None:
         """Compare the photographs that have marks with their hashes in the marks file."""
-        for name, stated in self._saved.now.hashes.items():
-            if name not in self._index:
-                continue
-            path = self.project.photographs.paths[self._index[name]]
+        for name in self._saved.now.hashes.keys() & self._index.keys():
             with suppress(PhotographError, OSError):
-                if content_hash(path) != stated:
-                    self._changed_files[name] = "changed since it was marked: check its marks"
+                self._hash(name)
 
     # --- the state ---------------------------------------------------------------------------------
 
@@ -602,16 +723,18 @@ class MarkingSession:
             "version": self._version,
             "name": project.survey.name,
             "unit": project.survey.unit,
+            "scaled": self._following is not None and self._following.orientation.frame != "model",
+            "codes": project.survey.family is not None,
             "photographs": self._shown_photographs(marks),
             "points": self._shown_points(marks),
             "marks": marks,
             "proposals": [self._shown_proposal(key, proposal) for key, proposal in self._proposals.items()],
             "lines": self._shown_lines(marks),
-            "bars": [self._shown_bar(bar) for bar in scale_bars(project, marking)],
+            "bars": [self._shown_bar(bar) for bar in bars_of(project, marking)],
             "adjustment": self._shown_adjustment(),
             "next": self._next_sentence(),
-            "can_undo": self._saved.can_undo,
-            "can_redo": self._saved.can_redo,
+            "undo": _shown_change(self._saved.last),
+            "redo": _shown_change(self._saved.last_undone),
             "saved": str(self._saved.path),
             "run": None if self._run is None else vars(self._run),
         }
@@ -628,9 +751,9 @@ class MarkingSession:
 
     def _shown_photographs(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
         project, following = self.project, self._following
-        count = np.bincount([mark["image"] for mark in marks], minlength=len(project.sizes))
+        number = np.bincount([mark["image"] for mark in marks], minlength=len(project.sizes))
         oriented = np.zeros(len(project.sizes), dtype=bool)
-        needs = np.maximum(3 - count, 1)
+        needs = np.maximum(3 - number, 1)
         if following is not None:
             oriented, needs = following.estimate.oriented, marks_needed(following)[0]
         return [
@@ -640,12 +763,17 @@ class MarkingSession:
                 "width": project.sizes[i][0],
                 "height": project.sizes[i][1],
                 "oriented": bool(oriented[i]),
-                "marks": int(count[i]),
+                "marks": int(number[i]),
                 "needs": int(needs[i]),
-                "changed": self._changed_files.get(name),
+                "changed": self._what_changed(name),
             }
             for i, name in enumerate(project.photographs.names)
         ]
+
+    def _what_changed(self, photograph: str) -> str | None:
+        marked, now = self._marking.hashes.get(photograph), self._hashes.get(photograph)
+        changed = marked and now and marked != now
+        return "changed since it was marked: measure its marks again" if changed else None
 
     def _shown_points(self, marks: list[dict[str, Any]]) -> list[dict[str, Any]]:
         following, control = self._following, stated_points(self.project, self._marking)
@@ -675,7 +803,13 @@ class MarkingSession:
                     "sigma": sigma,
                     "rays": rays.get(name, 0),
                     "control": (
-                        None if stated is None else {"X": list(stated.xyz), "sigma": list(stated.sigma)}
+                        None
+                        if stated is None
+                        else {
+                            "X": list(stated.xyz),
+                            "sigma": list(stated.sigma),
+                            "given": name not in self._marking.control,
+                        }
                     ),
                     "automatic": name not in by_hand,
                 }
@@ -722,7 +856,7 @@ class MarkingSession:
 
     def _shown_proposal(self, key: tuple[str, str], proposal: Proposal) -> dict[str, Any]:
         ellipse, measured = proposal.predicted.ellipse, proposal.measured
-        x, y = proposal.predicted.xy.tolist() if measured is None else (measured.x, measured.y)
+        x, y = proposal.xy.tolist()
         sigma = None if measured is None else np.sqrt(np.diagonal(measured.covariance)).tolist()
         return {
             "image": self._index[key[0]],
@@ -756,7 +890,8 @@ class MarkingSession:
         if following is not None and {bar.start, bar.end} <= following.marked.point.keys():
             a, b = (following.estimate.points[following.marked.point[name]] for name in (bar.start, bar.end))
             residual = or_none(float(np.linalg.norm(b - a)) - bar.length)
-        shown: dict[str, Any] = {"start": bar.start, "end": bar.end}
+        given = (bar.start, bar.end) not in self._marking.bars
+        shown: dict[str, Any] = {"start": bar.start, "end": bar.end, "given": given}
         return {**shown, "length": bar.length, "sigma": bar.sigma, "residual": residual}
 
     def _shown_adjustment(self) -> dict[str, Any]:
@@ -789,6 +924,18 @@ class MarkingSession:
                 f"{a.sigma0_px:.2f} px, redundancy {a.redundancy}."
             )
         return shown
+
+
+def _told(marks: list[Mark]) -> str:
+    """Return which places were accepted or refused, for the history."""
+    if len(marks) == 1:
+        return f"{marks[0].point} in {marks[0].photograph}"
+    points = {mark.point for mark in marks}
+    return f"{counted(len(marks), 'place')}{f' of {marks[0].point}' if len(points) == 1 else ''}"
+
+
+def _shown_change(change: Change | None) -> dict[str, Any] | None:
+    return None if change is None else vars(change)
 
 
 def _of_single_marks(

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from sfm.model.camera import project, tangents_from_pixel
-from sfm.model.conventions import FloatArray
+from sfm.model.camera import Camera, camera_from_values, project, tangents_from_pixel
+from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.distributions import chi2_isf
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, empty_estimate
 from sfm.orientation.relative import five_point_orientations
 from sfm.products.marking.adjusting import CONTAINED, MarkAdjustment, adjust_marks
-from sfm.products.marking.evidence import Pose
+from sfm.products.marking.evidence import PictureEvidence, Pose
+from sfm.products.marking.following import follow
 from sfm.products.marking.guidance import Guide
 from sfm.products.marking.orienting import HandOrientation, orient_by_hand
+from sfm.products.marking.project import MarkedProject
+from sfm.survey.inputs.given_values import KnownPoints
+from sfm.survey.inputs.marks_file import Mark, Marking
+from sfm.survey.inputs.measurements import PhotographList
+from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests.products.marking.photographs import LENS, network_of_points, seen_points, stations
 
 FALSE_ALARM = 0.05
@@ -31,6 +40,9 @@ class NoEvidence:
 
     def matches(self, i: int, j: int) -> tuple[FloatArray, FloatArray]:
         return np.zeros((0, 2)), np.zeros((0, 2))
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> NoEvidence:
+        return self
 
 
 class SeenEvidence(NoEvidence):
@@ -70,6 +82,15 @@ def close(estimate: Estimate, i: int, place: FloatArray, rotation: FloatArray) -
     return bool(cosine > np.cos(np.radians(2)) and np.linalg.norm(estimate.position[i] - place) < 0.1)
 
 
+def triple(rng: np.random.Generator, points: FloatArray) -> IntArray:
+    """Return three of the first ten points that are not on a line."""
+    while True:
+        chosen = rng.choice(10, 3, replace=False)
+        a, b, c = points[chosen]
+        if np.linalg.norm(np.cross(b - a, c - a)) > 0.5:
+            return np.asarray(chosen)
+
+
 def test_three_marks_of_known_points_orient_a_photograph_50_of_50() -> None:
     rng, oriented = np.random.default_rng(1), 0
     for _ in range(50):
@@ -77,20 +98,57 @@ def test_three_marks_of_known_points_orient_a_photograph_50_of_50() -> None:
         places, rotations = stations(rng, 2, around=1.6)
         xy = seen_points(places, rotations, points) + rng.normal(0, 0.1, (2, 30, 2))
         marked = np.zeros((2, 30), dtype=bool)
-        for i in range(2):  # three that are not on a line
-            while True:
-                chosen = rng.choice(10, 3, replace=False)
-                a, b, c = points[chosen]
-                if np.linalg.norm(np.cross(b - a, c - a)) > 0.5:
-                    break
-            marked[i, chosen] = True
+        for i in range(2):
+            marked[i, triple(rng, points)] = True
         network = network_of_points(xy, marked, 0.1).with_control(
             [f"p{j}" for j in range(10)], points[:10], 0.001
         )
         by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), SeenEvidence(xy))
-        assert by_hand.in_control
+        assert by_hand.frame == "control"
         oriented += all(close(by_hand.estimate, i, places[i], rotations[i]) for i in range(2))
     assert oriented == 50
+
+
+class Pictures(PictureEvidence):
+    """Photographs whose targets are known, and which show nothing that looks alike."""
+
+    def __init__(self, xy: FloatArray) -> None:
+        super().__init__(lambda i: np.zeros((0, 0)), [LENS] * len(xy))
+        self._targets = lambda i: xy[i]
+        self._alike = lambda i, j: (np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+def oriented_by_threes(rng: np.random.Generator, trials: int, c_sigma: float) -> tuple[int, int, int]:
+    """Return how many photographs of a lens that is not calibrated are right, open, and wrong in silence."""
+    right = left_open = silent = 0
+    for _ in range(trials):
+        c, K1 = 9.0 * (1 + c_sigma * rng.standard_normal()), 3e-4 * rng.uniform(-1, 1)
+        lens = camera_from_values("lens", "brown", LENS.size_px, (0.004, 0.004), c_mm=c, values=(("K1", K1),))
+        points = object_points(rng, 30)
+        places, rotations = stations(rng, 2, around=1.6)
+        xy = np.array([project(lens, X0, R, points) for X0, R in zip(places, rotations, strict=True)])
+        marked = np.zeros((2, 30), dtype=bool)
+        for i in range(2):
+            marked[i, triple(rng, points)] = True
+        network = network_of_points(xy + rng.normal(0, 0.1, xy.shape), marked, 0.1).with_control(
+            [f"p{j}" for j in range(10)], points[:10], 0.001
+        )
+        by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), Pictures(xy))
+        estimate = by_hand.estimate
+        for i in range(2):
+            turn = np.arccos(np.clip((np.trace(estimate.rotation[i].T @ rotations[i]) - 1) / 2, -1, 1))
+            away = np.linalg.norm(estimate.position[i] - places[i]) / np.linalg.norm(places[i])
+            ok = bool(turn < np.radians(8) and away < 0.15)
+            right += ok
+            left_open += i in by_hand.open and not ok
+            silent += i not in by_hand.open and not ok
+    return right, left_open, silent
+
+
+@pytest.mark.parametrize("c_sigma", [0.03, 0.1])
+def test_three_marks_orient_photographs_of_a_lens_that_is_not_calibrated(c_sigma: float) -> None:
+    right, left_open, silent = oriented_by_threes(np.random.default_rng(21), 40, c_sigma)
+    assert right >= 79 and silent <= 1 and right + left_open + silent == 80
 
 
 def relative_pose(places: FloatArray, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -142,6 +200,91 @@ def test_what_fits_several_orientations_says_so() -> None:
         assert by_hand.open or close(by_hand.estimate, 0, places[0], rotations[0])
         several += bool(by_hand.open)
     assert several
+
+
+def test_a_photograph_on_a_pair_is_right_or_left_open() -> None:
+    """Five common points of which two are known, and photographs that show nothing else."""
+    rng, right, left_open = np.random.default_rng(11), 0, 0
+    for _ in range(25):
+        points = object_points(rng, 10)
+        places, rotations = stations(rng, 3, around=1.6)
+        xy = seen_points(places, rotations, points) + rng.normal(0, 0.1, (3, 10, 2))
+        marked = np.zeros((3, 10), dtype=bool)
+        marked[:2, :4] = True  # of known points
+        marked[1:, [0, 1, 5, 6, 7]] = True  # common to the second photograph and the third
+        network = network_of_points(xy, marked, 0.1).with_control(
+            [f"p{j}" for j in range(4)], points[:4], 0.001
+        )
+        by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), NoEvidence())
+        is_right = by_hand.estimate.oriented[2] and close(by_hand.estimate, 2, places[2], rotations[2])
+        right += bool(is_right)
+        left_open += 2 in by_hand.open
+        assert is_right or 2 in by_hand.open
+        assert not (2 in by_hand.open and by_hand.estimate.oriented[2])  # nothing is built on it
+    assert left_open
+
+
+class Misleading(SeenEvidence):
+    """Photographs whose features seem to support the pose that is farthest from the right one."""
+
+    def __init__(self, xy: FloatArray, places: FloatArray) -> None:
+        super().__init__(xy)
+        self._places = places
+
+    def places(self, i: int, pose: Pose, points: FloatArray) -> float:
+        return 100 * float(np.linalg.norm(pose[0] - self._places[i]))
+
+    def support(self, i: int, j: int, first: Pose, second: Pose) -> float:
+        return self.places(i, first, np.zeros((0, 3))) + self.places(j, second, np.zeros((0, 3)))
+
+
+def test_a_wrong_orientation_is_left_when_further_marks_contradict_it(tmp_path: Path) -> None:
+    """Three marks fit several orientations, and the features led to a wrong one."""
+    rng, wrong = np.random.default_rng(12), 0
+    for trial in range(12):
+        points = object_points(rng, 8)
+        places, rotations = stations(rng, 3, around=1.6)
+        xy = seen_points(places, rotations, points) + rng.normal(0, 0.1, (3, 8, 2))
+        project = project_of_lens(tmp_path / str(trial), points)
+        evidence = Misleading(xy, places)
+        marking = Marking("lens")
+        for i, j in [(i, j) for i in (0, 1) for j in range(8)] + [(2, j) for j in range(3)]:
+            marking = marking.with_mark(mark_at(i, j, xy))
+        last = follow(project, marking, evidence)
+        was_right = close(last.estimate, 2, places[2], rotations[2])
+        wrong += not was_right
+        for j in range(3, 6):
+            marking = marking.with_mark(mark_at(2, j, xy))
+            last = follow(project, marking, evidence, last)
+        assert close(last.estimate, 2, places[2], rotations[2]), (trial, was_right)
+        worst = None if last.adjustment is None else last.adjustment.worst
+        assert worst is None or not worst.flagged
+    assert wrong > 3
+
+
+def mark_at(i: int, j: int, xy: FloatArray) -> Mark:
+    return Mark(f"i{i}.png", f"p{j}", *map(float, xy[i, j]), 0.01, 0.0, 0.01, "target", when="t")  # type: ignore[misc]
+
+
+def project_of_lens(folder: Path, points: FloatArray) -> MarkedProject:
+    """Return a project of three photographs by the lens, all points of which are control."""
+    folder.mkdir()
+    camera = CameraSetup(
+        name="lens",
+        images="i*.png",
+        size_px=LENS.size_px,
+        pixel_mm=(0.004, 0.004),
+        c_mm=LENS.value("c"),
+        model="brown",
+        free=("c",),
+    )
+    control = KnownPoints.from_arrays([f"p{j}" for j in range(8)], points, np.full((8, 3), 0.001))
+    survey = Survey(name="lens", cameras=(camera,), control=control, folder=folder)
+    files = tuple(folder / f"i{i}.png" for i in range(3))
+    photographs = PhotographList(
+        tuple(path.name for path in files), files, np.zeros(3, dtype=np.int64), folder
+    )
+    return MarkedProject(survey, photographs, (LENS.size_px,) * 3, (LENS,))
 
 
 def adjusted(network: Network, start: Estimate, *, in_control: bool) -> MarkAdjustment:
@@ -215,7 +358,7 @@ def spoiled(rng: np.random.Generator, *, neighbour: bool, control: bool) -> tupl
         network = network.with_control(["p0", "p1", "p2", "p3"], points[:4], 0.001)
     by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), NoEvidence())
     marks = adjust_marks(
-        network, by_hand.estimate, (LENS,), in_control=by_hand.in_control, false_alarm=FALSE_ALARM
+        network, by_hand.estimate, (LENS,), in_control=by_hand.frame == "control", false_alarm=FALSE_ALARM
     )
     worst = None if marks is None else marks.worst
     named = worst is not None and worst.flagged

@@ -96,7 +96,7 @@ def test_two_points_do_not_become_one(session: MarkingSession, given: tuple[Path
     with pytest.raises(MarkError, match=r"has a mark in i0\.png already"):
         session.rename("P3", "P2")
     session.rename("P3", "P3")
-    assert shown(session) == before and not session.state()["can_undo"]
+    assert shown(session) == before and session.state()["undo"] is None
     session.click(0, *given[1][0, 9], point="A")
     session.click(1, *given[1][1, 9], point="B")
     session.set_bar("A", "B", ScaleBar("A", "B", 1.0, 0.1))

@@ -176,7 +176,7 @@ def test_marks_are_renamed_measured_again_deleted_and_all_is_undone(discs: Marki
     assert [mark["point"] for mark in discs.state["marks"]] == ["P2"]
     for _ in range(5):
         discs.key("z")
-    assert discs.state["marks"] == [] and not discs.state["can_undo"]
+    assert discs.state["marks"] == [] and discs.state["undo"] is None
     discs.key("Shift+Z")
     assert [mark["point"] for mark in discs.state["marks"]] == ["P1"]
     assert [key[1] for key in read_marks(tmp_path / "marks.csv").marks] == ["P1"]
@@ -202,7 +202,7 @@ def test_control_and_bars_are_stated_in_forms(discs: Marking) -> None:
     page.keyboard.press("Enter")
     discs.tab.until("() => !document.querySelector('dialog')")
     point = next(p for p in discs.state["points"] if p["name"] == "P2")
-    assert point["control"] == {"X": [1.5, -2, 0.25], "sigma": [0.01] * 3}
+    assert point["control"] == {"X": [1.5, -2, 0.25], "sigma": [0.01] * 3, "given": False}
     discs.key("b")
     page.get_by_label("to point").fill("P1")
     page.get_by_label("length [mm]").fill("400.003")
@@ -229,6 +229,73 @@ def test_two_pages_keep_each_other_current(browser: Any, folder: Path, tmp_path:
         assert names == [["P1", "P2"], ["P1", "P2"]]
         for page in pages:
             page.close()
+
+
+def test_a_late_answer_does_not_choose_again_what_the_person_has_left(discs: Marking) -> None:
+    """A click that takes long, N, and a click on another feature: it is another point."""
+    page = discs.page
+    pane_of(discs, "photo 1.png")
+    page.locator(".m-pane select").nth(1).select_option(label="photo 2.png")
+    discs.ready()
+    held: list[Any] = []
+    page.route("**/click", lambda route: held.append(route) if not held else route.continue_())
+    places = page.evaluate(PLACE, [0, *DISCS[0]]), page.evaluate(PLACE, [1, *(DISCS[1] + SHIFT)])
+    page.mouse.click(*places[0])
+    page.keyboard.press("n")
+    page.keyboard.press("1")
+    page.wait_for_timeout(450)
+    page.mouse.click(*places[1])
+    page.keyboard.press("7")  # of the next click
+    page.keyboard.press("n")
+    page.wait_for_timeout(50)
+    held[0].continue_()
+    discs.settled()
+    marks = {(mark["image"], mark["point"], mark["kind"]) for mark in discs.state["marks"]}
+    assert {(point, kind) for _, point, kind in marks} == {("P1", "target"), ("P2", "target")}
+    assert len({image for image, _, _ in marks}) == 2
+    assert discs.chosen == "None"
+
+
+def test_z_undoes_what_another_page_did_only_at_the_second_time(
+    browser: Any, folder: Path, tmp_path: Path
+) -> None:
+    with served(folder / "survey.toml", tmp_path / "marks.csv") as server:
+        pages = [open_page(browser, server), open_page(browser, server)]
+        for page in pages:
+            pane_of(page, "photo 1.png")
+        pages[0].click(0, DISCS[0])
+        pages[1].tab.until(f"() => {PAGE}.model.state.marks.length === 1")
+        pages[1].key("z")
+        assert "Another page made the last change: P1 marked in photo 1.png." in pages[1].said()
+        assert len(pages[1].state["marks"]) == 1
+        pages[1].key("z")
+        assert pages[1].state["marks"] == [] and pages[1].said() == "Undone: P1 marked in photo 1.png."
+        for page in pages:
+            page.close()
+
+
+def test_a_page_that_nobody_sees_holds_no_connection(discs: Marking, folder: Path) -> None:
+    page = discs.page
+    page.evaluate(
+        "() => { Object.defineProperty(document, 'hidden', { configurable: true, get: () => true });"
+        " document.dispatchEvent(new Event('visibilitychange')) }"
+    )
+    page.wait_for_timeout(200)
+    asked = len(discs.tab.requests)
+    server = discs.page.evaluate("() => location.href")
+    pane_of(discs, "photo 1.png")
+    discs.click(0, DISCS[0])  # changes are sent and answered
+    assert len(discs.state["marks"]) == 1
+    page.wait_for_timeout(500)
+    assert not any("state" in url for url in discs.tab.requests[asked:]), server
+    page.evaluate(
+        "() => { Object.defineProperty(document, 'hidden', { configurable: true, get: () => false });"
+        " document.dispatchEvent(new Event('visibilitychange')) }"
+    )
+    discs.tab.until(f"() => {PAGE}.model.state.adjustment.state !== 'running'")
+    discs.page.wait_for_timeout(100)
+    assert any("state" in url for url in discs.tab.requests[asked:])
+    assert page.locator("#m-lost:visible").count() == 0
 
 
 def test_a_lost_program_is_told_and_the_click_is_made_when_it_answers(discs: Marking) -> None:

@@ -90,6 +90,10 @@ def click(served: Served, image: int, dot: int, point: str | None = None) -> dic
     return answer
 
 
+def last(served: Served, step: str) -> dict[str, Any]:
+    return {"number": served.state()[step]["number"]}
+
+
 def test_a_click_measures_saves_and_is_undone(served: Served) -> None:
     answer = click(served, 0, 4)
     mark = answer["mark"]
@@ -99,9 +103,9 @@ def test_a_click_measures_saves_and_is_undone(served: Served) -> None:
     assert [(row.photograph, row.point, row.x) for row in saved.marks.values()] == [
         ("i0.png", "P1", mark["x"])
     ]
-    assert json.loads(served.ask("undo", {})[1])["marks"] == []
+    assert json.loads(served.ask("undo", last(served, "undo"))[1])["marks"] == []
     assert read_marks(served.marks).marks == {}
-    assert len(json.loads(served.ask("redo", {})[1])["marks"]) == 1
+    assert len(json.loads(served.ask("redo", last(served, "redo"))[1])["marks"]) == 1
     assert served.ask("fit/0/P1.png")[1].startswith(b"\x89PNG")
     assert served.ask("delete", {"point": "P1"})[0] == 200
 
@@ -129,10 +133,12 @@ def test_five_dots_orient_two_photographs_and_the_others_are_proposed(served: Se
     assert (2, new) in proposed
     x, y = served.dots[2, 7]
     assert np.hypot(proposed[2, new]["x"] - x, proposed[2, new]["y"] - y) < 0.2
-    assert served.ask("refuse", {"image": 2, "point": new})[0] == 200
+    version = served.state()["version"]
+    assert served.ask("refuse", {"image": 2, "point": new, "version": version - 1})[0] == 422
+    assert served.ask("refuse", {"image": 2, "point": new, "version": version})[0] == 200
     assert (2, new) not in {(row["image"], row["point"]) for row in served.state()["proposals"]}
-    assert served.ask("undo", {})[0] == 200
-    assert served.ask("accept", {})[0] == 200
+    assert served.ask("undo", last(served, "undo"))[0] == 200
+    assert served.ask("accept", {"version": served.state()["version"]})[0] == 200
     assert any(row["image"] == 2 and row["point"] == new for row in served.state()["marks"])
     assert served.ask("rename", {"point": new, "name": names[0]})[0] == 422
     assert served.ask("rename", {"point": new, "name": "bolt"})[0] == 200

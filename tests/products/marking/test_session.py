@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.remarks.remark import of_kind
 from sfm.pipeline import run_survey
+from sfm.products.marking.clicks import Measured
 from sfm.products.marking.project import MarkedProject, project_of_folder, project_of_survey
-from sfm.products.marking.session import MarkError, MarkingSession
-from sfm.survey.inputs.marks_file import StatedPoint, read_marks
+from sfm.products.marking.session import MOST_WAITING, MarkError, MarkingSession
+from sfm.survey.inputs.given_values import ScaleBar
+from sfm.survey.inputs.marks_file import Kind, StatedPoint, read_marks
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from tests.products.marking.photographs import LENS, seen_points, stations
 
@@ -138,16 +142,199 @@ def test_everything_is_undone_and_made_again(session: MarkingSession, board: tup
     for change in changes:
         change()
         files.append(session._saved.path.read_bytes())
+    said = ["P1 marked in i0.png", "P1 marked in i1.png", "P2 marked in i1.png", "P1 renamed bolt"]
+    said += ["coordinates of bolt stated", "P2 deleted"]
     for before in (*files[-2::-1], None):
+        assert session.state()["undo"]["what"] == said.pop()
         session.undo()
         if before is not None:
             assert session._saved.path.read_bytes() == before
     assert read_marks(session._saved.path).marks == {}
-    assert not session.state()["can_undo"]
+    assert session.state()["undo"] is None
     for after in files:
         session.redo()
         assert session._saved.path.read_bytes() == after
-    assert not session.state()["can_redo"]
+    assert session.state()["redo"] is None
+
+
+def test_only_what_the_page_showed_is_accepted(
+    session: MarkingSession, board: tuple[Path, FloatArray]
+) -> None:
+    _, xy = board
+    orient(session, xy)
+    before = settled(session)["version"]
+    for i in (0, 1):
+        session.click(i, *xy[i, 2], point="P")
+    after = settled(session)
+    measured = [row for row in after["proposals"] if row["measured"] and row["point"] == "P"]
+    assert {row["image"] for row in measured} == {2, 3}
+    for decide in (session.accept, session.refuse):
+        with pytest.raises(MarkError, match="came later than what the page shows"):
+            decide(None, "P", seen=before)
+    answer = session.accept(2, "P", seen=after["version"])
+    assert answer["count"] == 1
+    assert session.accept(seen=after["version"])["count"] == 1  # what was seen and has not moved
+    assert {mark["image"] for mark in session.state()["marks"] if mark["point"] == "P"} == {0, 1, 2, 3}
+
+
+def test_another_page_undoes_a_change_only_when_it_says_so(
+    session: MarkingSession, board: tuple[Path, FloatArray]
+) -> None:
+    _, xy = board
+    session.click(0, *xy[0, 1], page="left")
+    first = session.state()["undo"]
+    assert (first["what"], first["page"]) == ("P1 marked in i0.png", "left")
+    with pytest.raises(MarkError, match=r"another page made this change: P1 marked in i0\.png"):
+        session.undo(first["number"], page="right")
+    session.click(0, *xy[0, 2], page="right")
+    for page in ("left", "right"):
+        with pytest.raises(MarkError, match=r"something else was changed: P2 marked in i0\.png"):
+            session.undo(first["number"], page=page)
+    assert session.undo(page="right")["undo"] == first
+    state = session.undo(first["number"], page="right", anyway=True)
+    assert state["marks"] == [] and state["undo"] is None
+    assert state["redo"] == first
+    with pytest.raises(MarkError, match="no such change"):
+        session.undo()
+
+
+def test_a_few_pages_wait_at_a_time_and_the_oldest_is_answered(session: MarkingSession) -> None:
+    version, answered = session.state()["version"], list[int]()
+
+    def wait(page: int) -> None:
+        session.state(version, wait_s=60)
+        answered.append(page)
+
+    pages = [threading.Thread(target=wait, args=(page,)) for page in range(MOST_WAITING + 2)]
+    for page in pages:
+        page.start()
+        time.sleep(0.2)
+    for page in pages[:2]:
+        page.join(10)
+    assert answered == [0, 1]
+    session.click(0, 10.0, 90.5, kind="hand")
+    for page in pages:
+        page.join(10)
+    assert len(answered) == len(pages)
+
+
+def test_values_of_the_survey_are_not_taken_back_by_the_page(tmp_path: Path) -> None:
+    write_board(tmp_path, 2)
+    (tmp_path / "control.csv").write_text(
+        "id,X,Y,Z,sX,sY,sZ\nA,0,0,0,0.01,0.01,0.01\nB,1,0,0,0.01,0.01,0.01\n", encoding="utf-8"
+    )
+    file = tmp_path / "with_control.toml"
+    bar = '[[scale_bar]]\nfrom = "A"\nto = "B"\nlength = 1.0\nsigma = 0.01\n'
+    file.write_text(f'{SURVEY}{bar}[control]\nfile = "control.csv"\n', encoding="utf-8")
+    session = MarkingSession(project_of_survey(read_survey(file), survey_file=file), tmp_path / "marks.csv")
+    state = session.state()
+    assert state["bars"][0]["given"] and all(point["control"]["given"] for point in state["points"])
+    with pytest.raises(MarkError, match="those of the survey stay"):
+        session.set_control("A", None)
+    with pytest.raises(MarkError, match="one of the survey stays"):
+        session.set_bar("B", "A", None)
+    assert session.state()["undo"] is None
+    session.set_control("A", StatedPoint((5.0, 0.0, 0.0), (0.01, 0.01, 0.01)))
+    assert not session.state()["points"][0]["control"]["given"]
+    assert session.set_control("A", None)["points"][0]["control"]["X"] == [0.0, 0.0, 0.0]
+    with pytest.raises(MarkError, match="no family of codes"):
+        session.click(0, 10.0, 10.0, kind="ring")
+    session.close()
+
+
+def test_a_length_has_a_unit_when_its_bar_is_marked(
+    session: MarkingSession, board: tuple[Path, FloatArray]
+) -> None:
+    _, xy = board
+    for j in range(8):
+        for i in (0, 1):
+            session.click(i, *xy[i, j], point=f"D{j}")
+    assert any(photograph["oriented"] for photograph in settled(session)["photographs"])
+    length = float(np.linalg.norm(BOARD[9] - BOARD[0]))
+    session.set_bar("D0", "D9", ScaleBar("D0", "D9", length, 0.0001))
+    assert not settled(session)["scaled"]
+    for i in (0, 1):  # its other end, after the photographs are oriented
+        session.click(i, *xy[i, 9], point="D9")
+    state = settled(session)
+    assert state["scaled"] and abs(state["bars"][0]["residual"]) < 1e-3
+    X = {point["name"]: np.array(point["X"]) for point in state["points"]}
+    assert np.linalg.norm(X["D6"] - X["D1"]) == pytest.approx(np.linalg.norm(BOARD[6] - BOARD[1]), rel=0.01)
+
+
+def test_another_ring_than_at_the_other_marks_is_refused(
+    session: MarkingSession, board: tuple[Path, FloatArray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    codes = {0: 12, 1: 15, 2: 12, 3: None}
+    image = {session.pixels.grey(i)[::50, ::50].tobytes(): i for i in range(4)}
+
+    def ring(photograph: AnyArray, x: float, y: float, kind: Kind | None = None, **_: object) -> Measured:
+        code = codes[image[photograph[::50, ::50].tobytes()]]
+        return Measured(x, y, 0.01 * np.eye(2), "target" if code is None else "ring", np.zeros((0, 2)), code)
+
+    monkeypatch.setattr("sfm.products.marking.session.measure_click", ring)
+    session.click(0, 50.0, 50.0, point="bolt")
+    session._fits.clear()  # as after a restart
+    with pytest.raises(MarkError, match=r"this is ring 15, but 'bolt' is ring 12 in i0\.png"):
+        session.click(1, 50.0, 50.0, point="bolt")
+    for i in (2, 3, 0):  # a code that is not read contradicts nothing, and a mark may be measured again
+        session.click(i, 50.0, 50.0, point="bolt")
+    assert {mark["image"] for mark in session.state()["marks"]} == {0, 2, 3}
+
+
+def test_no_neighbour_is_proposed_after_a_restart(tmp_path: Path) -> None:
+    """The dot of the point is gone in one photograph, and one of three times its size is there."""
+    xy = write_board(tmp_path, 4)
+    picture = cv2.imread(str(tmp_path / "i3.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.circle(picture, tuple(round(16 * float(v)) for v in xy[3, 2]), 16 * 18, 40, -1, cv2.LINE_AA, 4)
+    cv2.imwrite(str(tmp_path / "i3.png"), cv2.GaussianBlur(picture, (0, 0), 0.8))
+    pictures = []
+    for start in range(2):
+        session = MarkingSession(project_of(tmp_path), tmp_path / "marks.csv")
+        if not start:
+            orient(session, xy)
+            for i in (0, 1):
+                session.click(i, *xy[i, 2], point="P")
+        state = settled(session)
+        measured = {row["image"]: row["measured"] for row in state["proposals"] if row["point"] == "P"}
+        assert measured == {2: True, 3: False}
+        pictures.append(session.fit_picture(0, "P"))
+        session.close()
+    assert pictures[0] == pictures[1]  # they show what was fitted, as before
+
+
+def test_a_changed_photograph_is_told_until_all_its_marks_are_measured_again(tmp_path: Path) -> None:
+    xy = write_board(tmp_path, 4)
+    session = MarkingSession(project_of(tmp_path), tmp_path / "marks.csv")
+    for j in (1, 2):
+        session.click(0, *xy[0, j], point=f"D{j}")
+    session.close()
+    picture = cv2.imread(str(tmp_path / "i0.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "i0.png"), picture // 2 + 60)
+    session = MarkingSession(project_of(tmp_path), tmp_path / "marks.csv")
+    told = [settled(session)["photographs"][0]["changed"]]
+    for j in (1, 2):
+        session.click(0, *xy[0, j], point=f"D{j}")
+        told.append(session.state()["photographs"][0]["changed"])
+    assert told[0] and told[1] and told[2] is None
+    session.undo()
+    assert session.state()["photographs"][0]["changed"]
+    session.close()
+
+
+def test_a_run_tells_photographs_that_changed_since_they_were_marked(tmp_path: Path) -> None:
+    xy = write_board(tmp_path, 4)
+    session = MarkingSession(project_of(tmp_path), tmp_path / "marks.csv")
+    orient(session, xy)
+    session.close()
+    file = tmp_path / "marked.toml"
+    file.write_text(f'{SURVEY}[targets]\n[marks]\nfile = "marks.csv"\n', encoding="utf-8")
+    picture = cv2.imread(str(tmp_path / "i2.png"), cv2.IMREAD_GRAYSCALE)
+    for changed in (False, True):
+        if changed:
+            cv2.imwrite(str(tmp_path / "i2.png"), picture - picture // 20)
+        verdict = run_survey(read_survey(file)).verdict
+        said = of_kind(verdict.remarks, "photographs_changed")
+        assert [row.names("photographs") for row in said] == ([("i2.png",)] if changed else [])
 
 
 def test_by_hand_has_the_stated_sigma(session: MarkingSession) -> None:

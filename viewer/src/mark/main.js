@@ -98,8 +98,11 @@ class Page {
       pane.refresh()
     }
     this.strip.refresh(this.panes.map((pane) => pane.image), this.pane.image)
-    this.buttons.undo.disabled = !model.state.can_undo
-    this.buttons.redo.disabled = !model.state.can_redo
+    for (const [name, key] of [["undo", "Z"], ["redo", "Shift+Z"]]) {
+      const change = model.state[name]
+      this.buttons[name].disabled = !change
+      this.buttons[name].title = change ? `${key}: ${change.what}${change.page === this.server.page ? "" : ", made by another page"}` : key
+    }
     this.aim.textContent = model.chosen ?? "new point"
     this.buttons.fresh.setAttribute("aria-pressed", String(model.chosen === null))
     const measured = model.measured(model.state.proposals).length
@@ -134,7 +137,8 @@ class Page {
       all: act("Accept all", "Shift+Enter", () => this.acceptAll(), { className: "m-all" }),
     }
     this.aim = make("b", {})
-    const kinds = [["", "what fits (0)"], ...KINDS.map((kind, k) => [kind, `${kind === "hand" ? "by hand" : kind} (${k + 1})`])]
+    const known = KINDS.filter((kind) => kind !== "ring" || this.model.state.codes)
+    const kinds = [["", "what fits (0)"], ...known.map((kind) => [kind, `${kind === "hand" ? "by hand" : kind} (${KINDS.indexOf(kind) + 1})`])]
     this.kinds = choice("measured as", kinds, (kind) => this.setKind(kind || null), { value: "" })
     const sigma = make("input", { type: "number", min: 0.01, step: 0.1, value: this.model.sigma_px, className: "m-number" })
     sigma.addEventListener("change", () => {
@@ -191,6 +195,10 @@ class Page {
   }
 
   setKind(kind) {
+    if (kind === "ring" && !this.model.state.codes) {
+      this.kinds.querySelector("select").value = this.model.kind ?? ""
+      return this.say("The survey names no family of codes: mark rings as target, and name their points.", true)
+    }
     this.model.kind = kind
     this.kinds.querySelector("select").value = kind ?? ""
     this.sigma.hidden = kind !== "hand"
@@ -345,9 +353,10 @@ class Page {
     const { image } = pane
     pane.pending.push(place)
     pane.draw()
-    const body = () => ({ image, x: place[0], y: place[1], point: again ? model.chosen : model.pointFor(image), kind: model.kind, sigma_px: model.kind === "hand" ? model.sigma_px : null })
+    const { aim, kind, sigma_px } = model // of this click, whatever the person does until it is measured
+    const body = () => ({ image, x: place[0], y: place[1], point: again ? aim.point : model.pointFor(image, aim.point), kind, sigma_px: kind === "hand" ? sigma_px : null })
     await this.change("click", body, ({ mark, note }) => {
-      model.choose(mark.point)
+      model.hit(aim, mark.point)
       const sigma = significant(Math.max(...mark.sigma), 2)
       return `${mark.point} in ${model.photograph(image).name}: ${mark.kind}${mark.by === "hand" ? " by hand" : ""}, sigma ${sigma} px.${note ? ` ${note}` : ""}`
     })
@@ -378,7 +387,6 @@ class Page {
     return this.model.chosen !== null
   }
 
-
   chooseAt(pane, point) {
     this.model.choose(point)
     this.say(this.model.markOf(pane.image, point) ? `${point} is chosen.` : `${point} is proposed here: Enter accepts all its proposals, Y this one, X refuses it.`)
@@ -393,7 +401,7 @@ class Page {
     const point = this.model.chosen
     if (!this.hasChosen()) return
     const measured = this.model.measured(this.model.proposed.get(point) ?? [])
-    if (measured.length) this.change("accept", { point }, `${counted(measured.length, "proposal")} of ${point} accepted.`)
+    if (measured.length) this.change("accept", { point, version: this.server.version }, ({ count }) => `${counted(count, "proposal")} of ${point} accepted.`)
     else this.say(`Nothing measured is proposed for ${point}.`, true)
   }
 
@@ -401,13 +409,13 @@ class Page {
     const point = this.model.chosen
     const { image } = this.pane
     if (!this.hasChosen()) return
-    if (this.model.proposalOf(image, point)?.measured) this.change("accept", { image, point }, `Proposal of ${point} accepted here.`)
+    if (this.model.proposalOf(image, point)?.measured) this.change("accept", { image, point, version: this.server.version }, `Proposal of ${point} accepted here.`)
     else this.say(`Nothing measured is proposed for ${point} in this photograph: click it.`, true)
   }
 
   acceptAll() {
     const measured = this.model.measured(this.model.state.proposals)
-    if (measured.length) this.change("accept", {}, `${counted(measured.length, "proposal")} accepted.`)
+    if (measured.length) this.change("accept", { version: this.server.version }, ({ count }) => `${counted(count, "proposal")} accepted.`)
     else this.say("Nothing measured is proposed.", true)
   }
 
@@ -415,7 +423,7 @@ class Page {
     const point = this.model.chosen
     if (!this.hasChosen()) return
     const proposals = this.model.proposed.get(point) ?? []
-    if (proposals.length) this.change("refuse", { point }, `${counted(proposals.length, "proposal")} of ${point} refused.`)
+    if (proposals.length) this.change("refuse", { point, version: this.server.version }, ({ count }) => `${counted(count, "proposal")} of ${point} refused.`)
     else this.say(`${point} has no proposals.`, true)
   }
 
@@ -424,7 +432,7 @@ class Page {
     const { image } = this.pane
     if (!this.hasChosen()) return
     if (this.model.markOf(image, point)?.automatic) this.removeHere()
-    else if (this.model.proposalOf(image, point)) this.change("refuse", { image, point }, `Proposal of ${point} refused here.`)
+    else if (this.model.proposalOf(image, point)) this.change("refuse", { image, point, version: this.server.version }, `Proposal of ${point} refused here.`)
     else this.say(`${point} has no proposal in this photograph.`, true)
   }
 
@@ -433,7 +441,8 @@ class Page {
     const { image } = this.pane
     if (!this.hasChosen()) return
     const mark = this.model.markOf(image, point)
-    if (mark) this.change(mark.automatic ? "refuse" : "delete", { image, point }, `Mark of ${point} ${mark.automatic ? "refused" : "deleted"} here; Z undoes it.`)
+    if (mark?.automatic) this.change("refuse", { image, point, version: this.server.version }, `Mark of ${point} refused here; Z undoes it.`)
+    else if (mark) this.change("delete", { image, point }, `Mark of ${point} deleted here; Z undoes it.`)
     else this.say(`${point} is not marked in this photograph; Shift+Delete deletes the whole point.`, true)
   }
 
@@ -443,13 +452,31 @@ class Page {
   }
 
   undo() {
-    if (this.model.state.can_undo) this.change("undo", {}, "Undone.")
-    else this.say("Nothing to undo.", true)
+    this.stepBack("undo", "Undone", "Nothing to undo.")
   }
 
   redo() {
-    if (this.model.state.can_redo) this.change("redo", {}, "Done again.")
-    else this.say("Nothing to do again.", true)
+    this.stepBack("redo", "Done again", "Nothing to do again.")
+  }
+
+  /** Undo or redo what the page shows as the last change; of another page only when asked again. */
+  stepBack(what, done, nothing) {
+    const step = this.model.state[what]
+    const anyway = this.doubted === step?.number
+    this.doubted = null
+    if (!step) this.say(nothing, true)
+    else if (step.page !== this.server.page && !anyway) {
+      this.doubted = step.number
+      this.say(`Another page made the last change: ${step.what}. The same key again changes it all the same.`, true)
+    } else {
+      // keys that follow fast mean one change each: whatever is the last one of this page in its turn
+      let change = step
+      const body = () => {
+        if (!anyway) change = this.model.state[what] ?? step
+        return { number: change.number, anyway }
+      }
+      this.change(what, body, () => `${done}: ${change.what}.`)
+    }
   }
 
   automatic() {
@@ -494,9 +521,10 @@ class Page {
     }
     const drop = async () => {
       await this.server.change("control", { point, remove: true })
-      this.say(`${point} is no control point now.`)
+      const { control: left } = this.model.pointOf.get(point) ?? {}
+      this.say(left ? `${point} has the coordinates of the survey again.` : `${point} is no control point now.`)
     }
-    ask(`Coordinates of ${point} as control`, fields, send, { also: given ? [["No control", drop]] : [] })
+    ask(`Coordinates of ${point} as control`, fields, send, { also: given && !given.given ? [["No control", drop]] : [] })
   }
 
   bar() {

@@ -8,11 +8,16 @@ export class Model {
   constructor(hub) {
     this.hub = hub
     this.state = null
-    this.chosen = null // name of the point that the next click measures; null: a new point
+    this.aim = { point: null } // what the person has chosen last: a point, or a new one (null), which its click names
     this.kind = null // of the next click; null: whatever fits
     this.sigma_px = 1 // of a mark by hand
     this.hovered = null // photograph under the pointer
     this.names = [] // of all points, in natural order
+  }
+
+  /** Name of the point that the next click measures; null: a new point. */
+  get chosen() {
+    return this.aim.point
   }
 
   take(state) {
@@ -26,7 +31,7 @@ export class Model {
     this.names = [...new Set([...this.pointOf.keys(), ...this.rays.keys()])].sort(byName)
     this.usualResidual = usualResidual(state.marks)
     const known = (name) => this.pointOf.has(name) || this.rays.has(name)
-    if (this.chosen !== null && !known(this.chosen)) this.chosen = null
+    if (this.chosen !== null && !known(this.chosen)) this.aim.point = null
   }
 
   photograph(image) {
@@ -60,8 +65,7 @@ export class Model {
    * coordinates follows, because the photograph waits for it; elsewhere the click makes a new point. The best one is
    * farthest from all lines through points that are marked there: points on a line do not orient a photograph.
    */
-  pointFor(image) {
-    const { chosen } = this
+  pointFor(image, chosen = this.chosen) {
     if (chosen === null || !this.markOf(image, chosen)) return chosen
     if (this.photograph(image).oriented) return null
     const place = (name) => this.pointOf.get(name)?.X ?? this.pointOf.get(name)?.control?.X
@@ -80,16 +84,23 @@ export class Model {
     return this.hovered === null ? this.chosen : (this.pointFor(this.hovered) ?? this.chosen)
   }
 
+  /** The person chooses a point, or a new one (null): clicks before it keep their own aim. */
   choose(point) {
-    if (point === this.chosen) return
-    this.chosen = point
-    this.hub.tell("chosen", point)
+    const before = this.chosen
+    this.aim = { point }
+    if (point !== before) this.hub.tell("chosen", point)
   }
 
-  /** The unit of lengths; empty if neither a bar nor control nor an earlier result gives the scale. */
+  /** A click has measured a point: further clicks of the same aim measure it too. */
+  hit(aim, point) {
+    const before = this.chosen
+    aim.point = point
+    if (this.chosen !== before) this.hub.tell("chosen", this.chosen)
+  }
+
+  /** The unit of lengths; empty as long as nothing gives the scale. */
   get unit() {
-    const { unit, bars, points } = this.state
-    return bars.length || points.some((point) => point.control || point.automatic) ? unit : ""
+    return this.state.scaled ? this.state.unit : ""
   }
 }
 

@@ -53,7 +53,7 @@ export class Panel {
     const measured = model.measured(proposals).length
     const coordinate = (c) => `${toPrecision(point.X[c], point.sigma?.[c])}${model.unit && ` ${model.unit}`}${point.sigma ? `, sigma ${significant(point.sigma[c], SIGMA_DIGITS)}` : ""}`
     const rows = point.X ? [0, 1, 2].map((c) => ["XYZ"[c], coordinate(c)]) : [["coordinates", "not known yet: mark it in two oriented photographs"]]
-    if (point.control) rows.push(["control", point.control.X.map((x, c) => `${x} \u00b1 ${point.control.sigma[c]}`).join(", ")])
+    if (point.control) rows.push([point.control.given ? "control of the survey" : "control", point.control.X.map((x, c) => `${x} \u00b1 ${point.control.sigma[c]}`).join(", ")])
     this.point.replaceChildren(
       make("h2", {}, `Point ${name}`),
       facts(rows),
@@ -129,7 +129,7 @@ export class Panel {
       const words = `${worst.point} in ${photograph} fits least, |w| ${fixed(Math.abs(worst.test), 1)}`
       parts.push(make("p", { className: worst.flagged ? "m-verdict bad" : "note" }, worst.flagged ? `${words}. Look at it: measure it again, or delete it. ` : `${words}. `, button("Show (w)", () => this.actions.openWorst())))
     }
-    if (done && !this.model.unit) parts.push(make("p", { className: "note" }, "Neither a scale bar nor control: coordinates have no unit."))
+    if (done && !this.model.unit) parts.push(make("p", { className: "note" }, "Scale not known: coordinates have no unit until a bar has both its ends, or three control points are marked."))
     parts.push(make("p", { className: "note" }, `Marks are saved after every change in ${saved}`))
     this.adjustment.replaceChildren(...parts)
   }
@@ -143,7 +143,7 @@ export class Panel {
         make("th", { scope: "row" }, `${bar.start} \u2013 ${bar.end}`),
         make("td", { className: "n" }, `${bar.length} \u00b1 ${bar.sigma} ${unit}`),
         make("td", { className: "n" }, Number.isFinite(bar.residual) ? `v ${signed(bar.residual, 4)}` : ""),
-        make("td", {}, button("Delete", () => this.actions.removeBar(bar), { "aria-label": `delete the bar from ${bar.start} to ${bar.end}` })),
+        make("td", {}, bar.given ? "of the survey" : button("Delete", () => this.actions.removeBar(bar), { "aria-label": `delete the bar from ${bar.start} to ${bar.end}` })),
       )
     this.bars.replaceChildren(
       make("h2", {}, "Scale bars"),

@@ -2,6 +2,8 @@
 
 const SECRET = location.pathname.split("/")[1] // the first part of the address of the page
 const PATIENCE_MS = 40_000 // for an answer; the program holds a request for a newer state for 25 s
+const REST_MS = 1000 // after an answer without news, which more pages than may wait are given at once
+const HIDDEN = Symbol("hidden") // why a page that nobody sees ends its waiting request
 const PAUSES_MS = [500, 1000, 2000, 5000] // before the next request, while the program does not answer
 
 /** The program has refused a change; the message is its sentence. */
@@ -19,6 +21,7 @@ export class Server {
   constructor(hub) {
     this.hub = hub
     this.version = null
+    this.page = crypto.randomUUID() // tells the changes of this page from those of others
     this.failures = 0
     this.open = 0 // changes that are not answered yet
   }
@@ -27,16 +30,24 @@ export class Server {
     return this.open === 0
   }
 
-  /** Keep the state current: each request waits in the program until there is a newer one. */
+  /**
+   * Keep the state current: each request waits in the program until there is a newer one.
+   * A page that nobody sees does not wait: a browser has few connections to one program, and clicks need them.
+   */
   async follow() {
+    document.addEventListener("visibilitychange", () => document.hidden && this.#poll?.abort(HIDDEN))
     for (;;) {
+      while (document.hidden && this.version !== null) await new Promise((resolve) => document.addEventListener("visibilitychange", resolve, { once: true }))
       try {
         const fresh = this.version === null || this.failures > 0
         this.#poll = new AbortController()
-        this.#take(await this.#ask(fresh ? "state" : `state?after=${this.version}`, { signal: AbortSignal.any([this.#poll.signal, AbortSignal.timeout(PATIENCE_MS)]) }), fresh)
+        const state = await this.#ask(fresh ? "state" : `state?after=${this.version}`, { signal: AbortSignal.any([this.#poll.signal, AbortSignal.timeout(PATIENCE_MS)]) })
+        const isNew = fresh || state.version > this.version
+        this.#take(state, fresh)
         this.#answered()
+        if (!isNew) await new Promise((resolve) => setTimeout(resolve, REST_MS))
       } catch (error) {
-        await this.#lose(error)
+        if (error !== HIDDEN) await this.#lose(error)
       }
     }
   }
@@ -60,7 +71,7 @@ export class Server {
 
   async #send(what, body) {
     const before = this.version
-    const options = { method: "POST", headers: { "Content-Type": "application/json", "X-Kolinear": SECRET }, body: JSON.stringify(body) }
+    const options = { method: "POST", headers: { "Content-Type": "application/json", "X-Kolinear": SECRET }, body: JSON.stringify({ ...body, page: this.page }) }
     for (;;) {
       let answer
       try {
