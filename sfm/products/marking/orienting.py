@@ -52,7 +52,7 @@ CLEAR, LEAD = 0.25, 2.0
 # Principal distances that are tried, in parts of the nominal one, which is the first: two standard deviations
 # to each side. With steps of a quarter of one, features support the right orientation with one of them.
 C_FACTORS = (1.0, *(1 + sign * C_SIGMA * k / 4 for k in range(1, 9) for sign in (-1, 1)))
-MOST_TRIED = 4  # photographs that decide on the principal distance
+MOST_TRIED = 2  # photographs that decide on the principal distance
 ALIKE_DEG = 15.0  # between orientations that are no rivals, but one with and without further features
 
 

@@ -192,7 +192,10 @@ class MarkingSession:
             self._change(
                 self._with_marks(marking, [(mark, measured)]), f"{point} marked in {name}{again}", page
             )
-            return {"mark": self._shown_mark(mark), "note": measured.note, "state": self._state()}
+            note, code = measured.note, measured.code
+            if code is not None and point.isdecimal() and point != str(code):
+                note = f"its code is {code}"
+            return {"mark": self._shown_mark(mark), "note": note, "state": self._state()}
 
     def accept(
         self, image: int | None = None, point: str | None = None, *, seen: int | None = None, page: str = ""

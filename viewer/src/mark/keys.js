@@ -26,7 +26,7 @@ export function keysOf(page) {
     ["Delete", "delete the mark of the chosen point in the active photograph", () => page.removeHere()],
     ["Shift+Delete", "delete the chosen point", () => page.remove()],
     ["m", "measure this mark again, with the kind that is set", () => page.again()],
-    ["z", "undo", () => page.undo()],
+    ["z", "undo; a change of another page if pressed again", () => page.undo()],
     ["Shift+z", "redo", () => page.redo()],
     ["r", "rename the chosen point", () => page.rename()],
     ["c", "coordinates of the chosen point as control", () => page.control()],
