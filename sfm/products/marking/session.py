@@ -395,7 +395,7 @@ class MarkingSession:
                 raise MarkError("there is no such change any more")
             if number not in (None, change.number):
                 raise MarkError(f"in between something else was changed: {change.what}; look at it first")
-            if page not in (None, change.page):
+            if page is not None and change.page not in ("", page):
                 raise MarkError(f"another page made this change: {change.what}")
             step()
             self._follow(before)

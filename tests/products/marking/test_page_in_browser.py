@@ -231,8 +231,9 @@ def test_two_pages_keep_each_other_current(browser: Any, folder: Path, tmp_path:
             page.close()
 
 
-def test_a_late_answer_does_not_choose_again_what_the_person_has_left(discs: Marking) -> None:
-    """A click that takes long, N, and a click on another feature: it is another point."""
+@pytest.mark.parametrize("left", [True, False])
+def test_a_late_answer_does_not_choose_again_what_the_person_has_left(discs: Marking, left: bool) -> None:
+    """A click that takes long, N, and a click on another feature: another point; without N the same."""
     page = discs.page
     pane_of(discs, "photo 1.png")
     page.locator(".m-pane select").nth(1).select_option(label="photo 2.png")
@@ -241,7 +242,7 @@ def test_a_late_answer_does_not_choose_again_what_the_person_has_left(discs: Mar
     page.route("**/click", lambda route: held.append(route) if not held else route.continue_())
     places = page.evaluate(PLACE, [0, *DISCS[0]]), page.evaluate(PLACE, [1, *(DISCS[1] + SHIFT)])
     page.mouse.click(*places[0])
-    page.keyboard.press("n")
+    page.keyboard.press("n" if left else "h")
     page.keyboard.press("1")
     page.wait_for_timeout(450)
     page.mouse.click(*places[1])
@@ -251,7 +252,10 @@ def test_a_late_answer_does_not_choose_again_what_the_person_has_left(discs: Mar
     held[0].continue_()
     discs.settled()
     marks = {(mark["image"], mark["point"], mark["kind"]) for mark in discs.state["marks"]}
-    assert {(point, kind) for _, point, kind in marks} == {("P1", "target"), ("P2", "target")}
+    assert {(point, kind) for _, point, kind in marks} == {
+        ("P1", "target"),
+        ("P2" if left else "P1", "target"),
+    }
     assert len({image for image, _, _ in marks}) == 2
     assert discs.chosen == "None"
 

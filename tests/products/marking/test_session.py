@@ -19,7 +19,7 @@ from sfm.products.marking.clicks import Measured
 from sfm.products.marking.project import MarkedProject, project_of_folder, project_of_survey
 from sfm.products.marking.session import MOST_WAITING, MarkError, MarkingSession
 from sfm.survey.inputs.given_values import ScaleBar
-from sfm.survey.inputs.marks_file import Kind, StatedPoint, read_marks
+from sfm.survey.inputs.marks_file import Kind, Mark, Marking, StatedPoint, read_marks
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey
 from tests.products.marking.photographs import LENS, seen_points, stations
 
@@ -196,6 +196,9 @@ def test_another_page_undoes_a_change_only_when_it_says_so(
     assert state["redo"] == first
     with pytest.raises(MarkError, match="no such change"):
         session.undo()
+    mark = Mark("i0.png", "A", 10.0, 20.0, 1.0, 0.0, 1.0, "hand", "hand", when="t")
+    assert session.add(Marking("board").with_mark(mark)) == 1  # by --import, which is no page
+    assert session.undo(page="right")["marks"] == []
 
 
 def test_a_few_pages_wait_at_a_time_and_the_oldest_is_answered(session: MarkingSession) -> None:

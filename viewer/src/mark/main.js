@@ -101,7 +101,7 @@ class Page {
     for (const [name, key] of [["undo", "Z"], ["redo", "Shift+Z"]]) {
       const change = model.state[name]
       this.buttons[name].disabled = !change
-      this.buttons[name].title = change ? `${key}: ${change.what}${change.page === this.server.page ? "" : ", made by another page"}` : key
+      this.buttons[name].title = change ? `${key}: ${change.what}${this.server.made(change) ? "" : ", made by another page"}` : key
     }
     this.aim.textContent = model.chosen ?? "new point"
     this.buttons.fresh.setAttribute("aria-pressed", String(model.chosen === null))
@@ -465,7 +465,7 @@ class Page {
     const anyway = this.doubted === step?.number
     this.doubted = null
     if (!step) this.say(nothing, true)
-    else if (step.page !== this.server.page && !anyway) {
+    else if (!this.server.made(step) && !anyway) {
       this.doubted = step.number
       this.say(`Another page made the last change: ${step.what}. The same key again changes it all the same.`, true)
     } else {

@@ -30,6 +30,11 @@ export class Server {
     return this.open === 0
   }
 
+  /** Whether a change was made by this page, or by none, as by --import. */
+  made(change) {
+    return ["", this.page].includes(change.page)
+  }
+
   /**
    * Keep the state current: each request waits in the program until there is a newer one.
    * A page that nobody sees does not wait: a browser has few connections to one program, and clicks need them.
