@@ -471,6 +471,7 @@ NOT_IN_THE_TABLE = {
     "copied",
     "other_moments",
     "refused",
+    "marked_hashes",
     "equipment",
     "diameters",
     "start_orientations",
