@@ -20,6 +20,7 @@ import numpy as np
 from adapters.reading.text_lines import Lines
 from sfm.files.csv_tables import MAX_NUMBER, MAX_TABLE_BYTES
 from sfm.files.plain_text import MAX_SIDE_PX
+from sfm.model.conventions import FloatArray
 from sfm.model.errors import SurveyFileError
 
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
@@ -304,3 +305,35 @@ class _Bytes:
         if end < 0:
             raise self.error("the file ends in the name of a photograph")
         self.at = end + 1
+
+
+def camera_rows(path: Path) -> list[tuple[int, str, tuple[int, int], FloatArray]]:
+    """Return the cameras of cameras.txt or cameras.bin alone, after checking the file.
+
+    Args:
+        path: the file; one that ends in .bin is binary.
+
+    Returns:
+        Number, COLMAP's model, size (px) and parameters (n,) of each camera.
+
+    Raises:
+        SurveyFileError: the file is truncated or out of order, or has impossible values.
+    """
+    rows = []
+    if path.suffix.lower() == ".bin":
+        _check_binary("cameras", path)
+        data = _Bytes.of(path)
+        names = tuple(MODELS)
+        for _ in range(data.take("Q")[0]):
+            number, model, width, height = data.take("IiQQ")
+            params = np.array(data.numbers(f"{PARAMETERS[model]}d"))
+            rows.append((int(number), names[model], (int(width), int(height)), params))
+        return rows
+    _check_text("cameras", path)
+    text = Lines.of(path)
+    while (line := text.maybe_line()) is not None:
+        words = line.split()
+        if words and not line.startswith("#"):
+            params = np.array([float(word) for word in words[4:]])
+            rows.append((int(words[0]), words[1], (int(words[2]), int(words[3])), params))
+    return rows

@@ -28,13 +28,18 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from adapters.formats.cameras.metashape import (
+    calibration_lines,
+    calibration_values,
+    camera_of_values,
+    values_of,
+)
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, write_lines
 from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.files.plain_text import MAX_PIXEL_MM, shorten
-from sfm.model.camera import Camera, camera_from_values
+from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray
-from sfm.model.distortion.models import MODELS
-from sfm.model.errors import OutputError, SurveyFileError
+from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, rows_of
 from sfm.model.similarity import Similarity
@@ -45,26 +50,6 @@ MARKER = ["markers", "marker"]  # path of elements below the chunk
 LOCATION = ["frames", "frame", "markers", "marker", "location"]
 
 AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in Kolinear's
-CALIBRATION = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
-OPENCV_PARAMETERS: dict[str, tuple[str, ...]] = {  # that are free where one of a calibration is
-    "f": ("fx", "fy"),
-    "cx": ("cx",),
-    "cy": ("cy",),
-    "b1": ("fx",),
-    "k1": ("k1",),
-    "k2": ("k2",),
-    "k3": ("k3",),
-    "p1": ("p2",),
-    "p2": ("p1",),
-}
-BROWN_PARAMETERS: dict[str, tuple[str, ...]] = {
-    "f": ("c",),
-    "cx": ("x0",),
-    "cy": ("y0",),
-    "b1": ("b1",),
-    "b2": ("b2",),
-}
-BROWN_PARAMETERS |= {name: (name.upper(),) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
 
 
 def read_metashape(path: Path) -> tuple[Network, Estimate]:
@@ -193,95 +178,20 @@ def _camera(sensor: Node) -> Camera:
     )
     if not all(0 < side <= MAX_PIXEL_MM for side in pixel):
         raise sensor.error(f"pixels of {pixel[0]:g} x {pixel[1]:g} mm, needed 0 to {MAX_PIXEL_MM:g}")
-    p, free = _calibration(sensor)
-    if p["k4"] == 0 and p["b2"] == 0:
-        model = "opencv" if p["k3"] == 0 else "full_opencv"
-        values = _opencv_values(p, size)
-        names = OPENCV_PARAMETERS
-    else:
-        model, names = "brown_forward_affine", BROWN_PARAMETERS
-        c = p["f"] * pixel[1]
-        values = {"x0": p["cx"] * pixel[0], "y0": -p["cy"] * pixel[1]}
-        values |= {"b1": (p["f"] + p["b1"]) * pixel[0] / c - 1, "b2": -p["b2"] * pixel[0] / c}
-        values |= {f"K{i}": p[f"k{i}"] / c ** (2 * i) for i in (1, 2, 3, 4)}
-        values |= {"P1": p["p1"] / c, "P2": -p["p2"] / c}
-    freed = [name for tag in CALIBRATION if tag in free for name in names.get(tag, ())]
-    has = MODELS[model].names
-    return camera_from_values(
-        sensor.name("label" if "label" in sensor.attributes else "id"),
-        model,
-        size,
-        (float(pixel[0]), float(pixel[1])),
-        c_mm=p["f"] * pixel[1],
-        free=tuple(name for name in freed if name in has),
-        values=tuple((name, float(value)) for name, value in values.items() if name in has),
-    )
-
-
-def _calibration(sensor: Node) -> tuple[dict[str, float], set[str]]:
-    """Return the values of CALIBRATION, adjusted if the sensor has them, and which of them are stated."""
     calibrations = sensor.all("calibration")
     if not calibrations:
         raise sensor.error("sensor without calibration")
     adjusted = [node for node in calibrations if node.attributes.get("class") == "adjusted"]
-    node = (adjusted or calibrations)[0]
-    stated = {child.tag: float(child.numbers(1)[0]) for child in node.children if child.tag in CALIBRATION}
-    p = dict.fromkeys(CALIBRATION, 0.0) | stated
-    if not (p["f"] > 0 and p["f"] + p["b1"] > 0):
-        raise node.error(f"f = {p['f']:g} px, b1 = {p['b1']:g} px: f and f + b1 must be positive")
-    return p, set(stated)
-
-
-def _opencv_values(p: dict[str, float], size_px: tuple[int, int]) -> dict[str, float]:
-    """Return the parameters of the OpenCV models from a calibration without k4 and b2, with k3."""
-    centre = (np.array(size_px) - 1) / 2
-    return {
-        "fx": p["f"] + p["b1"],
-        "fy": p["f"],
-        "cx": centre[0] + p["cx"],
-        "cy": centre[1] + p["cy"],
-        "k1": p["k1"],
-        "k2": p["k2"],
-        "k3": p["k3"],
-        "p1": p["p2"],
-        "p2": p["p1"],
-    }
+    p, stated = calibration_values((adjusted or calibrations)[0])
+    name = sensor.name("label" if "label" in sensor.attributes else "id")
+    return camera_of_values(name, size, (float(pixel[0]), float(pixel[1])), p, stated)
 
 
 def _sensor_lines(number: int, camera: Camera) -> list[str]:
     """Return the lines of a sensor; refuse a camera without an equivalent in Metashape."""
     width, height = camera.size_px
-    centre = (np.array(camera.size_px) - 1) / 2
-    p = dict.fromkeys(CALIBRATION, 0.0)
-    if camera.model in ("opencv", "full_opencv"):
-        if camera.model == "full_opencv" and any(camera.value(name) for name in ("k4", "k5", "k6")):
-            raise OutputError(
-                f"camera {camera.name}: Metashape has no k4-k6 of full_opencv, convert it to "
-                "brown_forward_affine"
-            )
-        p |= {"f": camera.value("fy"), "b1": camera.value("fx") - camera.value("fy")}
-        p |= {"cx": camera.value("cx") - centre[0], "cy": camera.value("cy") - centre[1]}
-        p |= {"k1": camera.value("k1"), "k2": camera.value("k2")}
-        p |= {"p1": camera.value("p2"), "p2": camera.value("p1")}
-        p |= {"k3": camera.value("k3")} if camera.model == "full_opencv" else {}
-    elif camera.model == "brown_forward_affine":
-        c, (sx, sy) = camera.value("c"), camera.pixel_mm
-        p |= {
-            "f": c / sy,
-            "b1": c * (1 + camera.value("b1")) / sx - c / sy,
-            "b2": -c * camera.value("b2") / sx,
-        }
-        p |= {"cx": camera.value("x0") / sx, "cy": -camera.value("y0") / sy}
-        p |= {f"k{i}": camera.value(f"K{i}") * c ** (2 * i) for i in (1, 2, 3, 4)}
-        p |= {"p1": camera.value("P1") * c, "p2": -camera.value("P2") * c}
-    else:
-        raise OutputError(
-            f"camera {camera.name}: Metashape has no model {camera.model}, convert it to brown_forward_affine"
-        )
     resolution = f'<resolution width="{width}" height="{height}"/>'
-    calibration = [
-        f"          <{name}>{float(value)!r}</{name}>" for name, value in p.items() if value or name == "f"
-    ]
+    calibration = [f"          {line}" for line in calibration_lines(values_of(camera))]
     return [
         f'      <sensor id="{number}" label={quoteattr(camera.name)} type="frame">',
         f"        {resolution}",

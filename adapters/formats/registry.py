@@ -29,6 +29,7 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
+from adapters.formats.cameras.rig_folder import write_rig_files
 from adapters.formats.content import ALL, Content, losses, refuse_not_finite, select_placed
 from adapters.formats.metashape import read_metashape, write_metashape
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
@@ -37,7 +38,6 @@ from adapters.formats.photomodeler import read_export, write_export
 from adapters.formats.result_tables import read_content as read_tables
 from adapters.formats.result_tables import read_result
 from adapters.formats.result_tables import write_content as write_content_tables
-from adapters.formats.rig_files import write_rig_files
 from adapters.formats.sba_text import read_sba, write_sba_folder
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines

@@ -1,1 +1,1 @@
-"""Reading of untrusted text and XML: line by line, within limits, with the location of every error."""
+"""Reading of untrusted text, XML, YAML and JSON: within limits, with the location of every error."""

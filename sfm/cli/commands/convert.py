@@ -44,14 +44,27 @@ def convert(
             "--control", metavar="FILE", help="Control points of a PhotoModeler export: id,label,X,Y,Z..."
         ),
     ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option("--camera", metavar="NAME", help="For formats of cameras: the only camera to write."),
+    ] = None,
+    inexact: Annotated[
+        bool,
+        typer.Option("--inexact", help="For formats of cameras and rig: accept a misfit above 0.05 px RMS."),
+    ] = False,
 ) -> None:
-    """Convert a survey from one program's format to another's.
+    """Convert a survey or its cameras from one program's format to another's.
 
-    A camera whose model the format lacks is converted to one that it has. Formats: colmap, colmap-text,
-    colmap-database, tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig (calibration
-    files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
+    A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
+    colmap-text, colmap-database, tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig
+    (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
+
+    Formats of cameras, to read and write: opencv-camera, ros-camera, kalibr-camera, mrcal-camera,
+    colmap-camera, metashape-camera, australis-camera, nerfstudio-camera and blender-camera. A camera of a
+    result is adjusted again in the other model, from the same image points, and its misfit stated.
     """
     with loading():
+        from adapters.formats.cameras.registry import NAMES, camera_format_of
         from adapters.formats.content import with_cameras
         from adapters.formats.registry import (
             ENDINGS,
@@ -63,34 +76,56 @@ def convert(
             refuse_taken,
             write_content,
         )
+        from sfm.cli.written_cameras import readjusted_content, write_camera_files
         from sfm.comparison.camera_conversion import Conversion, convert_cameras, undistort
 
     ending = target.suffix.lower()
+    if to_format is None and ending == ".cameramodel":
+        to_format = "mrcal-camera"
+    if to_format in NAMES:
+        with working_on(str(source)):
+            print(
+                write_camera_files(
+                    source, target, to_format, read_as=from_format, camera=camera, inexact=inexact
+                )
+            )
+        return
     if to_format is None and ending and ending not in ENDINGS:
         raise SurveyFileError(
             f"{target}: unknown ending {ending}, expected {', '.join(ENDINGS)}, a folder for tables, or --to "
-            f"with one of {', '.join(known.name for known in FORMATS)}"
+            f"with one of {', '.join((*(known.name for known in FORMATS), *NAMES))}"
         )
     form = format_named(to_format or ENDINGS.get(ending, "tables"))
     refuse_taken(target, form)
+    if from_format is None and source.is_file() and camera_format_of(source) is not None:
+        raise SurveyFileError(
+            f"{source}: a file of cameras, without a survey; --to needs one of {', '.join(NAMES)}"
+        )
     with working_on(str(source)):
         content = read_content(source, from_format, control=control)
     network, estimate = content.result.network, content.result.estimate
     cameras = estimate.cameras
     conversions: tuple[Conversion, ...] = ()
-    if form.models:
+    adjusted: tuple[str, ...] = ()
+    if form.name == "rig" and not straighten:
+        content, anew = readjusted_content(content, form.name, inexact=inexact)
+        network, estimate = content.result.network, content.result.estimate
+        adjusted = tuple(conversion.words for conversion in anew)
+    elif form.models:
         if straighten:
             network, estimate = undistort(network, estimate, form.models)
         estimate, conversions = convert_cameras(estimate, form.models, held=form.lacks)
     changed, gone = with_cameras(content, network, estimate)
     changed = replace(changed, result=replace(changed.result, name=target.name))
     write_content(target, form.name, changed)
-    for camera, conversion in zip(cameras, conversions, strict=False):
+    for words in adjusted:
+        print(words)
+    for former, conversion in zip(cameras, conversions, strict=False):
         if straighten:
-            print(f"camera {camera.name}: image points corrected for {camera.model}, ideal camera written")
-        elif conversion.camera is not camera:
+            print(f"camera {former.name}: image points corrected for {former.model}, ideal camera written")
+        elif conversion.camera is not former:
             print(
-                f"camera {camera.name}: {conversion.source_model} to {conversion.camera.model}, "
+                f"camera {former.name}: {conversion.source_model} to {conversion.camera.model}, "
                 f"misfit {conversion.rms_px:.4f} px RMS, {conversion.max_px:.4f} px at most"
             )
     for note in content.notes:

@@ -1,0 +1,172 @@
+"""Cameras of OpenCV, as cv2.FileStorage reads and writes YAML and JSON.
+
+    width, height, K, D [, rms, fisheye]        one camera, as written here
+    image_width, image_height, camera_matrix, distortion_coefficients [, avg_reprojection_error]
+                                                one camera, as OpenCV's calibration sample writes it
+    width, height, K1, D1, K2, D2, R, T, ...    two cameras, x2 = R x1 + T; R1, R2, P1, P2, Q if rectified
+
+Matrices are mappings of rows, cols, dt and data. Files of one or two cameras with other programs' spellings
+of these names (cameraMatrix, dist_coeffs, M1, ...) are read too.
+
+Source: OpenCV 4 documentation, "XML/YAML/JSON file storages", "stereoCalibrate" and "stereoRectify"; its
+samples calibration.cpp and stereo_calib.cpp.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from adapters.formats.cameras.lens_terms import (
+    COUNTS,
+    Mounted,
+    camera_of_matrix,
+    coefficients_of,
+    matrix_of,
+    mounts_of,
+    numbers_text,
+)
+from adapters.reading.trees import Tree, read_tree
+from sfm.model.camera import Camera
+from sfm.model.camera_file import CameraFile
+from sfm.model.conventions import FloatArray, skew
+from sfm.model.rectification import rectify
+
+WHAT = "a file of an OpenCV camera"
+WIDTH, HEIGHT = (
+    ("width", "image_width", "imageWidth", "image_Width"),
+    (*("height", "image_height", "imageHeight", "image_Height"),),
+)
+SIZE = ("image_size", "imageSize", "size", "resolution")
+MATRIX = ("K", "camera_matrix", "cameraMatrix", "Camera_Matrix", "M", "mtx", "intrinsic_matrix")
+COEFFICIENTS = (
+    *("D", "distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients"),
+    *("distortion", "dist", "dist_coeff"),
+)
+RMS = ("rms", "avg_reprojection_error", "reprojection_error", "error", "RMS")
+MATRICES = tuple((f"{name}1", f"{name}2") for name in ("K", "M", "camera_matrix_", "cameraMatrix"))
+
+
+def read_opencv(path: Path) -> CameraFile:
+    """Read one or two cameras; a pixel is 1 mm, as the files do not state its size.
+
+    Raises:
+        SurveyFileError: no camera, without the size of its photographs, or not a model that is read.
+    """
+    tree = read_tree(path, WHAT)
+    size = _size(tree)
+    pair = next((names for names in MATRICES if tree.key(names[0]) and tree.key(names[1])), None)
+    rms = (tree.number(*RMS),) if tree.key(*RMS) else ()
+    fisheye = tree.text("fisheye", tree.text("fisheye_model", "0")) not in ("0", "false")
+    if pair is None:
+        name = tree.text("camera", tree.text("camera_name", path.stem))
+        camera = _camera(tree, name, size, MATRIX, COEFFICIENTS, fisheye)
+        return CameraFile(path.name, (camera,), (None,), rms_px=rms)
+    cameras = tuple(
+        _camera(
+            tree,
+            tree.text(f"camera{k}", f"camera {k}"),
+            size,
+            (name,),
+            (f"D{k}", f"dist_coeffs_{k}", f"distCoeffs{k}", f"distortion_coefficients_{k}"),
+            fisheye,
+        )
+        for k, name in enumerate(pair, 1)
+    )
+    mounts = None
+    if tree.key("R") and tree.key("T"):
+        R, T = tree.numbers(("R",), 9).reshape(3, 3), tree.numbers(("T",), 3)
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+            raise tree.error("R is no rotation")
+        mounts = mounts_of([(np.eye(3), np.zeros(3)), (R, T)])
+    return CameraFile(path.name, cameras, (None, None), mounts)
+
+
+def _size(tree: Tree) -> tuple[int, int]:
+    """Return width and height of the photographs, which OpenCV's own files of a pair do not state."""
+    if tree.key(*SIZE) and not tree.key(*WIDTH):
+        width, height = tree.numbers(SIZE, 2)
+        return tree.side("width", width), tree.side("height", height)
+    if not tree.key(*WIDTH):
+        raise tree.error(
+            "the size of the photographs is missing (width and height), which a camera needs; add it to the file"
+        )
+    return tree.sides(WIDTH, HEIGHT)
+
+
+def _camera(
+    tree: Tree,
+    name: str,
+    size: tuple[int, int],
+    matrix: tuple[str, ...],
+    coefficients: tuple[str, ...],
+    fisheye: bool,
+) -> Camera:
+    K = tree.numbers(matrix, 9)
+    D = tree.numbers(coefficients, *COUNTS) if tree.key(*coefficients) else np.zeros(0)
+    return camera_of_matrix(f"{tree.path}", name, size, K, D, fisheye=fisheye)
+
+
+def write_opencv(path: Path, file: CameraFile) -> str:
+    """Return the text of a file with one camera, as YAML or, where the path ends in .json, as JSON.
+
+    Args:
+        path: the file to be written.
+        file: one camera in a model of OpenCV.
+    """
+    camera = file.cameras[0]
+    K, D = matrix_of(camera), np.array([coefficients_of(camera)])
+    fisheye = camera.model == "opencv_fisheye"
+    rms = file.rms_px[0] if file.rms_px else None
+    if path.suffix.lower() == ".json":
+        content = {"camera": camera.name, "width": camera.size_px[0], "height": camera.size_px[1]}
+        content |= {"fisheye": int(fisheye), "K": _as_json(K), "D": _as_json(D)}
+        return json.dumps(content | ({} if rms is None else {"rms": rms}), indent=1, allow_nan=False) + "\n"
+    lines = ["%YAML:1.0", "---", f"camera: {json.dumps(camera.name, ensure_ascii=False)}"]
+    lines += [f"width: {camera.size_px[0]}", f"height: {camera.size_px[1]}"]
+    lines += [f"fisheye: {int(fisheye)}", *_matrix_lines("K", K), *_matrix_lines("D", D)]
+    lines += [] if rms is None else [f"rms: {numbers_text([rms])}"]
+    return "\n".join(lines) + "\n"
+
+
+def pair_lines(first: Mounted, mounted: Mounted, unit: str, *, alpha: float = 0.0) -> Iterator[str]:
+    """Yield the lines of two cameras with their rectification.
+
+    Args:
+        first: the reference camera, in model opencv.
+        mounted: the second camera.
+        unit: unit of lengths.
+        alpha: see `sfm.model.rectification.rectify`.
+    """
+    R, T, second = mounted.R, mounted.T, mounted.camera
+    K1, K2 = matrix_of(first.camera), matrix_of(second)
+    E = skew(T) @ R
+    F = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
+    matrices = {"K1": K1, "D1": np.array([coefficients_of(first.camera)])}
+    matrices |= {"K2": K2, "D2": np.array([coefficients_of(second)])}
+    matrices |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
+    rectified = rectify(first.camera, second, R, T, alpha=alpha)
+    yield from ("%YAML:1.0", "---", f"# T is in {unit}: x2 = R x1 + T")
+    yield f"camera1: {json.dumps(first.camera.name, ensure_ascii=False)}"
+    yield f"camera2: {json.dumps(second.name, ensure_ascii=False)}"
+    yield from (f"width: {first.camera.size_px[0]}", f"height: {first.camera.size_px[1]}")
+    if rectified is None:
+        yield "# no rectification: the viewing directions differ too much for a common image plane"
+    else:
+        matrices |= rectified._asdict()
+    for name, M in matrices.items():
+        yield from _matrix_lines(name, M)
+
+
+def _matrix_lines(name: str, M: FloatArray) -> Iterator[str]:
+    yield f"{name}: !!opencv-matrix"
+    yield from (f"   rows: {M.shape[0]}", f"   cols: {M.shape[1]}", "   dt: d")
+    yield f"   data: [ {numbers_text(M)} ]"
+
+
+def _as_json(M: FloatArray) -> dict[str, object]:
+    rows, cols = M.shape
+    return {"type_id": "opencv-matrix", "rows": rows, "cols": cols, "dt": "d", "data": M.ravel().tolist()}

@@ -1,0 +1,321 @@
+"""Difference of two calibrated cameras, in px over the format, after the rotation that it implies.
+
+Two calibrations of one camera differ in parameters that compensate one another, and in the rotation that the
+exterior orientations of their photographs took up. What a user sees is where the same direction is imaged.
+For pixels q of camera a, their rays, at a distance d or at infinity, are turned (and at a distance shifted)
+into camera b and imaged there:
+
+    difference(q) = pixel_b(R ray_a(q) + t) - q
+
+R and t minimise the sum of squares of the differences over the region in which both cameras are known: the
+hull of their image points, or all of the format where these are unknown. The covariance of the differences
+follows from those of the parameters of both cameras, with what R and t absorb removed.
+
+Whether the cameras differ is decided by the RMS over the region. Without a difference its square is a sum of
+chi-square variables, weighted by the eigenvalues of the covariance of all differences.
+
+Source: mrcal 2.5, "Differences" (the implied transformation); Satterthwaite (1946), An approximate
+distribution of estimates of variance components, Biometrics Bulletin 2(6), for the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm.adjustment.quality.correlations import observed_part
+from sfm.model.arguments import checked_arguments
+from sfm.model.camera import (
+    Camera,
+    parameter_jacobian,
+    pixel_from_tangents,
+    pixel_jacobian,
+    tangents_from_pixel,
+)
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.model.display import html_table, text_table
+from sfm.model.distributions import LEVEL, chi2_sf
+from sfm.model.errors import GeometryError
+
+STEPS = 36  # of the grid along the longer side
+ROUNDS = 20  # of the rotation and translation; after five they change no more
+CONVERGED = 1e-12  # rad
+
+
+@dataclass(frozen=True, repr=False)
+class CameraDifference:
+    """Differences b - a of two cameras over the format of a, after the implied transformation."""
+
+    names: tuple[str, str]
+    size_px: tuple[int, int]  # of the photographs
+    x: FloatArray  # columns of the grid, px, (c,)
+    y: FloatArray  # rows of the grid, px, (r,)
+    difference: FloatArray  # px, NaN where a ray has no pixel, (r, c, 2)
+    covariance: FloatArray  # of the differences, px^2; NaN where neither camera has one, (r, c, 2, 2)
+    known: BoolArray  # the region in which both cameras are known, (r, c)
+    has_sigma: tuple[bool, bool]  # whether the covariance of a and of b is known
+    distance: float  # of the points whose images are compared; infinite for directions
+    rotation: FloatArray  # rotation vector from a to b, axes x right, y up, z back, rad, (3,)
+    translation: FloatArray  # from a to b, in the unit of the distance; 0 at infinity, (3,)
+    p_value: float  # probability of so large an RMS without a difference; NaN without covariances
+
+    @property
+    def length_px(self) -> FloatArray:
+        """Lengths of the differences, px, (r, c)."""
+        return np.asarray(np.hypot(self.difference[..., 0], self.difference[..., 1]))
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """Standard deviations of the differences along their directions, px, (r, c)."""
+        along = self.difference / np.where(self.length_px > 0, self.length_px, np.nan)[..., None]
+        return np.asarray(np.sqrt(np.einsum("rca,rcab,rcb->rc", along, self.covariance, along)))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square length of the differences in the known region, px."""
+        return float(np.sqrt(np.mean(self.length_px[self.known] ** 2)))
+
+    @property
+    def expected_rms_px(self) -> float:
+        """What chance alone gives for the RMS, from both covariances, px; NaN without them."""
+        return float(np.sqrt(np.mean(np.einsum("rcii->rc", self.covariance)[self.known])))
+
+    @property
+    def largest(self) -> tuple[int, int]:
+        """Row and column, in the grid, of the largest difference in the known region."""
+        length = np.where(self.known, self.length_px, -1.0)
+        row, column = np.unravel_index(int(np.argmax(length)), length.shape)
+        return int(row), int(column)
+
+    @property
+    def largest_px(self) -> float:
+        """The largest difference in the known region, px."""
+        return float(self.length_px[self.largest])
+
+    @property
+    def over_sigma(self) -> float:
+        """RMS of the differences over what chance alone gives; NaN without covariances."""
+        expected = self.expected_rms_px
+        return self.rms_px / expected if expected > 0 else float("nan")
+
+    @property
+    def significant(self) -> bool | None:
+        """Whether the cameras differ by more than chance; None without covariances."""
+        return None if np.isnan(self.p_value) else bool(self.p_value < LEVEL)
+
+    def _rows(self) -> list[tuple[str, str]]:
+        over = "not known" if np.isnan(self.over_sigma) else f"{self.over_sigma:.3g}"
+        return [
+            ("difference", f"{self.rms_px:.3g} px RMS, {self.largest_px:.3g} px at most"),
+            ("over its standard deviation", over),
+            ("implied rotation", f"{np.degrees(np.linalg.norm(self.rotation)):.3g} deg"),
+        ]
+
+    def __repr__(self) -> str:
+        return text_table(f"Difference of {' and '.join(self.names)}", ("", ""), self._rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(f"Difference of {' and '.join(self.names)}", ("", ""), self._rows())
+
+
+@checked_arguments()
+def compare_cameras(
+    a: Camera,
+    b: Camera,
+    *,
+    covariance: tuple[FloatArray | None, FloatArray | None] = (None, None),
+    seen_px: tuple[FloatArray | None, FloatArray | None] = (None, None),
+    distance: float = np.inf,
+) -> CameraDifference:
+    """Return the difference of two cameras in px over their format.
+
+    Args:
+        a: first camera.
+        b: second camera, with photographs of the same size.
+        covariance: of all parameters of a and of b, in their units, (p, p) each; None if unknown, which
+            treats the camera as free of error. The calibrations must be independent.
+        seen_px: image points of the calibrations of a and of b, px, (k, 2) each, whose hulls are the known
+            region; None for the whole photograph.
+        distance: of the points whose images are compared, along their rays; a shift of the projection centre
+            is then implied too. Infinite: directions.
+
+    Raises:
+        GeometryError: photographs of other sizes, a distance that is not positive, or cameras with fewer than
+            four known places in common.
+
+    Example:
+        >>> import sfm
+        >>> a = sfm.camera_from_values("a", "brown", (600, 400), (0.01, 0.01), c_mm=6.0)
+        >>> b = a.with_parameters(a.parameters + (0, 0, 0, 1e-4, 0, 0, 0, 0, 0, 0))
+        >>> 0.1 < compare_cameras(a, b).largest_px < 1.0
+        True
+    """
+    if a.size_px != b.size_px:
+        raise GeometryError(
+            f"cameras {a.name} and {b.name}: photographs of {a.size_px[0]} x {a.size_px[1]} px and of "
+            f"{b.size_px[0]} x {b.size_px[1]} px, needed the same size"
+        )
+    if not distance > 0:
+        raise GeometryError(f"cameras {a.name} and {b.name}: distance {distance:g}, it must be positive")
+    width, height = a.size_px
+    step = max(width, height) / STEPS
+    x = np.linspace(0, width - 1, max(2, round(width / step) + 1))
+    y = np.linspace(0, height - 1, max(2, round(height / step) + 1))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    uv = tangents_from_pixel(a, grid)
+    fits = np.isfinite(uv).all(axis=1) & np.isfinite(pixel_from_tangents(b, uv)).all(axis=1)
+    known = fits.copy()
+    for seen in seen_px:
+        if seen is not None and len(seen):
+            known &= observed_part(seen, grid)[1]
+    if known.sum() < 4:
+        raise GeometryError(
+            f"cameras {a.name} and {b.name}: {known.sum()} of {len(grid)} places of the photograph are known "
+            "to both, needed at least 4"
+        )
+    rays = np.column_stack([uv, -np.ones(len(uv))])
+    points = rays if np.isinf(distance) else distance * rays / np.linalg.norm(rays, axis=1)[:, None]
+    shifts = 0 if np.isinf(distance) else 3
+    sigmas = _moved_by_sigma(a, b, grid, uv, covariance)
+    rotation, translation, moved = _implied(b, points, grid, known, shifts)
+    difference = pixel_from_tangents(b, moved) - grid
+    difference[~fits] = np.nan
+    known &= np.isfinite(difference).all(axis=1)
+    C, p_value = np.full((len(grid), 2, 2), np.nan), float("nan")
+    if sigmas is not None:
+        free = sigmas - _absorbed(_lever(b, moved, points, shifts), sigmas, known)
+        C = free @ np.swapaxes(free, 1, 2)
+        p_value = _probability(float((difference[known] ** 2).sum()), free[known])
+    shape = (len(y), len(x))
+    return CameraDifference(
+        (a.name, b.name),
+        a.size_px,
+        x,
+        y,
+        difference.reshape(*shape, 2),
+        C.reshape(*shape, 2, 2),
+        known.reshape(shape),
+        (covariance[0] is not None, covariance[1] is not None),
+        float(distance),
+        rotation,
+        translation,
+        p_value,
+    )
+
+
+def _implied(
+    b: Camera, points: FloatArray, xy: FloatArray, known: BoolArray, shifts: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the transformation into b with the smallest differences, and the tangents of the points there.
+
+    Args:
+        b: the second camera.
+        points: in the axes of the first camera, (k, 3).
+        xy: their pixels there, px, (k, 2).
+        known: which pixels count, (k,).
+        shifts: 3 if a translation is implied too, otherwise 0.
+
+    Returns:
+        Rotation vector (3,), translation (3,), and tangents (k, 2).
+    """
+    R, t = np.eye(3), np.zeros(3)
+    for _ in range(ROUNDS):
+        at = (points @ R.T + t)[known]
+        uv = _tangents(at)
+        lever, off = _lever(b, uv, at, shifts), pixel_from_tangents(b, uv) - xy[known]
+        sound = np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
+        step = np.linalg.lstsq(lever[sound].reshape(-1, 3 + shifts), -off[sound].ravel(), rcond=None)[0]
+        turn = rotation_from_vector(step[:3])
+        R, t = turn @ R, turn @ t + (step[3:] if shifts else 0.0)
+        if np.abs(step[:3]).max() < CONVERGED:
+            break
+    return Rotation.from_matrix(R).as_rotvec(), t, _tangents(points @ R.T + t)
+
+
+def _tangents(points: FloatArray) -> FloatArray:
+    """Return -U/W and -V/W of points in camera axes, NaN behind the camera, (k, 2)."""
+    W = np.where(points[:, 2] < 0, points[:, 2], np.nan)
+    return np.asarray(-points[:, :2] / W[:, None])
+
+
+def _lever(b: Camera, uv: FloatArray, points: FloatArray, shifts: int) -> FloatArray:
+    """Return the derivatives of the pixels of points by a rotation and a shift of them, px, (k, 2, 3 + shifts).
+
+    Args:
+        b: the camera.
+        uv: tangents of the points, (k, 2).
+        points: in its axes, (k, 3).
+        shifts: 3 for the derivatives by a shift too, otherwise 0.
+    """
+    pixels = pixel_from_tangents(b, uv)
+    known = np.isfinite(pixels).all(axis=1)
+    J = np.full((len(uv), 2, 2), np.nan)
+    J[known] = pixel_jacobian(b, pixels[known])
+    U, V, W = points.T
+    zero = np.zeros(len(points))
+    by_point = np.stack(
+        [np.stack([-1 / W, zero, U / W**2], axis=1), np.stack([zero, -1 / W, V / W**2], axis=1)], axis=1
+    )
+    turned = np.stack(
+        [
+            np.stack([zero, W, -V], axis=1),
+            np.stack([-W, zero, U], axis=1),
+            np.stack([V, -U, zero], axis=1),
+        ],
+        axis=1,
+    )  # d (w x point) / d w
+    columns = [by_point @ turned] + ([by_point] if shifts else [])
+    return np.asarray(J @ np.concatenate(columns, axis=2))
+
+
+def _moved_by_sigma(
+    a: Camera,
+    b: Camera,
+    xy: FloatArray,
+    uv: FloatArray,
+    covariance: tuple[FloatArray | None, FloatArray | None],
+) -> FloatArray | None:
+    """Return how independent unit variables of both cameras move the differences, px, (k, 2, n); None unknown.
+
+    A camera's variables are those whose covariance is the identity, so that the sum of the outer products of
+    the columns is the covariance of the differences.
+    """
+    columns = []
+    for camera, Q, sign in ((a, covariance[0], -1.0), (b, covariance[1], 1.0)):
+        if Q is None:
+            continue
+        n = len(camera.parameters)
+        if Q.shape != (n, n) or not np.isfinite(Q).all():
+            raise GeometryError(f"camera {camera.name}: a covariance of shape {Q.shape}, needed {n} x {n}")
+        sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
+        free = np.flatnonzero(sigma > 0)
+        if not len(free):
+            continue
+        values, vectors = np.linalg.eigh(Q[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
+        root = sigma[free][:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        columns.append(sign * parameter_jacobian(camera, uv)[:, :, free] @ root)
+    return np.concatenate(columns, axis=2) if columns else None
+
+
+def _absorbed(lever: FloatArray, moved: FloatArray, known: BoolArray) -> FloatArray:
+    """Return the part of movements (k, 2, n) that a rotation and shift, fitted where known, take up."""
+    sound = known & np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(moved).all(axis=(1, 2))
+    A, columns = lever[sound].reshape(-1, lever.shape[2]), moved[sound].reshape(-1, moved.shape[2])
+    return np.asarray(lever @ np.linalg.lstsq(A, columns, rcond=None)[0])
+
+
+def _probability(square_sum: float, moved: FloatArray) -> float:
+    """Return the probability of a larger sum of squares of differences that have only chance in them.
+
+    Args:
+        square_sum: of the differences, px^2.
+        moved: how independent unit variables move them, px, (k, 2, n).
+    """
+    columns = moved.reshape(-1, moved.shape[2])
+    variances = np.linalg.eigvalsh(columns.T @ columns)
+    total, squares = float(variances.sum()), float((variances**2).sum())
+    if not total > 0:
+        return 0.0 if square_sum > 0 else 1.0
+    return float(chi2_sf(square_sum * total / squares, total**2 / squares))

@@ -1,0 +1,192 @@
+"""A calibrated camera in another model: a new adjustment of the same image points, where they are there.
+
+Models do not convert exactly. Where the image points of the calibration are known, they are adjusted again
+with the other model, so that it fits where points are, and exterior orientations and points take their part
+of the difference. Otherwise the curve is fitted over the photograph, see `sfm.comparison.camera_conversion`.
+
+The misfit is the difference of both cameras over the region of the image points, after the rotation that it
+implies, see `sfm.comparison.camera_difference`. Of the forms that a file can store, the leanest with as many
+radial terms as the camera uses is taken; if its misfit is above the limit, the next one with more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import adjust
+from sfm.comparison.camera_conversion import convert_camera, corresponding_free
+from sfm.comparison.camera_difference import compare_cameras
+from sfm.comparison.solutions import reprojection
+from sfm.model.camera import Camera
+from sfm.model.camera_file import CameraFile, cameras_of
+from sfm.model.distortion.models import MODELS, Role
+from sfm.model.errors import GeometryError, KolinearError, SurveyFileError
+from sfm.model.solution import Solution
+
+LIMIT_PX = 0.05  # RMS misfit up to which a camera is converted without being asked; a half of usual sigma0
+
+
+class Form(Protocol):
+    """A model of which all parameters but some, which must be 0, can be stored."""
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Parameters that must be 0."""
+
+
+@dataclass(frozen=True)
+class Readjusted:
+    """A camera in another model, and how far it differs from the former one."""
+
+    former: Camera
+    camera: Camera
+    rms_px: float  # RMS length of the difference over the region of the image points, px
+    max_px: float  # its largest length there, px
+    adjusted: bool  # whether the image points were adjusted again; otherwise the curve was fitted
+
+    @property
+    def words(self) -> str:
+        """The conversion in words."""
+        how = "image points adjusted again" if self.adjusted else "curve fitted over the photograph"
+        return (
+            f"camera {self.camera.name}: {self.former.model} to {self.camera.model}, {how}, "
+            f"misfit {self.rms_px:.4f} px RMS, {self.max_px:.4f} px at most"
+        )
+
+
+def readjust_cameras(
+    file: CameraFile, stored: Callable[[Camera], Camera | None], forms: Sequence[Form]
+) -> tuple[CameraFile, tuple[Readjusted, ...]]:
+    """Return cameras in forms that a file can store, and the conversions of those that were not.
+
+    Args:
+        file: the cameras, with the result that calibrated them where it is known.
+        stored: returns a camera as it is stored without conversion, None if it is not.
+        forms: the forms of the file, those with fewest parameters first.
+
+    Raises:
+        GeometryError: the distortion of a camera cannot be inverted over its photographs.
+        SurveyFileError: no form suits the lens.
+    """
+    cameras, covariance = list(file.cameras), list(file.covariance)
+    chosen: dict[int, tuple[Readjusted, Adjustment | None]] = {}
+    for k, camera in enumerate(file.cameras):
+        same = stored(camera)
+        if same is None:
+            chosen[k] = _converted(camera, file, forms)
+        elif same is not camera:
+            cameras[k], covariance[k] = same, None
+    conversions = [conversion for conversion, _ in chosen.values()]
+    anew = chosen[min(chosen)][1] if chosen else None
+    if len(chosen) > 1 and file.solution is not None and all(one.adjusted for one in conversions):
+        anew = _adjusted(file.solution, {one.camera.name: one.camera for one in conversions})
+    mounts = file.mounts
+    if anew is not None:
+        of_anew = cameras_of(anew.solution)
+        mounts = mounts and of_anew.mounts
+        for k, (conversion, _) in chosen.items():
+            row = of_anew.index(conversion.camera.name)
+            cameras[k], covariance[k] = of_anew.cameras[row], of_anew.covariance[row]
+            conversions[list(chosen).index(k)] = _difference(file.cameras[k], cameras[k], file, adjusted=True)
+    else:
+        for k, (conversion, _) in chosen.items():
+            cameras[k], covariance[k] = conversion.camera, None
+    changed = replace(file, cameras=tuple(cameras), covariance=tuple(covariance), mounts=mounts)
+    return changed, tuple(conversions)
+
+
+def _converted(
+    camera: Camera, file: CameraFile, forms: Sequence[Form]
+) -> tuple[Readjusted, Adjustment | None]:
+    """Return a camera in the leanest form within the limit, else in that of the smallest misfit."""
+    radial = int((camera.plays(Role.RADIAL, Role.DENOMINATOR) & (camera.parameters != 0)).sum())
+    best: tuple[Readjusted, Adjustment | None] | None = None
+    reasons: list[str] = []
+    suited = [form for form in forms if _radial_terms(form) >= radial] or [*forms[-1:]]
+    for form in suited:
+        try:
+            conversion = convert_camera(camera, form.model, held=form.held).camera
+        except KolinearError as error:
+            reasons.append(str(error))
+            continue
+        anew = None
+        if file.solution is not None:
+            anew = _adjusted(file.solution, {camera.name: _freed(camera, conversion, form.held)})
+        if anew is not None:
+            conversion = next(one for one in anew.estimate.cameras if one.name == camera.name)
+        found = _difference(camera, conversion, file, adjusted=anew is not None), anew
+        if best is None or found[0].rms_px < best[0].rms_px:
+            best = found
+        if found[0].rms_px <= LIMIT_PX:
+            break
+    if best is None:
+        models = ", ".join(dict.fromkeys(form.model for form in forms))
+        raise SurveyFileError(
+            f"camera {camera.name}: {camera.model} cannot be converted to {models}: {reasons[0]}"
+        )
+    return best
+
+
+def _radial_terms(form: Form) -> int:
+    """Return how many coefficients of radial distortion a form has."""
+    names = MODELS[form.model].names_of(Role.RADIAL, Role.DENOMINATOR)
+    return len([name for name in names if name not in form.held])
+
+
+def _freed(former: Camera, camera: Camera, held: tuple[str, ...]) -> Camera:
+    """Return a camera with the parameters free that correspond to the free ones of the former camera."""
+    free = corresponding_free(former, camera.model) & ~np.isin(camera.names, held)
+    return replace(camera, free=free, shared=())
+
+
+def _adjusted(solution: Solution, cameras: dict[str, Camera]) -> Adjustment | None:
+    """Return a new adjustment of a result with other cameras; None if it does not determine them.
+
+    Args:
+        solution: the result, without its rejected image points.
+        cameras: cameras by name, with the parameters free that were.
+    """
+    network, estimate = solution.network, solution.estimate
+    if not len(network.image_points) or not all(camera.free.any() for camera in cameras.values()):
+        return None
+    start = replace(estimate, cameras=tuple(cameras.get(camera.name, camera) for camera in estimate.cameras))
+    kind = solution.datum if solution.datum != "control" or len(network.control) else ""
+    try:
+        anew = adjust(network, start, datum=kind or "free", reject="none")
+    except GeometryError:
+        return None
+    fixed = anew.estimate.cameras
+    sound = all(np.isfinite(camera.parameters).all() for camera in fixed)
+    return anew if anew.converged and sound and not anew.undetermined else None
+
+
+def _difference(former: Camera, camera: Camera, file: CameraFile, *, adjusted: bool) -> Readjusted:
+    """Return the conversion with the difference of both cameras where image points are."""
+    seen = file.image_points(former.name)
+    difference = compare_cameras(former, camera, seen_px=(seen, None))
+    return Readjusted(former, camera, difference.rms_px, difference.largest_px, adjusted)
+
+
+def residuals_px(solution: Solution) -> tuple[float, ...]:
+    """Return the root mean square residual of an image coordinate of each camera of a result, px.
+
+    Args:
+        solution: the result; NaN for cameras without image points.
+    """
+    network = solution.network
+    v = reprojection(network, solution.estimate)
+    seen, estimate = network.image_points, solution.estimate
+    of = network.camera[seen.image[estimate.oriented[seen.image] & estimate.determined[seen.point]]]
+    return tuple(
+        float(np.sqrt(np.mean(v[of == k] ** 2))) if (of == k).any() else float("nan")
+        for k in range(len(estimate.cameras))
+    )
