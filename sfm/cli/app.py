@@ -34,6 +34,7 @@ from sfm.cli.commands.refine import refine
 from sfm.cli.commands.resect import resect
 from sfm.cli.commands.run import run
 from sfm.cli.commands.targets import targets
+from sfm.cli.commands.undistort import undistort
 from sfm.cli.commands.view import view
 
 
@@ -59,13 +60,16 @@ COMMANDS = (
     Command("resect", resect, "POINTS.csv --c MM", "one photograph on known points"),
     Command("mark", mark, "PHOTOS|SURVEY|RESULT", "measure points by hand, in the browser"),
     Command("match", match, "LEFT RIGHT", "conjugate points of two photographs"),
-    Command("compare", compare, "A B", "two results: differences and their significance"),
+    Command("compare", compare, "A B", "two results or cameras: differences and their significance"),
     Command("epochs", epochs, "FIRST SECOND", "what moved between surveys of one object"),
     Command("measure", measure, "RESULT", "shapes, distances, alignment, tolerances"),
     Command("accept", accept, "RESULT LENGTHS.csv", "calibrated lengths, VDI/VDE 2634 part 1"),
     Command("view", view, "FOLDER", "a result or a COLMAP model as one page to explore"),
     Command("refine", refine, "MODEL --images DIR", "re-measure the key points of a COLMAP model, adjust"),
-    Command("convert", convert, "IN OUT", "carry a survey between programs"),
+    Command("convert", convert, "IN OUT", "carry a survey or its cameras between programs"),
+    Command(
+        "undistort", undistort, "RESULT|CAMERA PHOTOS", "photographs without distortion, rectified pairs"
+    ),
     Command("doctor", doctor, "", "versions, folders, and whether this installation measures"),
 )
 PURPOSE = "Close-range photogrammetry: targets, orientation, bundle adjustment and comparison with COLMAP."

@@ -19,6 +19,10 @@ from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.errors import GeometryError
 
 GRID = 9  # grid points along each side of a photograph
+# As OpenCV: its inverse of a distortion ends after so many iterations, and its corners are in single precision.
+# Any focal length and principal point would do, and so they are those of cv2.stereoRectify to the last digits.
+ITERATIONS, CORNER = 5, np.float32
+OPENCV = ("opencv", "full_opencv")
 
 
 class Rectification(NamedTuple):
@@ -77,7 +81,7 @@ def rectify(
     turn = rotation_from_vector(normal)
     rotations = (turn @ half.T, turn @ half)
     base = float((rotations[1] @ T)[axis])
-    view = _common_view((first, second), rotations, axis, alpha)
+    view = common_view((first, second), rotations, axis, alpha)
     if view is None:
         return None
     f, c = view
@@ -90,13 +94,22 @@ def rectify(
     return Rectification(*rotations, P1, P2, Q)
 
 
-def _common_view(
-    cameras: tuple[Camera, Camera], rotations: tuple[FloatArray, FloatArray], axis: int, alpha: float
+def common_view(
+    cameras: tuple[Camera, ...], rotations: tuple[FloatArray, ...], axis: int, alpha: float
 ) -> tuple[float, FloatArray] | None:
-    """Return focal length and principal point (2,) of both rectified cameras, px; None if they cannot see.
+    """Return focal length and principal point of a camera without distortion that sees what others see.
 
-    The corners of the photographs are in the middle of the rectified ones. The focal length is such that the
+    The corners of the photographs are in the middle of the new ones. The focal length is such that the
     largest box without empty borders fills them (alpha 0), or the whole photographs are in them (alpha 1).
+
+    Args:
+        cameras: the cameras; the new photographs have the size of those of the first one.
+        rotations: x_new = rotation x of each, axes x right, y down, z forward, (3, 3) each.
+        axis: 0 takes the focal lengths along columns, 1 those along rows.
+        alpha: 0 to 1.
+
+    Returns:
+        Focal length, px, and principal point, px, (2,); None if a photograph reaches behind the image plane.
     """
     focal = [camera.parts[0] for camera in cameras]
     each = [
@@ -106,10 +119,11 @@ def _common_view(
     f = float(np.mean(each))
     centres = []
     for camera, rotation in zip(cameras, rotations, strict=True):
-        corners = _rectified(camera, rotation, 2)
+        corners = _rectified(camera, rotation, 2, CORNER)
         if corners is None:
             return None
-        centres.append((np.array(camera.size_px) - 1) / 2 - f * corners.reshape(-1, 2).mean(axis=0))
+        corners = (f * corners).astype(CORNER).astype(float)
+        centres.append((np.array(camera.size_px) - 1) / 2 - corners.reshape(-1, 2).mean(axis=0))
     c = np.mean(centres, axis=0)
     size, inner, outer = np.array(cameras[0].size_px), 0.0, np.inf
     for camera, rotation in zip(cameras, rotations, strict=True):
@@ -126,11 +140,30 @@ def _common_view(
     return f * (inner * (1 - alpha) + outer * alpha), np.asarray(c)
 
 
-def _rectified(camera: Camera, rotation: FloatArray, count: int) -> FloatArray | None:
+def _rectified(
+    camera: Camera, rotation: FloatArray, count: int, precision: type = float
+) -> FloatArray | None:
     """Return x/z and y/z of a grid on a photograph after a rotation, (n, n, 2); None if any is behind."""
     x, y = (np.linspace(0.0, side - 1.0, count) for side in camera.size_px)
-    uv = tangents_from_pixel(camera, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    rays = np.column_stack([uv[:, 0], -uv[:, 1], np.ones(len(uv))]) @ rotation.T
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    plane = _undistorted(camera, grid).astype(precision).astype(float)
+    rays = np.column_stack([plane, np.ones(len(plane))]) @ rotation.T
     if not (rays[:, 2] > 0).all():
         return None
     return np.asarray((rays[:, :2] / rays[:, 2:]).reshape(count, count, 2))
+
+
+def _undistorted(camera: Camera, xy: FloatArray) -> FloatArray:
+    """Return x/z and y/z of the rays of pixels, of models of OpenCV after as many iterations as there, (k, 2)."""
+    if camera.model not in OPENCV:
+        return np.asarray(tangents_from_pixel(camera, xy) * (1.0, -1.0))
+    fx, fy, cx, cy, *coefficients = camera.parameters
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * (8 - len(coefficients)))
+    x0, y0 = (xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy
+    x, y = x0, y0
+    for _ in range(ITERATIONS):
+        r2 = x * x + y * y
+        inverse = (1 + r2 * (k4 + r2 * (k5 + r2 * k6))) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+        dx, dy = 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        x, y = (x0 - dx) * inverse, (y0 - dy) * inverse
+    return np.column_stack([x, y])

@@ -33,7 +33,7 @@ from adapters.reading.trees import Tree, read_tree
 from sfm.model.camera import Camera
 from sfm.model.camera_file import CameraFile
 from sfm.model.conventions import FloatArray, skew
-from sfm.model.rectification import rectify
+from sfm.model.rectification import Rectification, rectify
 
 WHAT = "a file of an OpenCV camera"
 WIDTH, HEIGHT = (
@@ -132,14 +132,16 @@ def write_opencv(path: Path, file: CameraFile) -> str:
     return "\n".join(lines) + "\n"
 
 
-def pair_lines(first: Mounted, mounted: Mounted, unit: str, *, alpha: float = 0.0) -> Iterator[str]:
+def pair_lines(
+    first: Mounted, mounted: Mounted, unit: str, *, rectified: Rectification | None = None
+) -> Iterator[str]:
     """Yield the lines of two cameras with their rectification.
 
     Args:
         first: the reference camera, in model opencv.
         mounted: the second camera.
         unit: unit of lengths.
-        alpha: see `sfm.model.rectification.rectify`.
+        rectified: the rectification that gave them, if they are rectified; otherwise theirs is computed.
     """
     R, T, second = mounted.R, mounted.T, mounted.camera
     K1, K2 = matrix_of(first.camera), matrix_of(second)
@@ -148,7 +150,7 @@ def pair_lines(first: Mounted, mounted: Mounted, unit: str, *, alpha: float = 0.
     matrices = {"K1": K1, "D1": np.array([coefficients_of(first.camera)])}
     matrices |= {"K2": K2, "D2": np.array([coefficients_of(second)])}
     matrices |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
-    rectified = rectify(first.camera, second, R, T, alpha=alpha)
+    rectified = rectified or rectify(first.camera, second, R, T)
     yield from ("%YAML:1.0", "---", f"# T is in {unit}: x2 = R x1 + T")
     yield f"camera1: {json.dumps(first.camera.name, ensure_ascii=False)}"
     yield f"camera2: {json.dumps(second.name, ensure_ascii=False)}"

@@ -1,0 +1,94 @@
+"""Photographs drawn anew as a view shows them, with their bits, colours and EXIF data."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from sfm.model.conventions import AnyArray
+from sfm.model.errors import PhotographError
+from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
+from sfm.products.undistorting.views import View
+
+JPEG_QUALITY = 97  # percent; noise of a new compression is below that of the photograph
+INTERPOLATION = cv2.INTER_CUBIC
+
+
+class UndistortedPhotographs:
+    """Draws photographs of some cameras, whose places are computed once for each view."""
+
+    def __init__(self) -> None:
+        self._view: View | None = None
+        self._places: tuple[AnyArray, AnyArray] | None = None
+        self.without_exif: list[str] = []
+        """names of photographs whose EXIF data could not be kept"""
+
+    def draw(self, path: Path, view: View, out: Path) -> None:
+        """Draw a photograph as a view shows it.
+
+        Args:
+            path: the photograph.
+            view: of the camera that took it.
+            out: new file with the same ending.
+
+        Raises:
+            PhotographError: it cannot be read, or has another size than the camera.
+            OSError: the new file cannot be written.
+        """
+        if self._view is not view or self._places is None:
+            self._view, self._places = view, view.places()
+        data = read_bytes(path)
+        refuse_truncated(path, data)
+        with opened_header(path, io.BytesIO(data)) as header:
+            size, kind = header.size, header.format or ""
+            exif = header.info.get("exif") or header.getexif().tobytes()
+            icc = header.info.get("icc_profile")
+        if size != view.former.size_px:
+            needed = f"{view.former.size_px[0]} x {view.former.size_px[1]}"
+            raise PhotographError(
+                f"{path.name}: {size[0]} x {size[1]} px, camera {view.former.name} was calibrated with "
+                f"photographs of {needed} px; needed photographs of that size"
+            )
+        refuse_bomb(path, size, data)
+        pixels = _decoded(path, data)
+        x, y = self._places
+        drawn = cv2.remap(pixels, x, y, INTERPOLATION, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        if drawn.dtype == np.uint8:
+            colours = drawn if drawn.ndim == 2 else np.ascontiguousarray(drawn[:, :, _in_rgb(drawn)])
+            options: dict[str, object] = {"exif": exif} if exif else {}
+            options |= {"icc_profile": icc} if icc else {}
+            if kind in ("JPEG", "MPO"):
+                options |= {"quality": JPEG_QUALITY, "subsampling": 0}
+            Image.fromarray(colours).save(out, "JPEG" if kind == "MPO" else kind, **options)
+            return
+        if exif:
+            self.without_exif.append(path.name)
+        done, encoded = cv2.imencode(out.suffix, drawn)
+        if not done:
+            raise PhotographError(
+                f"{path.name}: a photograph of {drawn.dtype} cannot be written as {out.suffix}"
+            )
+        out.write_bytes(encoded.tobytes())
+
+
+def _decoded(path: Path, data: bytes) -> AnyArray:
+    """Return the pixels as stored, with all bits and colours, (H, W) or (H, W, 3 or 4)."""
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
+    return np.asarray(image)
+
+
+def _in_rgb(image: AnyArray) -> Sequence[int]:
+    """Return the order of OpenCV's channels blue, green, red and alpha as others have them."""
+    return (2, 1, 0, 3)[: image.shape[2]]
