@@ -100,7 +100,7 @@ class Tree:
             shape = [int(matrix.number(side)) for side in ("rows", "cols") if matrix.key(side)]
             if len(shape) == 2 and shape[0] * shape[1] != len(data):
                 raise self.error(
-                    f"{self.place}{name}: {len(data)} numbers, its rows and cols state {shape[0]} x {shape[1]}"
+                    f"{self.place}{name}: {len(data)} numbers, rows and cols state {shape[0]} x {shape[1]}"
                 )
         else:
             data = np.array([self._number(name, leaf) for leaf in _leaves(value)])
@@ -138,7 +138,8 @@ class Tree:
             number = None
         if number is None or not math.isfinite(number) or abs(number) > MAX_NUMBER:
             raise self.error(
-                f"{self.place}{name} is '{shorten(str(value))}', needed a finite number of at most {MAX_NUMBER:g}"
+                f"{self.place}{name} is '{shorten(str(value))}', needed a finite number of at most "
+                f"{MAX_NUMBER:g}"
             )
         return number
 
@@ -150,7 +151,7 @@ def _leaves(value: Any, depth: int = 2) -> list[Any]:
     return [leaf for item in value for leaf in _leaves(item, depth - 1)]
 
 
-class _Texts(yaml.BaseLoader):
+class _Texts(yaml.BaseLoader):  # type: ignore[misc]  # PyYAML has no types
     """Reads every leaf as text, and no anchors."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -228,7 +229,9 @@ def read_tree(path: Path, what: str) -> Tree:
             values = yaml.load(f"\n{rest}" if version.startswith("%YAML") else text, _Texts)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise SurveyFileError(f"{path}, line {line}: not {what} ({one_line(error.problem or '')})") from error
+        raise SurveyFileError(
+            f"{path}, line {line}: not {what} ({' '.join(str(error.problem).split())})"
+        ) from error
     except yaml.YAMLError as error:
         raise SurveyFileError(f"{path}: not {what} ({one_line(error):.100})") from error
     except json.JSONDecodeError as error:

@@ -96,8 +96,8 @@ def undistort_photographs(
                     path = target / f"camera-{_file_name(new.name)}{form.suffixes[0]}"
                     write_cameras(path, to, CameraFile(file.name, (new,), (None,)))
                     lines.append(
-                        f"camera {new.name}: {counted(owner.count(k), 'photograph')}, new camera {path.name}, "
-                        f"f = {new.value('fx'):.4f} px"
+                        f"camera {new.name}: {counted(owner.count(k), 'photograph')}, new camera "
+                        f"{path.name}, f = {new.value('fx'):.4f} px"
                     )
     if draw.without_exif:
         lines.append(
@@ -209,8 +209,8 @@ def _draw_pairs(
     """Draw rectified pairs, and write their cameras; return what was drawn in words."""
     if file.mounts is None or not any(file.mounts.rig):
         raise SurveyFileError(
-            f"{file.name}: how the cameras are mounted is not known, which pairs require: needed a result with "
-            "[[rig]], or a file with R and T"
+            f"{file.name}: how the cameras are mounted is not known, which pairs require: needed a result "
+            "with [[rig]], or a file with R and T"
         )
     moments = _moments(file, names)
     pairs = [rectified_pair(file.cameras, file.mounts, a, b, alpha or 0.0) for a, b in pairs_of(file.mounts)]

@@ -166,10 +166,10 @@ def compare_cameras(
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     uv = tangents_from_pixel(a, grid)
     fits = np.isfinite(uv).all(axis=1) & np.isfinite(pixel_from_tangents(b, uv)).all(axis=1)
-    known = fits.copy()
+    known: BoolArray = np.array(fits)
     for seen in seen_px:
         if seen is not None and len(seen):
-            known &= observed_part(seen, grid)[1]
+            known = np.asarray(known & observed_part(seen, grid)[1])
     if known.sum() < 4:
         raise GeometryError(
             f"cameras {a.name} and {b.name}: {known.sum()} of {len(grid)} places of the photograph are known "
@@ -182,7 +182,7 @@ def compare_cameras(
     rotation, translation, moved = _implied(b, points, grid, known, shifts)
     difference = pixel_from_tangents(b, moved) - grid
     difference[~fits] = np.nan
-    known &= np.isfinite(difference).all(axis=1)
+    known = np.asarray(known & np.isfinite(difference).all(axis=1))
     C, p_value = np.full((len(grid), 2, 2), np.nan), float("nan")
     if sigmas is not None:
         free = sigmas - _absorbed(_lever(b, moved, points, shifts), sigmas, known)
@@ -226,7 +226,8 @@ def _implied(
         uv = _tangents(at)
         lever, off = _lever(b, uv, at, shifts), pixel_from_tangents(b, uv) - xy[known]
         sound = np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
-        step = np.linalg.lstsq(lever[sound].reshape(-1, 3 + shifts), -off[sound].ravel(), rcond=None)[0]
+        A, rest = lever[sound].reshape(-1, 3 + shifts), -off[sound].ravel()
+        step = np.asarray(np.linalg.lstsq(A, rest, rcond=None)[0], dtype=float)
         turn = rotation_from_vector(step[:3])
         R, t = turn @ R, turn @ t + (step[3:] if shifts else 0.0)
         if np.abs(step[:3]).max() < CONVERGED:
@@ -241,7 +242,7 @@ def _tangents(points: FloatArray) -> FloatArray:
 
 
 def _lever(b: Camera, uv: FloatArray, points: FloatArray, shifts: int) -> FloatArray:
-    """Return the derivatives of the pixels of points by a rotation and a shift of them, px, (k, 2, 3 + shifts).
+    """Return the derivatives of the pixels of points by a rotation and a shift, px, (k, 2, 3 + shifts).
 
     Args:
         b: the camera.
@@ -277,10 +278,10 @@ def _moved_by_sigma(
     uv: FloatArray,
     covariance: tuple[FloatArray | None, FloatArray | None],
 ) -> FloatArray | None:
-    """Return how independent unit variables of both cameras move the differences, px, (k, 2, n); None unknown.
+    """Return how independent unit variables of both cameras move the differences, px, (k, 2, n).
 
     A camera's variables are those whose covariance is the identity, so that the sum of the outer products of
-    the columns is the covariance of the differences.
+    the columns is the covariance of the differences. None if neither covariance is known.
     """
     columns = []
     for camera, Q, sign in ((a, covariance[0], -1.0), (b, covariance[1], 1.0)):

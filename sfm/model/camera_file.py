@@ -72,7 +72,7 @@ class CameraFile:
         )
 
     def image_points(self, name: str) -> FloatArray | None:
-        """Return the image points of a camera in the result that calibrated it, px, (k, 2); None if unknown."""
+        """Return the image points that calibrated a camera, px, (k, 2); None if unknown."""
         if self.solution is None:
             return None
         names = [camera.name for camera in self.solution.estimate.cameras]

@@ -19,8 +19,8 @@ from sfm.model.conventions import FloatArray, rotation_from_vector
 from sfm.model.errors import GeometryError
 
 GRID = 9  # grid points along each side of a photograph
-# As OpenCV: its inverse of a distortion ends after so many iterations, and its corners are in single precision.
-# Any focal length and principal point would do, and so they are those of cv2.stereoRectify to the last digits.
+# As OpenCV: its inverse of a distortion ends after so many iterations, and its corners have single precision.
+# Any focal length and principal point would do, and so they are those of cv2.stereoRectify to 1e-9.
 ITERATIONS, CORNER = 5, np.float32
 OPENCV = ("opencv", "full_opencv")
 
@@ -154,11 +154,11 @@ def _rectified(
 
 
 def _undistorted(camera: Camera, xy: FloatArray) -> FloatArray:
-    """Return x/z and y/z of the rays of pixels, of models of OpenCV after as many iterations as there, (k, 2)."""
+    """Return x/z and y/z of the rays of pixels, of OpenCV's models as inexact as there, (k, 2)."""
     if camera.model not in OPENCV:
         return np.asarray(tangents_from_pixel(camera, xy) * (1.0, -1.0))
-    fx, fy, cx, cy, *coefficients = camera.parameters
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * (8 - len(coefficients)))
+    fx, fy, cx, cy = camera.parameters[:4]
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([camera.parameters[4:], np.zeros(8)])[:8]
     x0, y0 = (xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy
     x, y = x0, y0
     for _ in range(ITERATIONS):

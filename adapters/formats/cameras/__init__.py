@@ -1,1 +1,1 @@
-"""Files of calibrated cameras of other programs, a module a format; `registry` reads and writes all of them."""
+"""Files of calibrated cameras, a module a format; `registry` reads and writes all of them."""

@@ -78,7 +78,10 @@ def _camera(path: Path, name: str, values: dict[str, float], sides: dict[str, tu
 
 
 def write_australis(path: Path, file: CameraFile) -> str:
-    """Return the text of cameras in model brown_affine, or brown without affinity, with standard deviations where they are known."""
+    """Return the text of cameras in model brown_affine, or brown without affinity.
+
+    Standard deviations are written where they are known.
+    """
     lines = ["Australis Bundle Adjustment Results: Camera Parameters", ""]
     for k, (camera, Q) in enumerate(zip(file.cameras, file.covariance, strict=True), 1):
         sigma = np.zeros(len(camera.names)) if Q is None else np.sqrt(np.diagonal(Q))

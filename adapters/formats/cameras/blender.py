@@ -1,4 +1,4 @@
-"""A camera of Blender without distortion: its properties and those of the render, by Blender's names, in JSON.
+"""A camera of Blender without distortion: the properties of camera and render in JSON.
 
     lens, sensor_width, sensor_height    mm
     sensor_fit, shift_x, shift_y         HORIZONTAL; in widths of the sensor, x right, y up of the picture

@@ -29,6 +29,7 @@ from adapters.formats.cameras.lens_terms import (
 from adapters.reading.trees import Tree, read_tree
 from sfm.model.camera import Camera
 from sfm.model.camera_file import CameraFile
+from sfm.model.conventions import FloatArray
 
 WHAT = "a camera chain of Kalibr"
 MAX_CAMERAS = 1000
@@ -50,7 +51,8 @@ def read_kalibr(path: Path) -> CameraFile:
         SurveyFileError: no camera, or a model that is not read.
     """
     tree = read_tree(path, WHAT)
-    cameras, poses = [], []
+    cameras: list[Camera] = []
+    poses: list[tuple[FloatArray, FloatArray]] = []
     while len(cameras) < MAX_CAMERAS and tree.key(f"cam{len(cameras)}"):
         k = len(cameras)
         cameras.append(_camera(tree.below(f"cam{k}"), f"cam{k}"))

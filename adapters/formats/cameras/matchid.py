@@ -14,7 +14,7 @@ from adapters.formats.cameras.lens_terms import Mounted, coefficients_of, matrix
 
 
 def pair_lines(pair: list[Mounted]) -> Iterator[str]:
-    """Yield the lines of two cameras in model opencv, lengths in mm; a third radial coefficient is Kappa 3."""
+    """Yield the lines of two cameras in model opencv, lengths in mm."""
     for k, mounted in enumerate(pair):
         K, (k1, k2, p1, p2, k3) = matrix_of(mounted.camera), coefficients_of(mounted.camera)[:5]
         values = {"Fx [pixels]": K[0, 0], "Fy [pixels]": K[1, 1], "Fs [pixels]": 0.0}

@@ -65,7 +65,8 @@ def read_mrcal(path: Path) -> CameraFile:
     kind = lens.removeprefix(LENS)
     if kind.startswith("SPLINED"):
         raise tree.error(
-            f"{lens.partition('_order')[0]}: splined models are not read, convert it with mrcal-convert-lensmodel"
+            f"{lens.partition('_order')[0]}: splined models are not read; mrcal-convert-lensmodel converts "
+            "them"
         )
     if not lens.startswith(LENS) or kind not in COUNTS:
         raise tree.error(

@@ -92,7 +92,7 @@ def _size(tree: Tree) -> tuple[int, int]:
         return tree.side("width", width), tree.side("height", height)
     if not tree.key(*WIDTH):
         raise tree.error(
-            "the size of the photographs is missing (width and height), which a camera needs; add it to the file"
+            "the size of the photographs is missing, which a camera needs; add width and height to the file"
         )
     return tree.sides(WIDTH, HEIGHT)
 

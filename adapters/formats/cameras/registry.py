@@ -222,7 +222,7 @@ def read_cameras(path: Path, name: str | None = None) -> CameraFile:
     if form is not None:
         file = form.read(path)
         _refuse_duplicates(path, file)
-        return file
+        return replace(file, name=str(path))
     if name is None and not path.is_dir():
         try:
             format_of(path)
@@ -230,7 +230,7 @@ def read_cameras(path: Path, name: str | None = None) -> CameraFile:
             raise SurveyFileError(
                 f"{path}: not a file of a camera in a format that is read ({', '.join(NAMES)}), nor a result"
             ) from error
-    return cameras_of(read_content(path, name).result)
+    return replace(cameras_of(read_content(path, name).result), name=str(path))
 
 
 def refuse_links_out_of(path: Path) -> None:

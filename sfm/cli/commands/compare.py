@@ -1,7 +1,8 @@
-"""The command `compare`: two results of one object."""
+"""The command `compare`: two results of one object, or two calibrated cameras."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def compare(
-    a: Annotated[Path, typer.Argument(metavar="A", help="Result folder, COLMAP model, or another format.")],
+    a: Annotated[Path, typer.Argument(metavar="A", help="Result, or a file of cameras.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Result to compare with A.")],
     align: Annotated[
         str, typer.Option("--align", help="Align B to A by points, cameras, control or none.")
@@ -31,24 +32,54 @@ def compare(
     b_format: Annotated[
         str | None, typer.Option("--from-b", metavar="F", help="Format of B.  [default: by its content]")
     ] = None,
+    cameras: Annotated[
+        bool, typer.Option("--cameras", help="Compare the cameras of two results, not their points.")
+    ] = False,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            metavar="NAME",
+            help="Camera of both; A=B if it has another name in B.  [default: the only]",
+        ),
+    ] = None,
+    distance: Annotated[
+        float,
+        typer.Option(
+            "--distance",
+            metavar="D",
+            help="Compare the images of points at this distance, not of directions.",
+        ),
+    ] = math.inf,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for the table, JSON and page.")
     ] = Path("out/comparison"),
 ) -> None:
-    """Compare two results.
+    """Compare two results, or two calibrated cameras.
 
-    Reports differences, their standard deviations, and which differences are significant.
+    Of results, reports differences, their standard deviations, and which differences are significant. If A or
+    B is a file of cameras, or with --cameras, reports where both image the same directions: the difference in
+    px over the photograph after the rotation that it implies, in standard deviations where they are known.
     """
     with loading():
         from adapters.formats.registry import read_comparable
+        from sfm.cli.compared_cameras import compared_as_cameras, difference_of_files
         from sfm.cli.console import exit_by, print_verdict
         from sfm.comparison.comparison_remarks import verdict_of_comparison
         from sfm.comparison.significance import compare_results
         from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.report.camera_differences import verdict_of_difference, write_picture
         from sfm.report.differences import describe_pairing, describe_scale, largest_difference
         from sfm.report.pages import write_page
 
     refuse_foreign_folder(out)
+    if cameras or camera or compared_as_cameras(a, a_format) or compared_as_cameras(b, b_format):
+        with working_on(f"{a} and {b}"):
+            difference = difference_of_files(a, b, a_format, b_format, camera=camera, distance=distance)
+        page = write_page(difference, out, also=lambda folder: write_picture(difference, folder))
+        print_verdict(verdict_of_difference(difference))
+        print(f"Report: {page}")
+        return
     with working_on(str(a)):
         first = read_comparable(a, a_format)
     with working_on(str(b)):

@@ -31,7 +31,7 @@ def undistort(
         typer.Option(
             "--alpha",
             metavar="A",
-            help="0: no border is empty, 1: everything is visible.  [default: c and principal point are kept; "
+            help="0: no border is empty, 1: everything is visible.  [default: c and principal point kept; "
             "0 for pairs]",
         ),
     ] = None,
@@ -48,8 +48,8 @@ def undistort(
 ) -> None:
     """Write photographs without distortion, and the cameras that see them.
 
-    Photographs keep their names, bits, colours and EXIF data. Pairs of a rig are rectified with --pairs: their
-    cameras, R1, R2, P1, P2 and Q are those of OpenCV's stereoRectify, with zero disparity at infinity.
+    Photographs keep their names, bits, colours and EXIF data. Pairs of a rig are rectified with --pairs:
+    their cameras, R1, R2, P1, P2 and Q are those of OpenCV's stereoRectify, with zero disparity at infinity.
     """
     with loading():
         from sfm.cli.undistorted import undistort_photographs

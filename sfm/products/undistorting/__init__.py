@@ -1,1 +1,1 @@
-"""Photographs without distortion, and rectified pairs: `views` says what they show, `photographs` draws them."""
+"""Photographs without distortion, and rectified pairs: what they show (`views`), and how they are drawn."""

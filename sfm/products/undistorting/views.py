@@ -1,4 +1,4 @@
-"""What photographs without distortion show: new cameras, and where their pixels are in the former photographs.
+"""What photographs without distortion show: new cameras, and where their pixels are in the former ones.
 
 An undistorted photograph has the projection centre and the axes of the former one, and a camera in model
 opencv without distortion. The photographs of a rectified pair are turned in addition, so that conjugate
@@ -55,7 +55,7 @@ class View:
             rays = np.column_stack([grid, np.ones(len(grid))]) @ from_pixel.T
             ahead = rays[:, 2] > 0
             found = np.full((len(grid), 2), -1.0)
-            uv = rays[ahead, :2] / rays[ahead, 2:] * (1.0, -1.0)
+            uv: FloatArray = rays[ahead, :2] / rays[ahead, 2:] * np.array([1.0, -1.0])
             found[ahead] = np.nan_to_num(pixel_from_tangents(self.former, uv), nan=-1.0)
             x[rows], y[rows] = found.reshape(len(rows), width, 2).transpose(2, 0, 1)
         return x, y
@@ -101,8 +101,8 @@ def undistorted_view(camera: Camera, alpha: float | None = None) -> View:
     found = common_view((camera,), (np.eye(3),), 0, alpha)
     if found is None or not np.isfinite(found[0]):
         raise GeometryError(
-            f"camera {camera.name}: its photographs see too wide for one image plane; leave out --alpha, which "
-            "shows their middle"
+            f"camera {camera.name}: its photographs see too wide for one image plane; without --alpha, their "
+            "middle is shown"
         )
     f, (cx, cy) = found[0], found[1].tolist()
     side = float(camera.pixel_mm[1])
@@ -143,7 +143,7 @@ def rectified_pair(
     rectification = rectify(a, b, R, T, alpha=alpha)
     if rectification is None:
         raise GeometryError(
-            f"cameras {a.name} and {b.name}: their viewing directions differ too much for a common image plane"
+            f"cameras {a.name} and {b.name}: their viewing directions differ too much for one image plane"
         )
     new = [rectification.camera(camera.name, a.size_px, camera.pixel_mm) for camera in (a, b)]
     base = rectification.R2 @ T

@@ -1,17 +1,21 @@
-"""The figure of differences between two sets of coordinates."""
+"""The figures of differences between two sets of coordinates, and between two cameras."""
 
 from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from sfm.comparison.camera_difference import CameraDifference
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.report.figures.plots import (
     ALONE_IN,
+    BAR_FRACTION,
     BLUE,
     RED,
+    SHADES,
     plan_axes,
     single_panel_figure,
+    two_panel_figure,
 )
 from sfm.report.phrases import finer_unit, significant
 
@@ -58,4 +62,40 @@ def difference_figure(
     axes.set_aspect("equal")
     suffix = f" [{unit}]" if unit else ""
     axes.set(xlabel=f"{names[0]}{suffix}", ylabel=f"{names[1]}{suffix}")
+    return picture
+
+
+def camera_difference_figure(difference: CameraDifference) -> Figure:
+    """Draw the difference of two cameras over the format: its length as colour, its direction as arrows.
+
+    Outside of the region in which both cameras are known, colours are pale. With covariances a second panel
+    shows the differences in standard deviations.
+    """
+    length, known = difference.length_px, difference.known
+    over = length / difference.sigma_px
+    panels: list[tuple[FloatArray, str]] = [(length, "difference [px]")]
+    if np.isfinite(over[known]).any():
+        panels.append((over, "over its standard deviation"))
+    width, height = difference.size_px
+    picture = two_panel_figure(1.2 + 4.0 * height / width) if len(panels) == 2 else single_panel_figure(4.8)
+    axes = np.atleast_1d(picture.subplots(1, len(panels)))
+    X, Y = np.meshgrid(difference.x, difference.y)
+    arrows = difference.difference
+    for panel, (values, label) in zip(axes, panels, strict=True):
+        top = float(np.nanmax(values[known])) or 1.0
+        cell = [difference.x[1] - difference.x[0], difference.y[1] - difference.y[0]]
+        extent = (-cell[0] / 2, width - 1 + cell[0] / 2, height - 1 + cell[1] / 2, -cell[1] / 2)
+        drawn = panel.imshow(
+            values, cmap=SHADES, vmin=0.0, vmax=top, extent=extent, alpha=np.where(known, 1.0, 0.3)
+        )
+        picture.colorbar(drawn, ax=panel, label=label, shrink=0.8, fraction=BAR_FRACTION)
+        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
+    step = slice(None, None, 3)
+    longest = float(np.nanmax(length[known])) or 1.0
+    scale = longest / (3 * (difference.x[1] - difference.x[0]))
+    drawn_arrows = axes[0].quiver(
+        X[step, step], Y[step, step], arrows[step, step, 0], arrows[step, step, 1],
+        color="black", angles="xy", scale_units="xy", scale=scale, width=0.003,
+    )  # fmt: skip
+    axes[0].quiverkey(drawn_arrows, 0.1, 1.03, longest, f"{significant(longest)} px", labelpos="E")
     return picture

@@ -1,0 +1,73 @@
+"""The work of `kolinear compare` for cameras: which two, from which files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from adapters.formats.cameras.registry import NAMES, camera_format_of, read_cameras
+from sfm.comparison.camera_difference import CameraDifference, compare_cameras
+from sfm.model.errors import GeometryError
+
+
+def compared_as_cameras(path: Path, name: str | None) -> bool:
+    """Return whether a path is a file of cameras, and no result.
+
+    Args:
+        path: file or folder.
+        name: name of its format; None detects it.
+    """
+    return name in NAMES if name is not None else path.is_file() and camera_format_of(path) is not None
+
+
+def difference_of_files(
+    a: Path,
+    b: Path,
+    a_format: str | None,
+    b_format: str | None,
+    *,
+    camera: str | None,
+    distance: float,
+) -> CameraDifference:
+    """Return the difference of a camera of each of two files or results.
+
+    Args:
+        a: file or result.
+        b: file or result.
+        a_format: name of the format of a; None detects it.
+        b_format: name of the format of b; None detects it.
+        camera: name of the camera in both, or NAME=NAME; None for the only one.
+        distance: of the points whose images are compared; infinite for directions.
+
+    Raises:
+        KolinearError: a file cannot be read, or the cameras cannot be compared.
+    """
+    first, second = read_cameras(a, a_format), read_cameras(b, b_format)
+    names = (camera, camera)
+    if camera is not None and "=" in camera:
+        left, _, right = camera.partition("=")
+        names = (left, right)
+    if camera is None and len(second.cameras) > 1 and len(first.cameras) == 1:
+        shared = [one.name for one in second.cameras if one.name == first.cameras[0].name]
+        names = (None, shared[0] if shared else None)
+    if camera is None and len(first.cameras) > 1 and len(second.cameras) == 1:
+        shared = [one.name for one in first.cameras if one.name == second.cameras[0].name]
+        names = (shared[0] if shared else None, None)
+    chosen = [file.only(name) for file, name in zip((first, second), names, strict=True)]
+    if a.resolve() == b.resolve() and chosen[0].cameras[0].name == chosen[1].cameras[0].name:
+        raise GeometryError(
+            f"{a}: camera {chosen[0].cameras[0].name} would be compared with itself, needed another file or "
+            "--camera A=B"
+        )
+    seen = tuple(file.image_points(file.cameras[0].name) for file in chosen)
+    labels = [f"{file.cameras[0].name} of {path.name}" for file, path in zip(chosen, (a, b), strict=True)]
+    if labels[0] == labels[1]:
+        labels = [f"{file.cameras[0].name} of {path}" for file, path in zip(chosen, (a, b), strict=True)]
+    cameras = [replace(file.cameras[0], name=label) for file, label in zip(chosen, labels, strict=True)]
+    return compare_cameras(
+        cameras[0],
+        cameras[1],
+        covariance=(chosen[0].covariance[0], chosen[1].covariance[0]),
+        seen_px=(seen[0], seen[1]),
+        distance=distance,
+    )
