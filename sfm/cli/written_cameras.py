@@ -110,11 +110,14 @@ def refuse_inexact(conversions: tuple[Readjusted, ...], *, inexact: bool) -> Non
     """Raise OutputError for the first conversion whose misfit is above the limit, unless it was asked for."""
     for conversion in conversions:
         if conversion.rms_px > LIMIT_PX and not inexact:
+            ideal = not conversion.camera.parts[2].any()
+            remedy = (
+                "kolinear undistort makes photographs that it fits" if ideal else "another format may have it"
+            )
             raise OutputError(
                 f"camera {conversion.former.name}: model {conversion.camera.model} differs from "
                 f"{conversion.former.model} by {conversion.rms_px:.3f} px RMS, {conversion.max_px:.3f} px at "
-                f"most, more than {LIMIT_PX:g} px; --inexact writes it all the same, another format may have "
-                "the model"
+                f"most, more than {LIMIT_PX:g} px; --inexact writes it all the same, {remedy}"
             )
 
 

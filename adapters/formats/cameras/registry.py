@@ -157,7 +157,7 @@ CAMERA_FORMATS = (
         "blender-camera",
         "Blender",
         (".json",),
-        (LensForm("pinhole"), LensForm("opencv", ("k1", "k2", "p1", "p2"))),
+        (LensForm("opencv", ("k1", "k2", "p1", "p2")), LensForm("pinhole")),
         lambda path, head: '"sensor_width"' in head and '"lens"' in head,
         read_blender,
         write_blender,
