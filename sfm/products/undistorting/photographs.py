@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import PhotographError
@@ -16,6 +16,12 @@ from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_
 from sfm.products.undistorting.views import View
 
 JPEG_QUALITY = 97  # percent; noise of a new compression is below that of the photograph
+# Tags of TIFF that describe the photograph, and not how its pixels are stored.
+_TAGS = ExifTags.Base
+OF_PHOTOGRAPH = {
+    *(_TAGS.Make, _TAGS.Model, _TAGS.ImageDescription, _TAGS.Orientation, _TAGS.XResolution),
+    *(_TAGS.YResolution, _TAGS.ResolutionUnit, _TAGS.Software, _TAGS.DateTime, _TAGS.Artist, _TAGS.Copyright),
+}
 INTERPOLATION = cv2.INTER_CUBIC
 
 
@@ -46,16 +52,16 @@ class UndistortedPhotographs:
         refuse_truncated(path, data)
         with opened_header(path, io.BytesIO(data)) as header:
             size, kind = header.size, header.format or ""
-            exif = header.info.get("exif") or header.getexif().tobytes()
+            exif = header.info.get("exif") or _exif(header)
             icc = header.info.get("icc_profile")
+        refuse_bomb(path, size, data)
+        pixels = _decoded(path, data)
         if size != view.former.size_px:
             needed = f"{view.former.size_px[0]} x {view.former.size_px[1]}"
             raise PhotographError(
                 f"{path.name}: {size[0]} x {size[1]} px, camera {view.former.name} was calibrated with "
                 f"photographs of {needed} px; needed photographs of that size"
             )
-        refuse_bomb(path, size, data)
-        pixels = _decoded(path, data)
         x, y = self._places
         drawn = cv2.remap(pixels, x, y, INTERPOLATION, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         if drawn.dtype == np.uint8:
@@ -87,6 +93,20 @@ def _decoded(path: Path, data: bytes) -> AnyArray:
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
     return np.asarray(image)
+
+
+def _exif(header: Image.Image) -> bytes:
+    """Return the EXIF data of a file without a block of its own: of TIFF, which OpenCV turns upright."""
+    found, kept = header.getexif(), Image.Exif()
+    for tag in OF_PHOTOGRAPH & set(found):
+        kept[tag] = found[tag]
+    for directory in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+        kept.get_ifd(directory).update(found.get_ifd(directory))
+        if kept.get_ifd(directory):
+            kept[directory] = kept.get_ifd(directory)
+    if ExifTags.Base.Orientation in kept:
+        kept[ExifTags.Base.Orientation] = 1
+    return kept.tobytes() if len(kept) else b""
 
 
 def _in_rgb(image: AnyArray) -> Sequence[int]:
