@@ -11,6 +11,7 @@ from sfm.model import observations as observations
 from sfm.model.camera import Camera as Camera
 from sfm.model.camera import camera_from_values as camera_from_values
 from sfm.model.camera import project as project
+from sfm.model.camera_file import CameraFile as CameraFile
 from sfm.model.errors import KolinearError as KolinearError
 from sfm.model.estimate import Estimate as Estimate
 from sfm.model.network import Network as Network
@@ -30,8 +31,10 @@ from sfm.products.public_functions import compare as compare
 from sfm.products.public_functions import distance as distance
 from sfm.products.public_functions import measure as measure
 from sfm.products.public_functions import network_from_colmap as network_from_colmap
+from sfm.products.public_functions import read_cameras as read_cameras
 from sfm.products.public_functions import read_result as read_result
 from sfm.products.public_functions import run_survey as run_survey
+from sfm.products.public_functions import write_cameras as write_cameras
 from sfm.products.public_functions import write_result as write_result
 from sfm.survey.inputs.exterior_table import ObservedExterior as ObservedExterior
 from sfm.survey.inputs.given_values import KnownPoints as KnownPoints

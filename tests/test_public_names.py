@@ -68,6 +68,9 @@ PUBLIC = {
     *(
         "OrientSettings",
         "orient",
+        "CameraFile",
+        "read_cameras",
+        "write_cameras",
         "read_photograph",
         "read_result",
         "read_survey",

@@ -110,7 +110,7 @@ def refuse_inexact(conversions: tuple[Readjusted, ...], *, inexact: bool) -> Non
     """Raise OutputError for the first conversion whose misfit is above the limit, unless it was asked for."""
     for conversion in conversions:
         if conversion.rms_px > LIMIT_PX and not inexact:
-            ideal = not conversion.camera.parts[2].any()
+            ideal = not conversion.camera.parameters[conversion.camera.parts[2]].any()
             remedy = (
                 "kolinear undistort makes photographs that it fits" if ideal else "another format may have it"
             )

@@ -1,6 +1,7 @@
 """Comparison of solutions: two adjusters on one network, a survey with a baseline, two results of one object.
 
 - `compare_results`: begin here; aligns two results by names and tests them.
+- `compare_cameras`: two calibrations in px over the format, with their standard deviations.
 - `compare`: compares two solutions of one network, as in `sfm.compare` and the report.
 - `find_stable_points`, `robust_weights`: find points that did not move between two epochs.
 

@@ -1,5 +1,7 @@
 """The public names of `sfm.comparison`, a row each."""
 
+from sfm.comparison.camera_difference import CameraDifference as CameraDifference
+from sfm.comparison.camera_difference import compare_cameras as compare_cameras
 from sfm.comparison.significance import ResultComparison as ResultComparison
 from sfm.comparison.significance import compare_results as compare_results
 from sfm.comparison.solutions import Comparison as Comparison

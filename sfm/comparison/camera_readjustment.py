@@ -1,12 +1,15 @@
 """A calibrated camera in another model: a new adjustment of the same image points, where they are there.
 
-Models do not convert exactly. Where the image points of the calibration are known, they are adjusted again
-with the other model, so that it fits where points are, and exterior orientations and points take their part
-of the difference. Otherwise the curve is fitted over the photograph, see `sfm.comparison.camera_conversion`.
+Models do not convert exactly. First the curve of the other model is fitted to that of the camera, over the
+region of its image points or, where these are unknown, over the photograph, see
+`sfm.comparison.camera_conversion`. Of the forms that a file can store, the leanest with as many radial terms
+as the camera uses is taken; if its misfit is above the limit, the next one with more. Then the image points
+of the calibration are adjusted again with it, so that exterior orientations, points and mounts take their
+part of the difference, and the camera has a covariance.
 
 The misfit is the difference of both cameras over the region of the image points, after the rotation that it
-implies, see `sfm.comparison.camera_difference`. Of the forms that a file can store, the leanest with as many
-radial terms as the camera uses is taken; if its misfit is above the limit, the next one with more.
+implies, see `sfm.comparison.camera_difference`. A new adjustment whose misfit is above the limit where that
+of the curve is not was drawn elsewhere by contradictions among its observations; then the curve is kept.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from sfm.comparison.camera_difference import compare_cameras
 from sfm.comparison.solutions import reprojection
 from sfm.model.camera import Camera
 from sfm.model.camera_file import CameraFile, cameras_of
-from sfm.model.distortion.models import MODELS, Role
+from sfm.model.distortion.models import MODELS, WIDE_ANGLE, Role
 from sfm.model.errors import GeometryError, KolinearError, SurveyFileError
 from sfm.model.solution import Solution
 
@@ -56,7 +59,7 @@ class Readjusted:
     @property
     def words(self) -> str:
         """The conversion in words."""
-        how = "image points adjusted again" if self.adjusted else "curve fitted over the photograph"
+        how = "image points adjusted again" if self.adjusted else "curve fitted"
         return (
             f"camera {self.camera.name}: {self.former.model} to {self.camera.model}, {how}, "
             f"misfit {self.rms_px:.4f} px RMS, {self.max_px:.4f} px at most"
@@ -77,61 +80,65 @@ def readjust_cameras(
         GeometryError: the distortion of a camera cannot be inverted over its photographs.
         SurveyFileError: no form suits the lens.
     """
-    cameras, covariance = list(file.cameras), list(file.covariance)
-    chosen: dict[int, tuple[Readjusted, Adjustment | None]] = {}
+    cameras, covariance, mounts = list(file.cameras), list(file.covariance), file.mounts
+    curves: dict[int, tuple[Readjusted, Form]] = {}
     for k, camera in enumerate(file.cameras):
         same = stored(camera)
         if same is None:
-            chosen[k] = _converted(camera, file, forms)
+            curves[k] = _fitted(camera, file, forms)
+            cameras[k], covariance[k] = curves[k][0].camera, None
         elif same is not camera:
             cameras[k], covariance[k] = same, None
-    conversions = [conversion for conversion, _ in chosen.values()]
-    anew = chosen[min(chosen)][1] if chosen else None
-    if len(chosen) > 1 and file.solution is not None and all(one.adjusted for one in conversions):
-        anew = _adjusted(file.solution, {one.camera.name: one.camera for one in conversions})
-    mounts = file.mounts
-    if anew is not None:
-        of_anew = cameras_of(anew.solution)
-        mounts = mounts and of_anew.mounts
-        for k, (conversion, _) in chosen.items():
-            row = of_anew.index(conversion.camera.name)
-            cameras[k], covariance[k] = of_anew.cameras[row], of_anew.covariance[row]
-            conversions[list(chosen).index(k)] = _difference(file.cameras[k], cameras[k], file, adjusted=True)
-    else:
-        for k, (conversion, _) in chosen.items():
-            cameras[k], covariance[k] = conversion.camera, None
+    conversions = {k: curve for k, (curve, _) in curves.items()}
+    if curves and file.solution is not None:
+        anew = _adjusted(
+            file.solution,
+            {
+                curve.camera.name: _freed(curve.former, curve.camera, form.held)
+                for curve, form in curves.values()
+            },
+        )
+        of_anew = None if anew is None else cameras_of(anew.solution)
+        if of_anew is not None:
+            found = {
+                k: _difference(
+                    curve.former, of_anew.cameras[of_anew.index(curve.camera.name)], file, adjusted=True
+                )
+                for k, curve in conversions.items()
+            }
+            if all(found[k].rms_px <= max(LIMIT_PX, curve.rms_px) for k, curve in conversions.items()):
+                conversions, mounts = found, mounts and of_anew.mounts
+                for k, conversion in found.items():
+                    row = of_anew.index(conversion.camera.name)
+                    cameras[k], covariance[k] = conversion.camera, of_anew.covariance[row]
     changed = replace(file, cameras=tuple(cameras), covariance=tuple(covariance), mounts=mounts)
-    return changed, tuple(conversions)
+    return changed, tuple(conversions.values())
 
 
-def _converted(
-    camera: Camera, file: CameraFile, forms: Sequence[Form]
-) -> tuple[Readjusted, Adjustment | None]:
-    """Return a camera in the leanest form within the limit, else in that of the smallest misfit."""
+def _fitted(camera: Camera, file: CameraFile, forms: Sequence[Form]) -> tuple[Readjusted, Form]:
+    """Return the curve of a camera in the leanest form within the limit, else of the smallest misfit."""
     radial = int((camera.plays(Role.RADIAL, Role.DENOMINATOR) & (camera.parameters != 0)).sum())
-    best: tuple[Readjusted, Adjustment | None] | None = None
-    reasons: list[str] = []
-    suited = [form for form in forms if _radial_terms(form) >= radial] or [*forms[-1:]]
-    for form in suited:
+    alike = [form for form in forms if (MODELS[form.model] in WIDE_ANGLE) == camera.wide_angle] or [*forms]
+    most = max(map(_radial_terms, alike))
+    seen = file.image_points(camera.name)
+    region = None if seen is None or not len(seen) else np.concatenate([seen.min(axis=0), seen.max(axis=0)])
+    best: tuple[Readjusted, Form] | None = None
+    reason = ""
+    for form in (form for form in alike if _radial_terms(form) >= min(radial, most)):
         try:
-            conversion = convert_camera(camera, form.model, held=form.held).camera
+            converted = convert_camera(camera, form.model, held=form.held, region_px=region).camera
+            found = _difference(camera, converted, file, adjusted=False), form
         except KolinearError as error:
-            reasons.append(str(error))
+            reason = reason or str(error)
             continue
-        anew = None
-        if file.solution is not None:
-            anew = _adjusted(file.solution, {camera.name: _freed(camera, conversion, form.held)})
-        if anew is not None:
-            conversion = next(one for one in anew.estimate.cameras if one.name == camera.name)
-        found = _difference(camera, conversion, file, adjusted=anew is not None), anew
         if best is None or found[0].rms_px < best[0].rms_px:
             best = found
         if found[0].rms_px <= LIMIT_PX:
             break
     if best is None:
-        models = ", ".join(dict.fromkeys(form.model for form in forms))
+        models = ", ".join(dict.fromkeys(form.model for form in alike))
         raise SurveyFileError(
-            f"camera {camera.name}: {camera.model} cannot be converted to {models}: {reasons[0]}"
+            f"camera {camera.name}: {camera.model} cannot be converted to {models}: {reason}"
         )
     return best
 

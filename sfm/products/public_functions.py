@@ -20,6 +20,7 @@ from sfm.comparison.significance import ResultComparison, compare_results
 from sfm.judgement.survey_result import SurveyResult
 from sfm.judgement.verdict import judge_adjustment
 from sfm.model.arguments import checked_arguments
+from sfm.model.camera_file import CameraFile
 from sfm.model.errors import BackendError, GeometryError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
@@ -114,6 +115,60 @@ def read_result(path: str | Path) -> Solution:
     from adapters.formats.registry import read_comparable
 
     return read_comparable(Path(path))
+
+
+@checked_arguments()
+def read_cameras(path: str | Path, *, form: str | None = None) -> CameraFile:
+    """Read calibrated cameras: a file of OpenCV, ROS, Kalibr, mrcal, COLMAP and others, or a result.
+
+    Args:
+        path: file or folder.
+        form: name of the format, such as "ros-camera"; by the content of the file if not given.
+
+    Returns:
+        The cameras, and what is known of their precision and mounts.
+
+    Raises:
+        SurveyFileError: no cameras are in it; the message gives the reason.
+
+    Example:
+        >>> import sfm
+        >>> len(sfm.read_cameras(result_folder).cameras)
+        1
+    """
+    from adapters.formats.cameras.registry import read_cameras as read
+
+    return read(Path(path), form)
+
+
+@checked_arguments()
+def write_cameras(cameras: CameraFile, path: str | Path, *, form: str) -> Path:
+    """Write calibrated cameras into a new file of another program.
+
+    Args:
+        cameras: in models that the format has; `kolinear convert` adjusts them in such models.
+        path: the file.
+        form: name of the format, such as "opencv-camera".
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        OutputError: the format does not store a camera, or the file exists or cannot be written.
+
+    Example:
+        >>> import sfm, tempfile, pathlib
+        >>> camera = sfm.camera_from_values("a", "opencv", (640, 480), (0.01, 0.01), c_mm=5.0)
+        >>> file = sfm.CameraFile("a", (camera,), (None,))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = sfm.write_cameras(file, pathlib.Path(folder) / "a.yaml", form="ros-camera")
+        ...     sfm.read_cameras(path).cameras[0].value("fx")
+        500.0
+    """
+    from adapters.formats.cameras.registry import write_cameras as write
+
+    write(Path(path), form, cameras)
+    return Path(path)
 
 
 @checked_arguments()

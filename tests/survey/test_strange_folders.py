@@ -23,6 +23,7 @@ import sfm.cli
 import sfm.products.rendering.render
 from adapters.colmap.camera_models import write_model
 from adapters.colmap.database import read_database, write_database
+from adapters.formats.cameras.registry import write_cameras
 from adapters.formats.registry import FORMATS
 from adapters.formats.result_tables import write_tables
 from sfm.adjustment.covariance import marginal_of
@@ -32,6 +33,8 @@ from sfm.cli import app
 from sfm.files.open_folders import locked
 from sfm.files.whole_files import remove_leftovers, whole_file, whole_folder
 from sfm.matching.tracks.interest import natural_points
+from sfm.model.camera import camera_from_values
+from sfm.model.camera_file import CameraFile
 from sfm.model.errors import OutputError
 from sfm.model.solution import Solution
 from sfm.photographs.exif import Metadata, read_metadata
@@ -108,6 +111,15 @@ def photographs(folder: Path) -> tuple[Path, Path]:
     for k in (0, 1):
         cv2.imwrite(str(folder / f"{k}.png"), np.rint(pictures()[0]).astype(np.uint8))
     return folder / "0.png", folder / "1.png"
+
+
+def lenses(folder: Path) -> tuple[Path, Path]:
+    """Two files of a camera with photographs of the size of those above."""
+    height, width = pictures()[0].shape
+    camera = camera_from_values("left", "opencv", (width, height), (0.01, 0.01), c_mm=10.0)
+    for name in ("1.cameramodel", "2.cameramodel"):
+        write_cameras(folder / name, "mrcal-camera", CameraFile(name, (camera,), (None,)))
+    return folder / "1.cameramodel", folder / "2.cameramodel"
 
 
 def scene(folder: Path) -> Path:
@@ -191,6 +203,14 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("compare", model(f), f / "model"),
         ("out", "out/comparison", "out/.comparison.lock"),
     ),
+    "compare cameras": (
+        lambda f: ("compare", *lenses(f)),
+        ("out", "out/comparison", "out/.comparison.lock"),
+    ),
+    "undistort": (
+        lambda f: ("undistort", lenses(f)[0], photographs(f)[0]),
+        ("out", "out/undistorted", "out/.undistorted.lock"),
+    ),
     "epochs": (
         lambda f: ("epochs", *results(f)),
         ("out", "out/epochs", "out/.epochs.lock"),
@@ -231,6 +251,10 @@ COMMANDS: dict[str, Command] = {
     "view beside the model": (lambda f: ("view", model(f), "--no-open"), ("model.html",)),
     "convert to a file": (lambda f: ("convert", model(f), "new/a.xml"), ("new", "new/a.xml")),
     "convert to a database": (lambda f: ("convert", model(f), "new/a.db"), ("new", "new/a.db")),
+    "convert to a camera": (
+        lambda f: ("convert", lenses(f)[0], "new/a.yaml", "--to", "ros-camera"),
+        ("new", "new/a.yaml"),
+    ),
     "convert to a folder": (lambda f: ("convert", model(f), "new/a"), ("new", "new/a")),
 }
 

@@ -288,9 +288,7 @@ def test_convert_writes_a_rig_of_a_result(tmp_path: Path, capsys: pytest.Capture
     Solution("x", network, truth).write(tmp_path / "t")
     convert(tmp_path / "t", tmp_path / "r", to_format="rig")
     told = capsys.readouterr().out
-    assert (
-        "2 cameras of 1 rig as rig" in told and "to opencv, curve fitted over the photograph, misfit" in told
-    )
+    assert "2 cameras of 1 rig as rig" in told and "to opencv, curve fitted, misfit" in told
     assert len(list((tmp_path / "r").iterdir())) == 8
     single = make_network(seed_of("convert single"), images=3, points=8)
     Solution("x", *single).write(tmp_path / "single")
