@@ -18,7 +18,14 @@ SHOWN = 8  # names that an error message lists
 
 @dataclass(frozen=True)
 class CameraFile:
-    """Calibrated cameras, read from a file or taken from a result."""
+    """Calibrated cameras, read from a file or taken from a result.
+
+    Example:
+        >>> import sfm
+        >>> camera = sfm.camera_from_values("left", "opencv", (640, 480), (0.01, 0.01), c_mm=5.0)
+        >>> CameraFile("pair", (camera,), (None,)).only("left").cameras[0].value("fx")
+        500.0
+    """
 
     name: str
     """name of the file or result"""

@@ -58,8 +58,9 @@ def _picture(difference: CameraDifference) -> Plot:
 
 
 def write_picture(difference: CameraDifference, folder: Path) -> None:
-    """Write the picture of the page as difference.png into a folder."""
+    """Write the picture of the page as difference.png and difference.svg into a folder."""
     (folder / "difference.png").write_bytes(_picture(difference).png)
+    camera_difference_figure(difference).savefig(folder / "difference.svg", metadata={"Date": None})
 
 
 def verdict_of_difference(difference: CameraDifference) -> Banner:

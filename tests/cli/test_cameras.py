@@ -78,6 +78,7 @@ def test_two_calibrations_of_one_camera_do_not_differ(
     assert summary["significant"] is False and summary["covariances"] == [True, True]
     assert 0.3 < summary["standard_deviations"] < 2.5 and summary["headline"] in told
     assert (out / "difference.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (out / "difference.svg").read_text(encoding="utf-8")
     table = np.genfromtxt(out / "camera_difference.csv", delimiter=",", names=True)
     assert len(table) > 500 and np.isfinite(table["sigma_px"]).all()
     page = (out / "cameras.html").read_text()

@@ -29,7 +29,7 @@ from adapters.formats.cameras.lens_terms import (
 from adapters.reading.trees import Tree, read_tree
 from sfm.model.camera import Camera
 from sfm.model.camera_file import CameraFile
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import METRES, FloatArray
 
 WHAT = "a camera chain of Kalibr"
 MAX_CAMERAS = 1000
@@ -87,15 +87,14 @@ def _camera(entry: Tree, name: str) -> Camera:
 
 
 def write_kalibr(path: Path, file: CameraFile) -> str:
-    """Return the text of a chain; without mounts, cameras are beside one another and not connected."""
-    if file.mounts is None:
+    """Return the text of a chain in metres; cameras that are not on one rig are not connected."""
+    mounts = file.mounts
+    if mounts is None or len(set(mounts.rig)) > 1 or not all(mounts.rig):
         cameras = [alone(camera) for camera in file.cameras]
-    else:
-        cameras = [Mounted.of(camera, file.mounts, a) for a, camera in enumerate(file.cameras)]
-    return (
-        "\n".join(chain_lines(cameras, file.unit or "unknown units", connected=file.mounts is not None))
-        + "\n"
-    )
+        return "\n".join(chain_lines(cameras, "unknown units", connected=False)) + "\n"
+    metres = METRES.get(file.unit)
+    cameras = [Mounted.of(camera, mounts, a).scaled(metres or 1.0) for a, camera in enumerate(file.cameras)]
+    return "\n".join(chain_lines(cameras, "m" if metres else file.unit or "unknown units")) + "\n"
 
 
 def chain_lines(cameras: list[Mounted], unit: str, *, connected: bool = True) -> Iterator[str]:

@@ -157,6 +157,14 @@ def test_a_stereo_pair_has_its_mounts(tmp_path: Path) -> None:
     assert read.mounts is not None and read.unit == "m"
     np.testing.assert_allclose(read.mounts.position, truth.mounts.position, atol=1e-12)
     np.testing.assert_allclose(read.mounts.rotation, truth.mounts.rotation, atol=1e-12)
+    in_mm = tmp_path / "mm.yaml"
+    write_cameras(in_mm, "kalibr-camera", file_of(*lenses, mounts=truth.mounts, unit="mm"))
+    scaled = read_cameras(in_mm).mounts
+    assert scaled is not None
+    np.testing.assert_allclose(1000 * scaled.position, truth.mounts.position, atol=1e-9)
+    single = replace(truth.mounts, rig=("a", "b"))
+    write_cameras(tmp_path / "apart.yaml", "kalibr-camera", file_of(*lenses, mounts=single, unit="m"))
+    assert read_cameras(tmp_path / "apart.yaml").mounts is None
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".bin"])
