@@ -48,10 +48,10 @@ class Tree:
         Raises:
             SurveyFileError: none of them is.
         """
-        found = self.key(*names)
-        if found is None:
+        name = self.key(*names)
+        if name is None:
             raise self.error(f"{self.place}{names[0]} is missing")
-        return found
+        return name
 
     def below(self, name: str) -> Tree:
         """Return the tree of a key.

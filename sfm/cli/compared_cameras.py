@@ -48,10 +48,10 @@ def difference_of_files(
         left, _, right = camera.partition("=")
         names = (left, right)
     if camera is None and len(second.cameras) > 1 and len(first.cameras) == 1:
-        shared = [one.name for one in second.cameras if one.name == first.cameras[0].name]
+        shared = [other.name for other in second.cameras if other.name == first.cameras[0].name]
         names = (None, shared[0] if shared else None)
     if camera is None and len(first.cameras) > 1 and len(second.cameras) == 1:
-        shared = [one.name for one in first.cameras if one.name == second.cameras[0].name]
+        shared = [other.name for other in first.cameras if other.name == second.cameras[0].name]
         names = (shared[0] if shared else None, None)
     chosen = [file.only(name) for file, name in zip((first, second), names, strict=True)]
     if a.resolve() == b.resolve() and chosen[0].cameras[0].name == chosen[1].cameras[0].name:

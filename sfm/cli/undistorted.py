@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -35,13 +34,6 @@ SHOWN = 3  # names that a message lists
 Moment = tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What was drawn, in words."""
-
-    lines: tuple[str, ...]
-
-
 def undistort_photographs(
     cameras: Path,
     photographs: Path,
@@ -53,7 +45,7 @@ def undistort_photographs(
     alpha: float | None,
     to: str,
     progress: Progress,
-) -> Drawn:
+) -> tuple[str, ...]:
     """Draw the photographs of a folder without distortion, and write their new cameras beside them.
 
     Args:
@@ -66,6 +58,9 @@ def undistort_photographs(
         alpha: see `sfm.products.undistorting.views.undistorted_view`.
         to: format of the files of the new cameras.
         progress: receives the photographs.
+
+    Returns:
+        What was drawn and written, in lines.
 
     Raises:
         KolinearError: cameras or photographs cannot be read, or do not belong together; nothing is written.
@@ -104,7 +99,7 @@ def undistort_photographs(
             f"{counted(len(draw.without_exif), 'photograph')} of 16 bit: EXIF data not kept "
             f"({listed(draw.without_exif, most=SHOWN)})"
         )
-    return Drawn((*lines, f"{out}: {counted(len(names), 'photograph')} without distortion"))
+    return (*lines, f"{out}: {counted(len(names), 'photograph')} without distortion")
 
 
 def photographs_of(path: Path, out: Path) -> tuple[Path, list[str]]:

@@ -66,8 +66,8 @@ def write_camera_files(
     refuse_links(target)
     names = _file_names(target, file, form)
     with whole_folder(target) as folder:
-        for name, one in zip(names, file.cameras, strict=True):
-            write_cameras(folder / name, to, file.only(one.name))
+        for name, lens in zip(names, file.cameras, strict=True):
+            write_cameras(folder / name, to, file.only(lens.name))
     return "\n".join([*lines, f"{target}: {counted(len(names), 'camera')} as {to}: {listed(names)}"])
 
 

@@ -100,15 +100,15 @@ def readjust_cameras(
         )
         of_anew = None if anew is None else cameras_of(anew.solution)
         if of_anew is not None:
-            found = {
+            adjusted = {
                 k: _difference(
                     curve.former, of_anew.cameras[of_anew.index(curve.camera.name)], file, adjusted=True
                 )
                 for k, curve in conversions.items()
             }
-            if all(found[k].rms_px <= max(LIMIT_PX, curve.rms_px) for k, curve in conversions.items()):
-                conversions, mounts = found, mounts and of_anew.mounts
-                for k, conversion in found.items():
+            if all(adjusted[k].rms_px <= max(LIMIT_PX, curve.rms_px) for k, curve in conversions.items()):
+                conversions, mounts = adjusted, mounts and of_anew.mounts
+                for k, conversion in adjusted.items():
                     row = of_anew.index(conversion.camera.name)
                     cameras[k], covariance[k] = conversion.camera, of_anew.covariance[row]
     changed = replace(file, cameras=tuple(cameras), covariance=tuple(covariance), mounts=mounts)
@@ -127,13 +127,13 @@ def _fitted(camera: Camera, file: CameraFile, forms: Sequence[Form]) -> tuple[Re
     for form in (form for form in alike if _radial_terms(form) >= min(radial, most)):
         try:
             converted = convert_camera(camera, form.model, held=form.held, region_px=region).camera
-            found = _difference(camera, converted, file, adjusted=False), form
+            curve = _difference(camera, converted, file, adjusted=False)
         except KolinearError as error:
             reason = reason or str(error)
             continue
-        if best is None or found[0].rms_px < best[0].rms_px:
-            best = found
-        if found[0].rms_px <= LIMIT_PX:
+        if best is None or curve.rms_px < best[0].rms_px:
+            best = curve, form
+        if curve.rms_px <= LIMIT_PX:
             break
     if best is None:
         models = ", ".join(dict.fromkeys(form.model for form in alike))

@@ -45,23 +45,23 @@ def read_australis(path: Path) -> CameraFile:
         SurveyFileError: no camera, or one without size, pixel or principal distance.
     """
     text = Lines.of(path)
-    found: list[tuple[str, dict[str, float], dict[str, tuple[int, float]]]] = []
+    entries: list[tuple[str, dict[str, float], dict[str, tuple[int, float]]]] = []
     while (line := text.maybe_line()) is not None and text.number < MAX_LINES:
         titled, words = CAMERA.match(line), line.replace("(mm)", " ").split()
         if titled:
             name = re.sub(r"\s+Lens\s*$", "", titled[1].strip())
-            found.append((name if is_name(name) else f"camera {len(found) + 1}", {}, {}))
+            entries.append((name if is_name(name) else f"camera {len(entries) + 1}", {}, {}))
         elif words and words[0] in ("H", "V") and len(words) == 3:
-            if not found:
-                found.append((path.stem, {}, {}))
+            if not entries:
+                entries.append((path.stem, {}, {}))
             side = text.whole_of(words[1], 1, MAX_SIDE_PX, "a side of the photographs")
             pixel = text.number_of(words[2])
             if not 0 < pixel <= MAX_PIXEL_MM:
                 raise text.error(f"pixels of {pixel:g} mm, needed 0 to {MAX_PIXEL_MM:g}")
-            found[-1][2][words[0]] = side, pixel
-        elif words and words[0] in PARAMETERS and len(words) == 6 and found:
-            found[-1][1][PARAMETERS[words[0]]] = text.number_of(words[1 + FINAL])
-    cameras = tuple(_camera(path, *entry) for entry in found)
+            entries[-1][2][words[0]] = side, pixel
+        elif words and words[0] in PARAMETERS and len(words) == 6 and entries:
+            entries[-1][1][PARAMETERS[words[0]]] = text.number_of(words[1 + FINAL])
+    cameras = tuple(_camera(path, *entry) for entry in entries)
     if not cameras:
         raise SurveyFileError(f"{path}: no results for a camera are in this file of Australis")
     return CameraFile(path.name, cameras, (None,) * len(cameras))

@@ -149,7 +149,7 @@ CAMERA_FORMATS = (
             *(LensForm("opencv"), LensForm("full_opencv", LEAN)),
             *(LensForm("brown_forward_affine", ("b2",)), _FISHEYE),
         ),
-        lambda path, head: '"fl_x"' in head or '"camera_angle_x"' in head,
+        lambda path, head: any(f'"{key}"' in head for key in ("fl_x", "camera_angle_x", "transform_matrix")),
         read_nerfstudio,
         write_nerfstudio,
     ),

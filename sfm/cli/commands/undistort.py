@@ -56,7 +56,7 @@ def undistort(
         from sfm.runtime.progress_bar import drawn_progress
 
     with working_on(str(cameras)), drawn_progress() as progress:
-        drawn = undistort_photographs(
+        lines = undistort_photographs(
             cameras,
             photographs,
             out,
@@ -67,5 +67,5 @@ def undistort(
             to=to_format,
             progress=progress,
         )
-    for line in drawn.lines:
+    for line in lines:
         print(line)

@@ -54,10 +54,10 @@ class View:
             grid = np.stack(np.meshgrid(np.arange(width), rows), axis=-1).reshape(-1, 2)
             rays = np.column_stack([grid, np.ones(len(grid))]) @ from_pixel.T
             ahead = rays[:, 2] > 0
-            found = np.full((len(grid), 2), -1.0)
+            place = np.full((len(grid), 2), -1.0)
             uv: FloatArray = rays[ahead, :2] / rays[ahead, 2:] * np.array([1.0, -1.0])
-            found[ahead] = np.nan_to_num(pixel_from_tangents(self.former, uv), nan=-1.0)
-            x[rows], y[rows] = found.reshape(len(rows), width, 2).transpose(2, 0, 1)
+            place[ahead] = np.nan_to_num(pixel_from_tangents(self.former, uv), nan=-1.0)
+            x[rows], y[rows] = place.reshape(len(rows), width, 2).transpose(2, 0, 1)
         return x, y
 
     def pixels(self, xy: FloatArray) -> FloatArray:
@@ -98,13 +98,13 @@ def undistorted_view(camera: Camera, alpha: float | None = None) -> View:
     if alpha is None:
         return View(camera, ideal_camera(camera, ("opencv",)), np.eye(3))
     _refuse_alpha(alpha)
-    found = common_view((camera,), (np.eye(3),), 0, alpha)
-    if found is None or not np.isfinite(found[0]):
+    view = common_view((camera,), (np.eye(3),), 0, alpha)
+    if view is None or not np.isfinite(view[0]):
         raise GeometryError(
             f"camera {camera.name}: its photographs see too wide for one image plane; without --alpha, their "
             "middle is shown"
         )
-    f, (cx, cy) = found[0], found[1].tolist()
+    f, (cx, cy) = view[0], view[1].tolist()
     side = float(camera.pixel_mm[1])
     values = (("fx", f), ("fy", f), ("cx", cx), ("cy", cy))
     new = camera_from_values(

@@ -146,6 +146,22 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
         assert file.rms_px == (0.31,) and file.cameras[0].name == "sample"
 
 
+def test_other_programs_spellings_are_read(tmp_path: Path) -> None:
+    """Lists of lists from Python, and frames of nerfstudio with cameras of their own."""
+    path = tmp_path / "a.json"
+    K = [[500.0, 0, 320], [0, 501, 240], [0, 0, 1]]
+    path.write_text(json.dumps({"mtx": K, "dist": [[-0.2, 0.1, 1e-3, 1e-5, 0]], "image_size": [640, 480]}))
+    (camera_read,) = read_cameras(path).cameras
+    np.testing.assert_array_equal(camera_read.parameters, [500, 501, 320, 240, -0.2, 0.1, 1e-3, 1e-5])
+    frames = [
+        {"file_path": "a", "transform_matrix": [[1]], "fl_x": f, "w": 640, "h": 480, "cx": 320.5, "cy": 240.5}
+        for f in (500, 600, 500)
+    ]
+    path.write_text(json.dumps({"frames": frames, "camera_model": "PINHOLE"}))
+    read = read_cameras(path).cameras
+    assert [lens.parameters.tolist() for lens in read] == [[500, 500, 320, 240], [600, 600, 320, 240]]
+
+
 def test_a_stereo_pair_has_its_mounts(tmp_path: Path) -> None:
     """As `convert --to rig` and Kalibr's chain have them: the same mount from either."""
     _, truth = make_rig(seed_of("pair of files"), moments=4, points=15)
