@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
@@ -18,7 +19,7 @@ from sfm.model.display import counted, listed
 from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import conversion_of
 from sfm.photographs.reading import SUFFIXES
-from sfm.products.drafting.camera_names import PARTS, cameras_in_names
+from sfm.products.drafting.camera_names import cameras_in_names
 from sfm.products.undistorting.photographs import UndistortedPhotographs
 from sfm.products.undistorting.views import (
     RectifiedPair,
@@ -99,7 +100,7 @@ def undistort_photographs(
             f"{counted(len(draw.without_exif), 'photograph')} of 16 bit: EXIF data not kept "
             f"({listed(draw.without_exif, most=SHOWN)})"
         )
-    return (*lines, f"{out}: {counted(len(names), 'photograph')} without distortion")
+    return (*lines, f"{out}: {counted(draw.count, 'photograph')} without distortion")
 
 
 def photographs_of(path: Path, out: Path) -> tuple[Path, list[str]]:
@@ -150,7 +151,7 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
     known: dict[str, int] = {}
     if file.solution is not None:
         network = file.solution.network
-        known = dict(zip(network.images, network.camera.tolist(), strict=True))
+        known = {_stem(name): k for name, k in zip(network.images, network.camera.tolist(), strict=True)}
     proposed = cameras_in_names(list(names))
     order: dict[str, int] = {}
     if proposed is not None:
@@ -159,10 +160,10 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
             order = {part: k for k, part in enumerate(parts)}
     of: list[int] = []
     for name in names:
-        words = set(PARTS.findall(PurePosixPath(name).with_suffix("").as_posix()))
-        named = [k for k, camera in enumerate(file.cameras) if camera.name in words]
-        if name in known:
-            of.append(known[name])
+        stem = _stem(name)
+        named = [k for k, camera in enumerate(file.cameras) if _whole(camera.name).search(stem)]
+        if stem in known:
+            of.append(known[stem])
         elif len(named) == 1:
             of.append(named[0])
         elif proposed is not None and proposed.camera.get(name) in order:
@@ -176,19 +177,30 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
     return of
 
 
+def _whole(name: str) -> re.Pattern[str]:
+    """Return what finds a name where no further letter or digit of its kind continues it."""
+    ends = [r"\d" if end.isdigit() else r"[^\W\d_]" for end in (name[0], name[-1])]
+    return re.compile(f"(?<!{ends[0]}){re.escape(name)}(?!{ends[1]})")
+
+
 def _moments(file: CameraFile, names: Sequence[str]) -> dict[str, Moment]:
     """Return the moment of each photograph, by the result that calibrated the cameras or by the names."""
-    moments: dict[str, Moment] = {}
+    proposed = cameras_in_names(list(names))
+    by_name = {} if proposed is None else proposed.moment
+    moments: dict[str, Moment] = {name: ("names", moment) for name, moment in by_name.items()}
     if file.solution is not None and file.solution.network.moment is not None:
         network = file.solution.network
-        moments = {
-            name: ("result", str(t))
-            for name, t in zip(network.images, file.solution.network.moment, strict=True)
+        of_result = {
+            _stem(name): str(t) for name, t in zip(network.images, file.solution.network.moment, strict=True)
         }
-    proposed = cameras_in_names(list(names))
-    if proposed is not None:
-        moments = {name: ("names", moment) for name, moment in proposed.moment.items()} | moments
+        known = {name: of_result[_stem(name)] for name in names if _stem(name) in of_result}
+        moments |= {name: ("result", moment) for name, moment in known.items()}
     return moments
+
+
+def _stem(name: str) -> str:
+    """Return the name of a photograph without its ending, which may have been converted."""
+    return PurePosixPath(name).with_suffix("").as_posix()
 
 
 def _draw_pairs(

@@ -31,6 +31,8 @@ class UndistortedPhotographs:
     def __init__(self) -> None:
         self._view: View | None = None
         self._places: tuple[AnyArray, AnyArray] | None = None
+        self.count = 0
+        """photographs drawn"""
         self.without_exif: list[str] = []
         """names of photographs whose EXIF data could not be kept"""
 
@@ -63,6 +65,7 @@ class UndistortedPhotographs:
                 f"photographs of {needed} px; needed photographs of that size"
             )
         x, y = self._places
+        self.count += 1
         drawn = cv2.remap(pixels, x, y, INTERPOLATION, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         if drawn.dtype == np.uint8:
             colours = drawn if drawn.ndim == 2 else np.ascontiguousarray(drawn[:, :, _in_rgb(drawn)])
