@@ -53,7 +53,7 @@ def convert(
         typer.Option("--inexact", help="For formats of cameras and rig: accept a misfit above 0.05 px RMS."),
     ] = False,
 ) -> None:
-    """Convert a survey or its cameras from one program's format to another's.
+    """Convert a survey or cameras between formats of programs.
 
     A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
     colmap-text, colmap-database, tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig

@@ -46,7 +46,7 @@ def undistort(
         Path, typer.Option("--out", metavar="DIR", help="Folder for photographs and new cameras.")
     ] = Path("out/undistorted"),
 ) -> None:
-    """Write photographs without distortion, and the cameras that see them.
+    """Write photographs without distortion, and their new cameras.
 
     Photographs keep their names, bits, colours and EXIF data. Pairs of a rig are rectified with --pairs:
     their cameras, R1, R2, P1, P2 and Q are those of OpenCV's stereoRectify, with zero disparity at infinity.
