@@ -12,7 +12,7 @@ from adapters.formats.cameras.lens_terms import Mounted, alone
 from adapters.formats.cameras.opencv import pair_lines
 from adapters.formats.cameras.registry import camera_format, read_cameras, write_cameras
 from sfm.files.globs import why_no_folder
-from sfm.files.open_folders import disk_errors, locked, refuse_foreign_folder, refuse_links_out
+from sfm.files.open_folders import disk_errors, is_home_file, locked, refuse_foreign_folder
 from sfm.files.whole_files import remove_leftovers, whole_folder
 from sfm.model.camera_file import CameraFile
 from sfm.model.display import counted, listed
@@ -126,8 +126,9 @@ def photographs_of(path: Path, out: Path) -> tuple[Path, list[str]]:
         and file.is_file()
         and not file.resolve().is_relative_to(inside)
     )
-    for folder in sorted({file.parent for file in files}):
-        refuse_links_out(folder)
+    for file in files:
+        if file.is_symlink() and not file.resolve().is_relative_to(path.resolve()) and not is_home_file(file):
+            raise SurveyFileError(f"{file}: a link that leaves its folder; the file itself is needed there")
     if not files:
         raise PhotographError(f"{path}: no photographs are in this folder ({', '.join(SUFFIXES)})")
     return path, [file.relative_to(path).as_posix() for file in files]

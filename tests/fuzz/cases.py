@@ -18,10 +18,12 @@ import numpy as np
 from PIL import Image
 
 from adapters.colmap.camera_models import read_model, write_model
+from adapters.formats.cameras.registry import CAMERA_FORMATS, read_cameras, write_cameras
 from adapters.formats.registry import read_any, write_any
 from adapters.formats.result_tables import read_result, write_tables
 from adapters.formats.sba_text import read_sba_text
 from sfm.model.camera import camera_from_values
+from sfm.model.camera_file import CameraFile
 from sfm.model.errors import KolinearError
 from sfm.model.solution import Solution
 from sfm.photographs.exif import read_metadata
@@ -123,6 +125,7 @@ def make_seeds(folder: Path) -> tuple[Seed, ...]:
     ]
     seeds += [Seed("models", name, text, read) for name, text, read in _OTHER_PROGRAMS]
     seeds += _results(folder)
+    seeds += _cameras(folder)
     seeds += [Seed("folders", "unused", b"x", _read_folder), Seed("rows", "unused", b"x", _read_rows)]
     for seed in seeds:
         path = folder / seed.name
@@ -173,6 +176,32 @@ def _results(folder: Path) -> list[Seed]:
             _reader_of("scene.db", "colmap-database"),
         )
     )
+    return found
+
+
+def _cameras(folder: Path) -> list[Seed]:
+    """Return files of cameras of other programs, read by their content and by name."""
+    values = (("fx", 500.0), ("fy", 501.0), ("cx", 320.0), ("cy", 240.0), ("k1", -0.2), ("p1", 1e-3))
+    radtan = camera_from_values("left", "opencv", (640, 480), (1.0, 1.0), c_mm=500.0, values=values)
+    lenses = {
+        "australis-camera": camera_from_values("a", "brown", (640, 480), (0.01, 0.01), c_mm=5.0),
+        "blender-camera": camera_from_values("b", "pinhole", (640, 480), (0.01, 0.01), c_mm=5.0),
+    }
+    found = []
+    (folder / "lenses").mkdir()
+    for form in CAMERA_FORMATS:
+        for suffix in form.suffixes:
+            name = f"lenses/{form.name}{suffix}"
+            write_cameras(
+                folder / name, form.name, CameraFile("x", (lenses.get(form.name, radtan),), (None,))
+            )
+            data = (folder / name).read_bytes()
+            content = data if suffix == ".bin" else data.decode()
+
+            def read(f: Path, rng: random.Random, name: str = name, form: str = form.name) -> None:
+                _drop(read_cameras(f / name, rng.choice([None, form])))
+
+            found.append(Seed("cameras", name, content, read))
     return found
 
 

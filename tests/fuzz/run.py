@@ -30,7 +30,7 @@ START_SECONDS = 1200.0  # imports and the first compilation of kernels
 LIMIT_MIB = 1024
 SHARES = {
     **{"surveys": 0.2, "tables": 0.18, "photographs": 0.24, "models": 0.13, "results": 0.14, "codes": 0.03},
-    **{"folders": 0.04, "rows": 0.04},
+    **{"cameras": 0.05, "folders": 0.04, "rows": 0.04},
 }
 
 

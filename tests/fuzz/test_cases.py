@@ -46,7 +46,7 @@ class _NeverFar(random.Random):
 
 
 @pytest.mark.parametrize(
-    "kind", ["surveys", "tables", "codes", "photographs", "models", "results", "folders", "rows"]
+    "kind", ["surveys", "tables", "codes", "photographs", "models", "results", "cameras", "folders", "rows"]
 )
 @given(number=st.integers(min_value=0, max_value=2**32))
 @SHORT

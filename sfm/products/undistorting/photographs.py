@@ -15,7 +15,9 @@ from sfm.model.errors import PhotographError
 from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 from sfm.products.undistorting.views import View
 
-JPEG_QUALITY = 97  # percent; noise of a new compression is below that of the photograph
+QUALITY = 97  # percent, of JPEG; noise of a new compression is below that of the photograph
+MAX_SIDE_PX = 32766  # that cv2.remap draws
+COLOURS = ("L", "RGB", "RGBA")  # whose colour profile suits what OpenCV decodes
 # Tags of TIFF that describe the photograph, and not how its pixels are stored.
 _TAGS = ExifTags.Base
 OF_PHOTOGRAPH = {
@@ -55,7 +57,9 @@ class UndistortedPhotographs:
         with opened_header(path, io.BytesIO(data)) as header:
             size, kind = header.size, header.format or ""
             exif = header.info.get("exif") or _exif(header)
-            icc = header.info.get("icc_profile")
+            icc = header.info.get("icc_profile") if header.mode in COLOURS else None
+        if max(size) > MAX_SIDE_PX:
+            raise PhotographError(f"{path.name}: {size[0]} x {size[1]} px, at most {MAX_SIDE_PX} on a side")
         refuse_bomb(path, size, data)
         pixels = _decoded(path, data)
         if size != view.former.size_px:
@@ -71,8 +75,8 @@ class UndistortedPhotographs:
             colours = drawn if drawn.ndim == 2 else np.ascontiguousarray(drawn[:, :, _in_rgb(drawn)])
             options: dict[str, object] = {"exif": exif} if exif else {}
             options |= {"icc_profile": icc} if icc else {}
-            if kind in ("JPEG", "MPO"):
-                options |= {"quality": JPEG_QUALITY, "subsampling": 0}
+            if kind in ("JPEG", "MPO", "WEBP"):
+                options |= {"quality": QUALITY} | ({} if kind == "WEBP" else {"subsampling": 0})
             Image.fromarray(colours).save(out, "JPEG" if kind == "MPO" else kind, **options)
             return
         if exif:
