@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray
-from sfm.model.display import listed
+from sfm.model.display import counted, listed
 from sfm.model.errors import SurveyFileError, UnknownNameError
 from sfm.model.estimate import Mounts
 from sfm.model.solution import Solution
@@ -66,7 +66,7 @@ class CameraFile:
         if name is None and len(self.cameras) > 1:
             names = [camera.name for camera in self.cameras]
             raise SurveyFileError(
-                f"{self.name}: {len(names)} cameras, one is needed; name it with --camera: "
+                f"{self.name}: {counted(len(names), 'camera')}, one is needed; name it with --camera: "
                 f"{listed(names, most=SHOWN)}"
             )
         k = 0 if name is None else self.index(name)
