@@ -7,6 +7,7 @@ from pathlib import Path
 
 from adapters.formats.cameras.registry import NAMES, camera_format_of, read_cameras
 from sfm.comparison.camera_difference import CameraDifference, compare_cameras
+from sfm.model.camera_file import CameraFile
 from sfm.model.errors import GeometryError
 
 
@@ -43,17 +44,10 @@ def difference_of_files(
         KolinearError: a file cannot be read, or the cameras cannot be compared.
     """
     first, second = read_cameras(a, a_format), read_cameras(b, b_format)
-    names = (camera, camera)
-    if camera is not None and "=" in camera:
-        left, _, right = camera.partition("=")
-        names = (left, right)
-    if camera is None and len(second.cameras) > 1 and len(first.cameras) == 1:
-        shared = [other.name for other in second.cameras if other.name == first.cameras[0].name]
-        names = (None, shared[0] if shared else None)
-    if camera is None and len(first.cameras) > 1 and len(second.cameras) == 1:
-        shared = [other.name for other in first.cameras if other.name == second.cameras[0].name]
-        names = (shared[0] if shared else None, None)
-    chosen = [file.only(name) for file, name in zip((first, second), names, strict=True)]
+    left, _, right = ("", "", "") if camera is None else camera.partition("=")
+    of_first = left if right else _name(first, left, second)
+    of_second = right or _name(second, left, first)
+    chosen = [first.only(of_first), second.only(of_second)]
     if a.resolve() == b.resolve() and chosen[0].cameras[0].name == chosen[1].cameras[0].name:
         raise GeometryError(
             f"{a}: camera {chosen[0].cameras[0].name} would be compared with itself, needed another file or "
@@ -70,4 +64,19 @@ def difference_of_files(
         covariance=(chosen[0].covariance[0], chosen[1].covariance[0]),
         seen_px=(seen[0], seen[1]),
         distance=distance,
+        independent=a.resolve() != b.resolve(),
     )
+
+
+def _name(file: CameraFile, wanted: str, other: CameraFile) -> str | None:
+    """Return the camera to compare: the wanted one, the only one, or the one named like the only other one.
+
+    Args:
+        file: cameras to choose from.
+        wanted: name that was asked for; empty for none.
+        other: the cameras to compare with.
+    """
+    if len(file.cameras) == 1:
+        return None
+    shared = [camera.name for camera in file.cameras if camera.name == other.cameras[0].name]
+    return wanted or (shared[0] if shared and len(other.cameras) == 1 else None)

@@ -60,6 +60,7 @@ class CameraDifference:
     rotation: FloatArray  # rotation vector from a to b, axes x right, y up, z back, rad, (3,)
     translation: FloatArray  # from a to b, in the unit of the distance; 0 at infinity, (3,)
     p_value: float  # probability of so large an RMS without a difference; NaN without covariances
+    independent: bool = True  # whether the cameras come from separate calibrations, as the test requires
 
     @property
     def length_px(self) -> FloatArray:
@@ -128,6 +129,7 @@ def compare_cameras(
     covariance: tuple[FloatArray | None, FloatArray | None] = (None, None),
     seen_px: tuple[FloatArray | None, FloatArray | None] = (None, None),
     distance: float = np.inf,
+    independent: bool = True,
 ) -> CameraDifference:
     """Return the difference of two cameras in px over their format.
 
@@ -135,11 +137,13 @@ def compare_cameras(
         a: first camera.
         b: second camera, with photographs of the same size.
         covariance: of all parameters of a and of b, in their units, (p, p) each; None if unknown, which
-            treats the camera as free of error. The calibrations must be independent.
+            treats the camera as free of error.
         seen_px: image points of the calibrations of a and of b, px, (k, 2) each, whose hulls are the known
             region; None for the whole photograph.
         distance: of the points whose images are compared, along their rays; a shift of the projection centre
             is then implied too. Infinite: directions.
+        independent: whether the cameras come from separate calibrations; otherwise their correlation is left
+            out, and the result says so.
 
     Raises:
         GeometryError: photographs of other sizes, a distance that is not positive, or cameras with fewer than
@@ -202,6 +206,7 @@ def compare_cameras(
         rotation,
         translation,
         p_value,
+        independent,
     )
 
 

@@ -42,6 +42,13 @@ class CameraFile:
     solution: Solution | None = None
     """the result that calibrated the cameras, with its image points; None if only the cameras are known"""
 
+    def __post_init__(self) -> None:
+        if len(self.covariance) != len(self.cameras) or len(self.rms_px) not in (0, len(self.cameras)):
+            raise SurveyFileError(
+                f"{self.name}: {counted(len(self.covariance), 'covariance')} of "
+                f"{counted(len(self.cameras), 'camera')}, needed one of each, None if unknown"
+            )
+
     def index(self, name: str) -> int:
         """Return the index of a camera.
 

@@ -79,6 +79,10 @@ def verdict_of_difference(difference: CameraDifference) -> Banner:
                 f"Only the covariance of {known[0]} is known; the other camera counts as free of error.",
             )
         )
+    if len(known) == 2 and not difference.independent:
+        lines.append(
+            Line("note", "Both cameras are of one adjustment; their correlation is left out of the test.")
+        )
     part = float(difference.known.mean())
     if part < 0.5:
         lines.append(

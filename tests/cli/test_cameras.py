@@ -127,7 +127,10 @@ def test_what_cannot_be_done_is_one_line(
     assert "no camera 'x'" in refused(capsys, "compare", two, one, "--camera", "x", *out)
     told = refused(capsys, "compare", two, two, "--camera", names[0], *out)
     assert "would be compared with itself" in told
+    assert "no camera 'x'" in refused(capsys, "compare", two, one, "--camera", f"{names[0]}=x", *out)
     assert kolinear("compare", two, two, "--camera", f"{names[0]}={names[1]}", *out) == 0
+    assert "their correlation is left out of the test" in capsys.readouterr().out
+    assert kolinear("compare", two, one, "--camera", names[0], *out) == 0
     (camera,) = read_cameras(one).cameras
     write_cameras(tmp_path / "small.yaml", "ros-camera", lens(camera, size_px=(100, 80)))
     capsys.readouterr()

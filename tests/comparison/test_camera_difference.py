@@ -175,3 +175,5 @@ def test_a_camera_of_a_file_is_found_by_its_name() -> None:
     with pytest.raises(SurveyFileError, match="2 cameras, one is needed; name it with --camera: lens, b"):
         file.only(None)
     assert file.image_points("lens") is None
+    with pytest.raises(SurveyFileError, match="1 covariance of 2 cameras, needed one of each"):
+        replace(file, covariance=(None,))
