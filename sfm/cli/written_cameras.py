@@ -36,7 +36,8 @@ def write_camera_files(
 
     Args:
         source: file of cameras, result or survey.
-        target: new file; a new folder, if the format has one camera in a file and there are several.
+        target: new file; without an ending a new folder, if there are several cameras and the format has one
+            of them, or a pair, in a file.
         to: name of the format.
         read_as: name of the format of the source; None detects it.
         camera: name of the only camera to write; None writes all.
@@ -54,13 +55,14 @@ def write_camera_files(
     file = read_cameras(source, read_as)
     if camera is not None:
         file = file.only(camera)
-    elif len(file.cameras) > 1 and not form.several and target.suffix:
+    elif len(file.cameras) > 1 and not form.several(file) and target.suffix:
         file = file.only(None)  # which names the cameras
     file = with_residuals(file)
     file, conversions = readjust_cameras(file, form.stored, form.forms)
     refuse_inexact(conversions, inexact=inexact)
     lines = [conversion.words for conversion in conversions]
-    if len(file.cameras) == 1 or form.several:
+    always = form.several(file.only(file.cameras[0].name))  # several cameras, also where they are no pair
+    if len(file.cameras) == 1 or (form.several(file) and (target.suffix or always)):
         write_cameras(target, to, file)
         return "\n".join([*lines, f"{target}: {counted(len(file.cameras), 'camera')} as {to}"])
     refuse_links(target)

@@ -46,6 +46,7 @@ COEFFICIENTS = (
     *("D", "distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients"),
     *("distortion", "dist", "dist_coeff"),
 )
+Entry = FloatArray | float | int | str
 RMS = ("rms", "avg_reprojection_error", "reprojection_error", "error", "RMS")
 MATRICES = tuple((f"{name}1", f"{name}2") for name in ("K", "M", "camera_matrix_", "cameraMatrix"))
 
@@ -111,25 +112,44 @@ def _camera(
 
 
 def write_opencv(path: Path, file: CameraFile) -> str:
-    """Return the text of a file with one camera, as YAML or, where the path ends in .json, as JSON.
+    """Return the text of a file with one camera or a pair, as YAML or, where the path ends in .json, as JSON.
 
     Args:
         path: the file to be written.
-        file: one camera in a model of OpenCV.
+        file: cameras in models of OpenCV; two only if `is_pair`.
     """
-    camera = file.cameras[0]
-    K, D = matrix_of(camera), np.array([coefficients_of(camera)])
-    fisheye = camera.model == "opencv_fisheye"
-    rms = file.rms_px[0] if file.rms_px else None
-    if path.suffix.lower() == ".json":
+    remarks: tuple[str, ...] = ()
+    if len(file.cameras) == 2 and file.mounts is not None:
+        first, second = (
+            Mounted.of(file.cameras[k], file.mounts, k) for k in next(iter(file.mounts.by_rig().values()))
+        )
+        unit = file.unit or "unknown units"
+        content, remarks = _pair_content(
+            first, second, rectify(first.camera, second.camera, second.R, second.T)
+        )
+        remarks = (f"T is in {unit}: x2 = R x1 + T", *remarks)
+    else:
+        camera = file.cameras[0]
         content = {"camera": camera.name, "width": camera.size_px[0], "height": camera.size_px[1]}
-        content |= {"fisheye": int(fisheye), "K": _as_json(K), "D": _as_json(D)}
-        return json.dumps(content | ({} if rms is None else {"rms": rms}), indent=1, allow_nan=False) + "\n"
-    lines = ["%YAML:1.0", "---", f"camera: {json.dumps(camera.name, ensure_ascii=False)}"]
-    lines += [f"width: {camera.size_px[0]}", f"height: {camera.size_px[1]}"]
-    lines += [f"fisheye: {int(fisheye)}", *_matrix_lines("K", K), *_matrix_lines("D", D)]
-    lines += [] if rms is None else [f"rms: {numbers_text([rms])}"]
-    return "\n".join(lines) + "\n"
+        content |= {"fisheye": int(camera.model == "opencv_fisheye")}
+        content |= {"K": matrix_of(camera), "D": np.array([coefficients_of(camera)])}
+        content |= {"rms": file.rms_px[0]} if file.rms_px else {}
+    if path.suffix.lower() == ".json":
+        values = {name: _as_json(M) if isinstance(M, np.ndarray) else M for name, M in content.items()}
+        return json.dumps(values, indent=1, allow_nan=False) + "\n"
+    return "\n".join(_yaml_lines(content, remarks)) + "\n"
+
+
+def is_pair(file: CameraFile) -> bool:
+    """Return whether cameras are a stereo pair that one file of OpenCV holds."""
+    mounts = file.mounts
+    fisheye = any(camera.model == "opencv_fisheye" for camera in file.cameras)
+    return (
+        mounts is not None
+        and len(file.cameras) == 2
+        and not fisheye
+        and [*map(len, mounts.by_rig().values())] == [2]
+    )
 
 
 def pair_lines(
@@ -143,24 +163,39 @@ def pair_lines(
         unit: unit of lengths.
         rectified: the rectification that gave them, if they are rectified; otherwise theirs is computed.
     """
+    rectified = rectified or rectify(first.camera, mounted.camera, mounted.R, mounted.T)
+    content, remarks = _pair_content(first, mounted, rectified)
+    yield from _yaml_lines(content, (f"T is in {unit}: x2 = R x1 + T", *remarks))
+
+
+def _pair_content(
+    first: Mounted, mounted: Mounted, rectified: Rectification | None
+) -> tuple[dict[str, Entry], tuple[str, ...]]:
+    """Return the entries of a pair of cameras, and what is to be remarked."""
     R, T, second = mounted.R, mounted.T, mounted.camera
     K1, K2 = matrix_of(first.camera), matrix_of(second)
     E = skew(T) @ R
     F = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
-    matrices = {"K1": K1, "D1": np.array([coefficients_of(first.camera)])}
-    matrices |= {"K2": K2, "D2": np.array([coefficients_of(second)])}
-    matrices |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
-    rectified = rectified or rectify(first.camera, second, R, T)
-    yield from ("%YAML:1.0", "---", f"# T is in {unit}: x2 = R x1 + T")
-    yield f"camera1: {json.dumps(first.camera.name, ensure_ascii=False)}"
-    yield f"camera2: {json.dumps(second.name, ensure_ascii=False)}"
-    yield from (f"width: {first.camera.size_px[0]}", f"height: {first.camera.size_px[1]}")
+    content: dict[str, Entry] = {"camera1": first.camera.name, "camera2": second.name}
+    content |= {"width": first.camera.size_px[0], "height": first.camera.size_px[1]}
+    content |= {"K1": K1, "D1": np.array([coefficients_of(first.camera)])}
+    content |= {"K2": K2, "D2": np.array([coefficients_of(second)])}
+    content |= {"R": R, "T": T[:, None], "E": E, "F": F / (F[2, 2] or 1.0)}
     if rectified is None:
-        yield "# no rectification: the viewing directions differ too much for a common image plane"
-    else:
-        matrices |= rectified._asdict()
-    for name, M in matrices.items():
-        yield from _matrix_lines(name, M)
+        apart = "no rectification: the viewing directions differ too much for a common image plane"
+        return content, (apart,)
+    return content | rectified._asdict(), ()
+
+
+def _yaml_lines(content: dict[str, Entry], remarks: tuple[str, ...]) -> Iterator[str]:
+    yield from ("%YAML:1.0", "---", *(f"# {remark}" for remark in remarks))
+    for name, value in content.items():
+        if isinstance(value, np.ndarray):
+            yield from _matrix_lines(name, value)
+        elif isinstance(value, float):
+            yield f"{name}: {numbers_text([value])}"
+        else:
+            yield f"{name}: {json.dumps(value, ensure_ascii=False)}"
 
 
 def _matrix_lines(name: str, M: FloatArray) -> Iterator[str]:

@@ -26,7 +26,7 @@ from adapters.formats.cameras.lens_terms import LEAN
 from adapters.formats.cameras.metashape import read_metashape_camera, write_metashape_camera
 from adapters.formats.cameras.mrcal import STEREOGRAPHIC, read_mrcal, write_mrcal
 from adapters.formats.cameras.nerfstudio import read_nerfstudio, write_nerfstudio
-from adapters.formats.cameras.opencv import read_opencv, write_opencv
+from adapters.formats.cameras.opencv import is_pair, read_opencv, write_opencv
 from adapters.formats.cameras.ros import read_ros, write_ros
 from adapters.formats.registry import FORMATS, format_of, read_content
 from adapters.reading.trees import head_of
@@ -63,7 +63,7 @@ class CameraFormat:
     recognises: Callable[[Path, str], bool]  # by the path and the beginning of the file
     read: Callable[[Path], CameraFile]
     write: Callable[[Path, CameraFile], str | bytes]  # returns the content of a new file
-    several: bool = False  # whether a file holds several cameras
+    several: Callable[[CameraFile], bool] = lambda file: False  # whether a file holds such several cameras
     exact: Callable[[Camera], bool] = lambda camera: True  # what else a camera must be to be stored
 
     def stored(self, camera: Camera) -> Camera | None:
@@ -108,7 +108,7 @@ CAMERA_FORMATS = (
         lambda path, head: "Australis" in head or "Results for Camera" in head,
         read_australis,
         write_australis,
-        several=True,
+        several=lambda file: True,
     ),
     CameraFormat(
         "colmap-camera",
@@ -120,7 +120,7 @@ CAMERA_FORMATS = (
         ),
         read_colmap,
         write_colmap,
-        several=True,
+        several=lambda file: True,
     ),
     CameraFormat(
         "kalibr-camera",
@@ -130,7 +130,7 @@ CAMERA_FORMATS = (
         lambda path, head: re.search(r"^cam0:", head, re.MULTILINE) is not None,
         read_kalibr,
         write_kalibr,
-        several=True,
+        several=lambda file: True,
     ),
     CameraFormat(
         "ros-camera",
@@ -174,6 +174,7 @@ CAMERA_FORMATS = (
         ),
         read_opencv,
         write_opencv,
+        several=is_pair,
     ),
 )
 NAMES = tuple(form.name for form in CAMERA_FORMATS)
@@ -255,7 +256,7 @@ def write_cameras(path: Path, name: str, file: CameraFile) -> None:
     """
     form = camera_format(name)
     refuse_existing(path)
-    if len(file.cameras) > 1 and not form.several:
+    if len(file.cameras) > 1 and not form.several(file):
         raise OutputError(f"{path}: a file of format {name} has one camera, not {len(file.cameras)}")
     stored = []
     for camera in file.cameras:

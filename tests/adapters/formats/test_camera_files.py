@@ -173,6 +173,20 @@ def test_a_stereo_pair_has_its_mounts(tmp_path: Path) -> None:
     assert read.mounts is not None and read.unit == "m"
     np.testing.assert_allclose(read.mounts.position, truth.mounts.position, atol=1e-12)
     np.testing.assert_allclose(read.mounts.rotation, truth.mounts.rotation, atol=1e-12)
+    for ending in ("yaml", "json"):
+        pair = tmp_path / f"pair.{ending}"
+        write_cameras(pair, "opencv-camera", file_of(*lenses, mounts=truth.mounts, unit="mm"))
+        found, storage = read_cameras(pair), opencv_values(pair)
+        assert found.mounts is not None and [camera.name for camera in found.cameras] == ["left", "right"]
+        np.testing.assert_allclose(found.mounts.position, truth.mounts.position, atol=1e-12)
+        exact: Any = cv2.stereoRectify(
+            *(storage[name] for name in ("K1", "D1", "K2", "D2")),
+            SIZE,
+            *(storage["R"], storage["T"]),
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            alpha=0,
+        )
+        np.testing.assert_allclose(storage["Q"], exact[4], rtol=1e-9, atol=1e-9)
     in_mm = tmp_path / "mm.yaml"
     write_cameras(in_mm, "kalibr-camera", file_of(*lenses, mounts=truth.mounts, unit="mm"))
     scaled = read_cameras(in_mm).mounts
