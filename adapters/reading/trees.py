@@ -25,6 +25,8 @@ MAX_YAML_BYTES = 2_000_000  # of which PyYAML reads 0.3 MB in a second; a camera
 MAX_JSON_BYTES = 100_000_000
 HEAD_BYTES = 65_536  # by which the format of a file is recognised
 
+TRUE, FALSE = ("true", "1", "yes", "on"), ("false", "0", "no", "off", "")
+
 
 @dataclass(frozen=True)
 class Tree:
@@ -76,6 +78,22 @@ class Tree:
         if not (isinstance(value, str) and is_name(value)):
             raise self.error(f"{self.place}{name} is '{shorten(str(value))}', needed plain text")
         return value
+
+    def truth(self, *names: str) -> bool:
+        """Return whether the first of some keys that is there is true; False if none is.
+
+        Raises:
+            SurveyFileError: it is no truth value of YAML or JSON.
+        """
+        name = self.key(*names)
+        if name is None:
+            return False
+        value = str(self.values[name]).lower()
+        if value not in TRUE and value not in FALSE:
+            raise self.error(
+                f"{self.place}{name} is '{shorten(str(self.values[name]))}', needed true or false"
+            )
+        return value in TRUE
 
     def number(self, *names: str) -> float:
         """Return a finite number, of the first of some keys that is there."""

@@ -2,7 +2,7 @@
 
     lens, sensor_width, sensor_height    mm
     sensor_fit, shift_x, shift_y         HORIZONTAL; in widths of the sensor, x right, y up of the picture
-    resolution_x, resolution_y           px
+    resolution_x, resolution_y           px, of which resolution_percentage is rendered
     pixel_aspect_x, pixel_aspect_y       sides of a pixel, the smaller one is 1
 
 The sensor is seen through a lens: a positive shift moves the picture to the left and down, so that cx = w/2 -
@@ -37,6 +37,9 @@ def read_blender(path: Path) -> CameraFile:
     if tree.text("type", "PERSP") != "PERSP":
         raise tree.error(f"type {tree.text('type')}, only perspective cameras (PERSP) can be read")
     size = tree.sides(("resolution_x",), ("resolution_y",))
+    percent = tree.number("resolution_percentage") if tree.key("resolution_percentage") else 100.0
+    scaled = [int(side * percent / 100) for side in size]  # rounded down, as Blender renders
+    size = tree.side("resolution_x", scaled[0]), tree.side("resolution_y", scaled[1])
     aspect = [tree.number(name) if tree.key(name) else 1.0 for name in ("pixel_aspect_x", "pixel_aspect_y")]
     fit = tree.text("sensor_fit", "AUTO")
     if fit not in ("AUTO", "HORIZONTAL", "VERTICAL"):

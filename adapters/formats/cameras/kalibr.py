@@ -22,6 +22,7 @@ from adapters.formats.cameras.lens_terms import (
     alone,
     camera_in_pixels,
     coefficients_of,
+    is_rotation,
     matrix_of,
     mounts_of,
     numbers_text,
@@ -59,7 +60,7 @@ def read_kalibr(path: Path) -> CameraFile:
         entry = tree.below(f"cam{k}")
         if k and entry.key("T_cn_cnm1") and len(poses) == k:
             T = entry.numbers(("T_cn_cnm1",), 16).reshape(4, 4)
-            if not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+            if not is_rotation(T[:3, :3]) or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
                 raise entry.error(f"{entry.place}T_cn_cnm1 is no rotation and translation")
             before_R, before_T = poses[-1]
             poses.append((T[:3, :3] @ before_R, T[:3, :3] @ before_T + T[:3, 3]))

@@ -161,6 +161,11 @@ def mounts_of(poses: list[tuple[FloatArray, FloatArray]]) -> Mounts:
     return Mounts(position, np.array(turned), free, ("rig",) * len(poses))
 
 
+def is_rotation(R: FloatArray) -> bool:
+    """Return whether a matrix (3, 3) is a rotation but for rounding of its numbers, and no reflection."""
+    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0)
+
+
 def nearest(R: FloatArray) -> FloatArray:
     """Return the rotation nearest to a matrix with rounded numbers, (3, 3)."""
     return np.asarray(Rotation.from_matrix(R).as_matrix())

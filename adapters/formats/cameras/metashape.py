@@ -9,7 +9,8 @@ With x = X/Z, y = Y/Z in camera axes (x right, y down, z forward) and r2 = x2 + 
     u = w/2 + cx + x' f + x' b1 + y' b2,   v = h/2 + cy + y' f
 
 from the corner of the top-left pixel. This is exactly `opencv` (k3 = k4 = b2 = 0) or `full_opencv` (k4 = b2 =
-0) with p1 and p2 exchanged; with k4 or b2 it is exactly `brown_forward_affine`.
+0) with p1 and p2 exchanged; with k4 or b2 it is exactly `brown_forward_affine`. The p3 and p4 of versions
+before 1.7 are refused unless they are 0.
 
 Source: Agisoft Metashape Professional user manual 2.x, app. D "Camera models".
 """
@@ -96,8 +97,11 @@ def calibration_values(node: Node) -> tuple[dict[str, float], set[str]]:
     """Return the values of CALIBRATION of an element, and which of them it states.
 
     Raises:
-        SurveyFileError: f or f + b1 are not positive; with the line.
+        SurveyFileError: f or f + b1 are not positive, or p3 or p4 is not 0; with the line.
     """
+    for child in node.children:
+        if child.tag in ("p3", "p4") and child.numbers(1)[0] != 0:
+            raise child.error(f"{child.tag} = {shorten(child.text.strip())}, which no model has: needed 0")
     stated = {child.tag: float(child.numbers(1)[0]) for child in node.children if child.tag in CALIBRATION}
     p = dict.fromkeys(CALIBRATION, 0.0) | stated
     if not (p["f"] > 0 and p["f"] + p["b1"] > 0):

@@ -27,7 +27,8 @@ from sfm.model.camera_file import CameraFile
 
 WHAT = "a transforms.json of nerfstudio"
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
-OF_CAMERA = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")
+NUMBERS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")
+OF_CAMERA = ("camera_model", "is_fisheye", *NUMBERS)
 MAX_CAMERAS = 10_000
 
 
@@ -39,27 +40,26 @@ def read_nerfstudio(path: Path) -> CameraFile:
     """
     tree = read_tree(path, WHAT)
     if tree.key("fl_x"):
-        return CameraFile(path.name, (_camera(tree, tree, path.stem),), (None,))
+        return CameraFile(path.name, (_camera(tree, path.stem),), (None,))
+    stated = {name: tree.values[name] for name in OF_CAMERA if tree.key(name)}
     frames = tree.values.get("frames")
-    of_frames = {
-        tuple(str(frame.get(name)) for name in OF_CAMERA): frame
-        for frame in (frames if isinstance(frames, list) else [])[:MAX_CAMERAS]
-        if isinstance(frame, Mapping) and "fl_x" in frame
-    }
+    of_frames: dict[tuple[str, ...], Tree] = {}
+    for k, frame in enumerate((frames if isinstance(frames, list) else [])[:MAX_CAMERAS]):
+        if isinstance(frame, Mapping) and frame.get("fl_x") is not None:
+            # what the file states is so of every frame
+            entry = Tree(path, {**frame, **stated}, f"frames[{k}].")
+            of_frames.setdefault(tuple(str(entry.values.get(name)) for name in OF_CAMERA), entry)
     if not of_frames:
         raise tree.error("fl_x is missing, of the file and of its frames: no camera is stated")
-    cameras = tuple(
-        _camera(tree, Tree(path, frame, f"frames[{k}]."), f"camera {k + 1}")
-        for k, frame in enumerate(of_frames.values())
-    )
+    cameras = tuple(_camera(entry, f"camera {k}") for k, entry in enumerate(of_frames.values(), 1))
     return CameraFile(path.name, cameras, (None,) * len(cameras))
 
 
-def _camera(tree: Tree, entry: Tree, name: str) -> Camera:
-    model = entry.text("camera_model", tree.text("camera_model", "OPENCV"))
-    fisheye = model == "OPENCV_FISHEYE" or tree.values.get("is_fisheye") is True
+def _camera(entry: Tree, name: str) -> Camera:
+    model = entry.text("camera_model", "OPENCV")
+    fisheye = model == "OPENCV_FISHEYE" or entry.truth("is_fisheye")
     if model not in MODELS:
-        raise tree.error(f"camera_model {model}, expected one of {', '.join(MODELS)}")
+        raise entry.error(f"{entry.place}camera_model {model}, expected one of {', '.join(MODELS)}")
     size = entry.sides(("w",), ("h",))
     fx = entry.number("fl_x")
     fy = entry.number("fl_y") if entry.key("fl_y") else fx
@@ -70,8 +70,8 @@ def _camera(tree: Tree, entry: Tree, name: str) -> Camera:
     if fisheye or model.endswith("PINHOLE"):
         kept = np.array([k[f"k{i}"] for i in range(1, 5)]) if fisheye else np.zeros(0)
         name_of_model = "opencv_fisheye" if fisheye else "pinhole"
-        return camera_in_pixels(f"{tree.path}", name, name_of_model, size, np.concatenate([plane, kept]))
-    camera_in_pixels(f"{tree.path}", name, "pinhole", size, plane)  # refuses focal lengths
+        return camera_in_pixels(f"{entry.path}", name, name_of_model, size, np.concatenate([plane, kept]))
+    camera_in_pixels(f"{entry.path}", name, "pinhole", size, plane)  # refuses focal lengths
     p = dict.fromkeys(CALIBRATION, 0.0) | {f"k{i}": k[f"k{i}"] for i in range(1, 5)}
     p |= {"f": fy, "b1": fx - fy, "p1": k["p2"], "p2": k["p1"]}
     p |= {axis: c - (side - 1) / 2 for axis, c, side in zip(("cx", "cy"), centre, size, strict=True)}

@@ -25,6 +25,7 @@ from adapters.formats.cameras.lens_terms import (
     Mounted,
     camera_of_matrix,
     coefficients_of,
+    is_rotation,
     matrix_of,
     mounts_of,
     numbers_text,
@@ -61,7 +62,7 @@ def read_opencv(path: Path) -> CameraFile:
     size = _size(tree)
     pair = next((names for names in MATRICES if tree.key(names[0]) and tree.key(names[1])), None)
     rms = (tree.number(*RMS),) if tree.key(*RMS) else ()
-    fisheye = tree.text("fisheye", tree.text("fisheye_model", "0")) not in ("0", "false")
+    fisheye = tree.truth("fisheye", "fisheye_model")
     if pair is None:
         name = tree.text("camera", tree.text("camera_name", path.stem))
         camera = _camera(tree, name, size, MATRIX, COEFFICIENTS, fisheye)
@@ -80,7 +81,7 @@ def read_opencv(path: Path) -> CameraFile:
     mounts = None
     if tree.key("R") and tree.key("T"):
         R, T = tree.numbers(("R",), 9).reshape(3, 3), tree.numbers(("T",), 3)
-        if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        if not is_rotation(R):
             raise tree.error("R is no rotation")
         mounts = mounts_of([(np.eye(3), np.zeros(3)), (R, T)])
     return CameraFile(path.name, cameras, (None, None), mounts)
@@ -141,13 +142,14 @@ def write_opencv(path: Path, file: CameraFile) -> str:
 
 
 def is_pair(file: CameraFile) -> bool:
-    """Return whether cameras are a stereo pair that one file of OpenCV holds."""
+    """Return whether cameras are a stereo pair that one file of OpenCV holds, which has one size."""
     mounts = file.mounts
     fisheye = any(camera.model == "opencv_fisheye" for camera in file.cameras)
     return (
         mounts is not None
         and len(file.cameras) == 2
         and not fisheye
+        and file.cameras[0].size_px == file.cameras[1].size_px
         and [*map(len, mounts.by_rig().values())] == [2]
     )
 

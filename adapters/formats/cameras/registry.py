@@ -238,7 +238,7 @@ def refuse_links_out_of(path: Path) -> None:
     """Raise SurveyFileError if a file of somebody else is a link that leaves its folder."""
     if path.is_dir():
         refuse_links_out(path)
-    elif path.is_symlink() and not path.resolve().is_relative_to(path.parent.resolve()):
+    elif path.is_file() and path.is_symlink() and not path.resolve().is_relative_to(path.parent.resolve()):
         raise SurveyFileError(f"{path}: a link that leaves its folder; the file itself is needed there")
 
 

@@ -25,6 +25,7 @@ from adapters.formats.cameras.lens_terms import (
     numbers_text,
 )
 from adapters.reading.trees import read_tree
+from sfm.files.plain_text import shorten
 from sfm.model.camera_file import CameraFile
 from sfm.model.conventions import FloatArray
 from sfm.model.rectification import rectify
@@ -41,14 +42,16 @@ def read_ros(path: Path) -> CameraFile:
         SurveyFileError: no camera, or a model that is not read.
     """
     tree = read_tree(path, WHAT)
-    model = tree.text("distortion_model", "plumb_bob")
+    model = tree.values.get("distortion_model", "plumb_bob")
     if model not in MODELS:
-        raise tree.error(f"distortion_model {model}, expected one of {', '.join(filter(None, MODELS))}")
+        raise tree.error(
+            f"distortion_model {shorten(str(model))}, expected one of {', '.join(filter(None, MODELS))}"
+        )
     size = tree.sides(("image_width", "width"), ("image_height", "height"))
     K = tree.numbers(("camera_matrix", "K", "k"), 9)
     names = ("distortion_coefficients", "D", "d")
     D = tree.numbers(names, *COUNTS) if tree.key(*names) and model not in ("none", "") else np.zeros(0)
-    name = tree.text("camera_name", path.stem)
+    name = tree.text("camera_name") if tree.values.get("camera_name") else path.stem
     camera = camera_of_matrix(f"{path}", name, size, K, D, fisheye=model in FISHEYE)
     return CameraFile(path.name, (camera,), (None,))
 

@@ -192,6 +192,11 @@ def test_a_stereo_pair_has_its_mounts(tmp_path: Path) -> None:
     scaled = read_cameras(in_mm).mounts
     assert scaled is not None
     np.testing.assert_allclose(1000 * scaled.position, truth.mounts.position, atol=1e-9)
+    larger = replace(lenses[1], size_px=(2 * SIZE[0], SIZE[1]))  # of which the file of a pair has no place
+    with pytest.raises(OutputError, match="has one camera, not 2"):
+        write_cameras(
+            tmp_path / "sizes.yaml", "opencv-camera", file_of(lenses[0], larger, mounts=truth.mounts)
+        )
     single = replace(truth.mounts, rig=("a", "b"))
     write_cameras(tmp_path / "apart.yaml", "kalibr-camera", file_of(*lenses, mounts=single, unit="m"))
     assert read_cameras(tmp_path / "apart.yaml").mounts is None
@@ -288,6 +293,48 @@ def test_blender_shifts_the_picture(tmp_path: Path) -> None:
     np.testing.assert_allclose(lens.pixel_mm, 0.036)
 
 
+def test_blender_renders_a_part_of_its_resolution(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    content = {"lens": 50.0, "sensor_width": 36.0, "shift_x": 0.1, "resolution_percentage": 50}
+    path.write_text(json.dumps(content | {"resolution_x": 1000, "resolution_y": 501}))
+    (lens,) = read_cameras(path).cameras
+    assert lens.size_px == (500, 250)
+    np.testing.assert_allclose(lens.parameters, [50 / 36 * 500] * 2 + [199.5, 124.5])
+
+
+@pytest.mark.parametrize(("suffix", "value", "model"), [
+    (".json", "true", "opencv_fisheye"), (".json", "false", "opencv"),
+    (".yaml", "False", "opencv"), (".yaml", "yes", "opencv_fisheye"),
+])  # fmt: skip
+def test_a_fisheye_lens_is_stated_by_truth_values(
+    suffix: str, value: str, model: str, tmp_path: Path
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    K = "[[500, 0, 320], [0, 500, 240], [0, 0, 1]]"
+    entries = [f'"{key}": {text}' for key, text in (("size", "[640, 480]"), ("fisheye", value), ("K", K))]
+    path.write_text(f"{{{', '.join(entries)}}}" if suffix == ".json" else "\n".join(entries))
+    assert read_cameras(path).cameras[0].model == model
+
+
+def test_frames_share_what_the_file_of_nerfstudio_states(tmp_path: Path) -> None:
+    """Sizes are the file's, focal lengths those of frames; equal frames are one camera."""
+    path = tmp_path / "transforms.json"
+    frames = [{"fl_x": f, "cx": 320, "cy": 240} for f in (500, 500, 510)]
+    path.write_text(json.dumps({"w": 640, "h": 480, "is_fisheye": True, "frames": frames}))
+    cameras = read_cameras(path).cameras
+    assert [(camera.name, camera.value("fx")) for camera in cameras] == [("camera 1", 500), ("camera 2", 510)]
+    assert all(camera.model == "opencv_fisheye" and camera.size_px == (640, 480) for camera in cameras)
+
+
+def test_ros_may_leave_model_and_name_empty(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(
+        ROS.format('""', 500) + "camera_name: ''\ndistortion_coefficients: {data: [0.1, 0, 0, 0, 0]}\n"
+    )
+    (camera,) = read_cameras(path).cameras
+    assert camera.name == "a" and not camera.parameters[4:].any()
+
+
 AUSTRALIS = """\
 Australis Bundle Adjustment Results: Camera Parameters
 
@@ -324,6 +371,11 @@ GOOD = CV_YAML + "   data: [ 500., 0., 320., 0., 500., 240., 0., 0., 1. ]\n"
 ROS = (
     "image_width: 640\nimage_height: 480\ndistortion_model: {}\n"
     "camera_matrix:\n  data: [500, 0, 320, 0, {}, 240, 0, 0, 1]\n"
+)
+CHAIN = "".join(
+    f"cam{k}:\n  camera_model: pinhole\n  intrinsics: [5, 5, 3, 2]\n  resolution: [6, 4]\n" for k in (0, 1)
+) + (  # of the last camera
+    "  T_cn_cnm1: [[{}, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, {}]]\n"
 )
 MRCAL = "{{ 'lensmodel': '{}', 'intrinsics': [{}], 'imagersize': [{}] }}"
 BAD: dict[str, tuple[str, str]] = {
@@ -368,6 +420,17 @@ BAD: dict[str, tuple[str, str]] = {
     "a.xml": ("<calibration><width>6</width></calibration>", "<calibration> without <height>"),
     "b.xml": ("<calibration><width>6</width><height>4</height></calibration>", "must be positive"),
     "c.xml": ("<calibration><projection>fisheye</projection></calibration>", "only frame cameras"),
+    "d.xml": (
+        "<calibration><width>6</width><height>4</height><f>5</f><p3>0</p3><p4>2.5</p4></calibration>",
+        "p4 = 2.5, which no model has",
+    ),
+    "q.yaml": (GOOD + "fisheye: perhaps\n", "fisheye is 'perhaps', needed true or false"),
+    "r.yaml": (CHAIN.format(-1, 1), "cam1.T_cn_cnm1 is no rotation and translation"),
+    "s.yaml": (CHAIN.format(1, 2), "cam1.T_cn_cnm1 is no rotation and translation"),
+    "f.json": (
+        json.dumps({"h": 4, "frames": [{}, {"fl_x": 5, "w": 6}, {"fl_x": 5, "w": 0.5}]}),
+        "frames[2].w is 0.5 px",
+    ),
     "cameras.txt": ("1 PINHOLE 640 480 500 500 320\n", "3 parameters, model PINHOLE has 4"),
     "cameras.bin": ("x", "the file ends here"),
     "a.txt": ("Australis\nResults for Camera 1 X\nC 8 0 8 1 1 (mm)\n", "sensor size and pixel size"),
@@ -396,6 +459,9 @@ def test_what_is_not_there_or_leads_elsewhere_is_refused(tmp_path: Path) -> None
     link.symlink_to(tmp_path / "home" / "secret.yaml")
     with pytest.raises(SurveyFileError, match="a link that leaves its folder"):
         read_cameras(link)
+    (tmp_path / "loop.yaml").symlink_to(tmp_path / "loop.yaml")
+    with pytest.raises(SurveyFileError, match=r"loop\.yaml: cannot be read"):
+        read_cameras(tmp_path / "loop.yaml")
     with pytest.raises(SurveyFileError, match="camera format 'x', expected one of"):
         camera_format("x")
 
