@@ -64,8 +64,18 @@ def difference_of_files(
         covariance=(chosen[0].covariance[0], chosen[1].covariance[0]),
         seen_px=(seen[0], seen[1]),
         distance=distance,
-        independent=a.resolve() != b.resolve(),
+        independent=a.resolve() != b.resolve() and not _image_points(first) & _image_points(second),
     )
+
+
+def _image_points(file: CameraFile) -> set[tuple[str, float, float]]:
+    """Return the image points of a result by photograph and pixel, px; those of a file are not known."""
+    if file.solution is None:
+        return set()
+    network = file.solution.network
+    seen = network.image_points
+    names = [network.images[k] for k in seen.image.tolist()]
+    return {(name, x, y) for name, (x, y) in zip(names, seen.xy.tolist(), strict=True)}
 
 
 def _name(file: CameraFile, wanted: str, other: CameraFile) -> str | None:

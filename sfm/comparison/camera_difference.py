@@ -103,8 +103,14 @@ class CameraDifference:
 
     @property
     def significant(self) -> bool | None:
-        """Whether the cameras differ by more than chance; None without covariances."""
-        return None if np.isnan(self.p_value) else bool(self.p_value < LEVEL)
+        """Whether the cameras differ by more than chance; None if that is not known.
+
+        Without covariances it is not, nor where calibrations that are not separate differ by little: what
+        they have in common makes their difference smaller than the covariances let expect.
+        """
+        if np.isnan(self.p_value) or (self.p_value >= LEVEL and not self.independent):
+            return None
+        return bool(self.p_value < LEVEL)
 
     def _rows(self) -> list[tuple[str, str]]:
         over = "not known" if np.isnan(self.over_sigma) else f"{self.over_sigma:.3g}"

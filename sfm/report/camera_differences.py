@@ -81,7 +81,11 @@ def verdict_of_difference(difference: CameraDifference) -> Banner:
         )
     if len(known) == 2 and not difference.independent:
         lines.append(
-            Line("note", "Both cameras are of one adjustment; their correlation is left out of the test.")
+            Line(
+                "note",
+                "Both cameras are of one adjustment or the same image points; their correlation is left out "
+                "of the test.",
+            )
         )
     part = float(difference.known.mean())
     if part < 0.5:
@@ -100,8 +104,10 @@ def describe_difference(difference: CameraDifference) -> str:
         f"They differ by {significant(difference.rms_px)} px RMS, {significant(difference.largest_px)} px at "
         f"most ({_place(difference)})"
     )
-    if difference.significant is None:
+    if np.isnan(difference.p_value):
         return f"{words}; standard deviations are not known."
+    if difference.significant is None:
+        return f"{words}, {significant(difference.over_sigma)} standard deviations of separate calibrations."
     what = "more than chance" if difference.significant else "no more than chance"
     return f"{words}, {significant(difference.over_sigma)} standard deviations: {what}."
 
@@ -156,6 +162,7 @@ def _summary(difference: CameraDifference) -> dict[str, object]:
         "largest_at_px": [difference.x[column], difference.y[row]],
         "largest_sigma_px": float(difference.sigma_px[row, column]),
         "probability": difference.p_value,
+        "independent": difference.independent,
         "significant": difference.significant,
         "known_part": float(difference.known.mean()),
         "rotation_deg": np.degrees(difference.rotation),

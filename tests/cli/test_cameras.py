@@ -85,6 +85,27 @@ def test_two_calibrations_of_one_camera_do_not_differ(
     assert "chance alone would give" in page and "implied rotation" in page
 
 
+def test_calibrations_from_the_same_image_points_are_not_separate(
+    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They differ by less than chance; that no more is in it would not be known."""
+    first = calibrated("first")
+    estimate = first.estimate
+    lens = estimate.cameras[0]
+    free = lens.free & ~np.isin(lens.names, ("P1", "P2"))
+    start = replace(estimate, cameras=(replace(lens, free=free),))
+    replace(adjust(first.network, start, reject="none").solution, name="again").write(tmp_path / "again")
+    out = tmp_path / "out"
+    assert kolinear("compare", results[0], tmp_path / "again", "--cameras", "--out", out) == 0
+    told = capsys.readouterr().out
+    assert "standard deviations of separate calibrations." in told and "than chance" not in told
+    assert "or the same image points; their correlation is left out of the test." in told
+    summary = json.loads((out / "cameras.json").read_text())
+    assert summary["significant"] is None and summary["independent"] is False
+    assert kolinear("compare", *results, "--cameras", "--out", tmp_path / "separate") == 0
+    assert "no more than chance" in capsys.readouterr().out
+
+
 def test_a_changed_camera_differs(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
