@@ -8,7 +8,8 @@ into camera b and imaged there:
     difference(q) = pixel_b(R ray_a(q) + t) - q
 
 R and t minimise the sum of squares of the differences over the region in which both cameras are known: the
-hull of their image points, or all of the format where these are unknown. The covariance of the differences
+hull of their image points, or all of the format where these are unknown. All points are at one distance, so
+that t is proportional to it, and the differences are the same at any. The covariance of the differences
 follows from those of the parameters of both cameras, with what R and t absorb removed.
 
 Whether the cameras differ is decided by the RMS over the region. Without a difference its square is a sum of
@@ -41,7 +42,8 @@ from sfm.model.errors import GeometryError
 
 STEPS = 36  # of the grid along the longer side
 ROUNDS = 20  # of the rotation and translation; after five they change no more
-CONVERGED = 1e-12  # rad
+CONVERGED = 1e-12  # rad, and distances
+STEP = 1e-6  # of tangents, for a derivative
 
 
 @dataclass(frozen=True, repr=False)
@@ -147,7 +149,7 @@ def compare_cameras(
         seen_px: image points of the calibrations of a and of b, px, (k, 2) each, whose hulls are the known
             region; None for the whole photograph.
         distance: of the points whose images are compared, along their rays; a shift of the projection centre
-            is then implied too. Infinite: directions.
+            is then implied too, and is all that depends on the distance. Infinite: directions.
         independent: whether the cameras come from separate calibrations; otherwise their correlation is left
             out, and the result says so.
 
@@ -185,18 +187,25 @@ def compare_cameras(
             f"cameras {a.name} and {b.name}: {known.sum()} of {len(grid)} places of the photograph are known "
             "to both, needed at least 4"
         )
-    rays = np.column_stack([uv, -np.ones(len(uv))])
-    points = rays if np.isinf(distance) else distance * rays / np.linalg.norm(rays, axis=1)[:, None]
     shifts = 0 if np.isinf(distance) else 3
-    sigmas = _moved_by_sigma(a, b, grid, uv, covariance)
-    rotation, translation, moved = _implied(b, points, grid, known, shifts)
+    R, t = _implied(b, _points(uv), grid, known, shifts)
+    points = _points(uv) @ R.T + t
+    moved = _tangents(points)
     difference = pixel_from_tangents(b, moved) - grid
     difference[~fits] = np.nan
     known = np.asarray(known & np.isfinite(difference).all(axis=1))
     C, p_value = np.full((len(grid), 2, 2), np.nan), float("nan")
-    if sigmas is not None:
-        free = sigmas - _absorbed(_lever(b, moved, points, shifts), sigmas, known)
+    sigmas = []
+    if covariance[0] is not None:  # a pixel of a keeps its place, so that its ray moves the other way
+        by_pixel = _by_ray(b, uv, R, t) @ np.linalg.inv(pixel_jacobian(a, grid))
+        sigmas.append(-by_pixel @ _moved_by_sigma(a, uv, covariance[0]))
+    if covariance[1] is not None:
+        sigmas.append(_moved_by_sigma(b, moved, covariance[1]))
+    if any(columns.shape[2] for columns in sigmas):
+        both = np.concatenate(sigmas, axis=2)
+        free = both - _absorbed(_lever(b, moved, points, shifts), both, known)
         C = free @ np.swapaxes(free, 1, 2)
+        known = np.asarray(known & np.isfinite(free).all(axis=(1, 2)))  # not at the end of a model's range
         p_value = _probability(float((difference[known] ** 2).sum()), free[known])
     shape = (len(y), len(x))
     return CameraDifference(
@@ -209,8 +218,8 @@ def compare_cameras(
         known.reshape(shape),
         (covariance[0] is not None, covariance[1] is not None),
         float(distance),
-        rotation,
-        translation,
+        np.asarray(Rotation.from_matrix(R).as_rotvec()),
+        distance * t if shifts else t,
         p_value,
         independent,
     )
@@ -218,18 +227,18 @@ def compare_cameras(
 
 def _implied(
     b: Camera, points: FloatArray, xy: FloatArray, known: BoolArray, shifts: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the transformation into b with the smallest differences, and the tangents of the points there.
+) -> tuple[FloatArray, FloatArray]:
+    """Return the transformation into b with the smallest differences.
 
     Args:
         b: the second camera.
-        points: in the axes of the first camera, (k, 3).
+        points: at distance 1 in the axes of the first camera, (k, 3).
         xy: their pixels there, px, (k, 2).
         known: which pixels count, (k,).
         shifts: 3 if a translation is implied too, otherwise 0.
 
     Returns:
-        Rotation vector (3,), translation (3,), and tangents (k, 2).
+        Rotation matrix (3, 3) and translation, in distances, (3,).
     """
     R, t = np.eye(3), np.zeros(3)
     for _ in range(ROUNDS):
@@ -241,9 +250,15 @@ def _implied(
         step = np.asarray(np.linalg.lstsq(A, rest, rcond=None)[0], dtype=float)
         turn = rotation_from_vector(step[:3])
         R, t = turn @ R, turn @ t + (step[3:] if shifts else 0.0)
-        if np.abs(step[:3]).max() < CONVERGED:
+        if np.abs(step).max() < CONVERGED:
             break
-    return Rotation.from_matrix(R).as_rotvec(), t, _tangents(points @ R.T + t)
+    return R, t
+
+
+def _points(uv: FloatArray) -> FloatArray:
+    """Return the points at distance 1 on rays, in camera axes, (k, 3)."""
+    rays = np.column_stack([uv, -np.ones(len(uv))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1)[:, None])
 
 
 def _tangents(points: FloatArray) -> FloatArray:
@@ -282,33 +297,37 @@ def _lever(b: Camera, uv: FloatArray, points: FloatArray, shifts: int) -> FloatA
     return np.asarray(J @ np.concatenate(columns, axis=2))
 
 
-def _moved_by_sigma(
-    a: Camera,
-    b: Camera,
-    xy: FloatArray,
-    uv: FloatArray,
-    covariance: tuple[FloatArray | None, FloatArray | None],
-) -> FloatArray | None:
-    """Return how independent unit variables of both cameras move the differences, px, (k, 2, n).
+def _by_ray(b: Camera, uv: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the derivatives of pixels of b by the tangents of the first camera's rays, px, (k, 2, 2)."""
+    ahead, behind = (
+        np.stack([_tangents(_points(uv + step) @ R.T + t) for step in sign * STEP * np.eye(2)], axis=-1)
+        for sign in (1, -1)
+    )
+    pixels = pixel_from_tangents(b, _tangents(_points(uv) @ R.T + t))
+    return np.asarray(pixel_jacobian(b, pixels) @ ((ahead - behind) / (2 * STEP)))
 
-    A camera's variables are those whose covariance is the identity, so that the sum of the outer products of
-    the columns is the covariance of the differences. None if neither covariance is known.
+
+def _moved_by_sigma(camera: Camera, uv: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return how independent unit variables of a camera move the pixels of rays, px, (k, 2, n).
+
+    These are variables whose covariance is the identity, so that the sum of the outer products of the columns
+    is the covariance of the pixels.
+
+    Args:
+        camera: the camera.
+        uv: tangents of the rays, (k, 2).
+        Q: covariance of its parameters, (p, p).
     """
-    columns = []
-    for camera, Q, sign in ((a, covariance[0], -1.0), (b, covariance[1], 1.0)):
-        if Q is None:
-            continue
-        n = len(camera.parameters)
-        if Q.shape != (n, n) or not np.isfinite(Q).all():
-            raise GeometryError(f"camera {camera.name}: a covariance of shape {Q.shape}, needed {n} x {n}")
-        sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
-        free = np.flatnonzero(sigma > 0)
-        if not len(free):
-            continue
-        values, vectors = np.linalg.eigh(Q[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
-        root = sigma[free][:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-        columns.append(sign * parameter_jacobian(camera, uv)[:, :, free] @ root)
-    return np.concatenate(columns, axis=2) if columns else None
+    n = len(camera.parameters)
+    if Q.shape != (n, n) or not np.isfinite(Q).all():
+        raise GeometryError(f"camera {camera.name}: a covariance of shape {Q.shape}, needed {n} x {n}")
+    sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
+    free = np.flatnonzero(sigma > 0)
+    if not len(free):
+        return np.zeros((len(uv), 2, 0))
+    values, vectors = np.linalg.eigh(Q[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
+    root = sigma[free][:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(parameter_jacobian(camera, uv)[:, :, free] @ root)
 
 
 def _absorbed(lever: FloatArray, moved: FloatArray, known: BoolArray) -> FloatArray:

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from sfm.adjustment.solve import adjust
 from sfm.comparison.camera_difference import CameraDifference, compare_cameras
 from sfm.comparison.camera_readjustment import LIMIT_PX, readjust_cameras, residuals_px
-from sfm.model.camera import Camera, camera_from_values
+from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
 from sfm.model.camera_file import CameraFile, cameras_of
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError, SurveyFileError, UnknownNameError
@@ -48,6 +49,61 @@ def test_a_distance_implies_a_shift_along_the_axis() -> None:
     assert near.rms_px < far.rms_px / 3
     np.testing.assert_allclose(near.translation[:2], 0.0, atol=1e-6)
     assert abs(near.translation[2]) > 1e-3
+
+
+def with_value(camera: Camera, name: str, value: float) -> Camera:
+    return camera.with_parameters(np.where(np.array(camera.names) == name, value, camera.parameters))
+
+
+def test_a_shift_is_converged_where_no_rotation_is_implied() -> None:
+    """Against a search over shifts along the axis, which is the only shift by symmetry."""
+    shorter, short = (
+        with_value(lens(), "c", 8.0),
+        compare_cameras(lens(), with_value(lens(), "c", 8.0), distance=3.0),
+    )
+    np.testing.assert_allclose(np.linalg.norm(short.rotation), 0.0, atol=1e-9)
+    grid = np.stack(np.meshgrid(short.x, short.y), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([tangents_from_pixel(lens(), grid), -np.ones(len(grid))])
+    points = 3.0 * rays / np.linalg.norm(rays, axis=1)[:, None]
+
+    def rms(z: float) -> float:
+        moved = points + np.array([0.0, 0.0, z])
+        away = pixel_from_tangents(shorter, -moved[:, :2] / moved[:, 2:]) - grid
+        return float(np.sqrt((away**2).sum(axis=1).mean()))
+
+    best = minimize_scalar(rms, bounds=(0.0, 1.0), method="bounded")
+    np.testing.assert_allclose(short.rms_px, best.fun, rtol=1e-6)
+    far = compare_cameras(lens(), shorter, distance=300.0)  # the same but for the scale of the shift
+    np.testing.assert_allclose(far.difference, short.difference, atol=1e-6)
+    np.testing.assert_allclose(far.translation, 100 * short.translation, atol=1e-6)
+
+
+@pytest.mark.parametrize("distance", [np.inf, 3.0])
+@pytest.mark.parametrize(("name", "value"), [("c", 20.0), ("x0", 1.0), ("K1", -1e-3)])
+def test_cameras_that_differ_much_have_the_right_sigma(name: str, value: float, distance: float) -> None:
+    """The differences after a change of each parameter by its sigma, square by square."""
+    a, b = lens(), with_value(lens(), name, value)
+    sigma = {"c": 2e-3, "x0": 2e-3, "y0": 1e-3, "K1": 2e-6, "P1": 1e-6}
+    Q = np.diag([sigma.get(of, 0.0) ** 2 for of in a.names])
+    compared = compare_cameras(a, b, covariance=(Q, Q), distance=distance)
+    expected = np.zeros_like(compared.covariance)
+    for of, change in sigma.items():
+        for pair in (
+            (with_value(a, of, a.value(of) + change), b),
+            (a, with_value(b, of, b.value(of) + change)),
+        ):
+            moved = compare_cameras(*pair, distance=distance).difference - compared.difference
+            expected += moved[..., :, None] * moved[..., None, :]
+    np.testing.assert_allclose(compared.expected_rms_px**2, np.einsum("rcii->rc", expected).mean(), rtol=0.05)
+
+
+def test_places_at_the_end_of_a_models_range_are_not_known() -> None:
+    """There its derivatives are missing; the others have an expected RMS all the same."""
+    folding = camera_from_values("x", "opencv", SIZE, (1.0, 1.0), c_mm=900.0, values=(("k1", -0.4),))
+    Q = np.diag(np.full(len(folding.names), 1e-6))
+    compared = compare_cameras(folding, with_value(folding, "k1", -0.39), covariance=(Q, Q))
+    assert 0.1 < compared.known.mean() < 1.0 and np.isfinite(compared.covariance[compared.known]).all()
+    assert compared.over_sigma > 0.0 and 0.0 <= compared.p_value <= 1.0
 
 
 def calibrated(rng: np.random.Generator) -> tuple[Camera, FloatArray, FloatArray]:
