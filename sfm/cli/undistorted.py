@@ -32,6 +32,7 @@ from sfm.products.undistorting.views import (
 from sfm.runtime.progress import Progress
 
 SHOWN = 3  # names that a message lists
+PAIRS_FORMAT = "opencv-camera"  # which has R1, R2, P1, P2 and Q
 Moment = tuple[str, ...]
 
 
@@ -67,10 +68,15 @@ def undistort_photographs(
         KolinearError: cameras or photographs cannot be read, or do not belong together; nothing is written.
     """
     form = camera_format(to)
+    if pairs and (camera is not None or to != PAIRS_FORMAT):
+        raise SurveyFileError(
+            f"{cameras}: --pairs takes both cameras of a rig and writes {PAIRS_FORMAT}; leave out --camera "
+            "and --to"
+        )
     refuse_foreign_folder(out)
     file = read_cameras(cameras, read_as)
     if camera is not None:
-        file = file.only(camera) if not pairs else file
+        file = file.only(camera)
     folder, names = photographs_of(photographs, out)
     owner = owners(file, names)
     lines: list[str] = []
@@ -92,7 +98,8 @@ def undistort_photographs(
                     path = target / f"camera-{_file_name(new.name)}{form.suffixes[0]}"
                     write_cameras(path, to, CameraFile(file.name, (new,), (None,)))
                     lines.append(
-                        f"camera {new.name}: {counted(owner.count(k), 'photograph')}, new camera "
+                        f"camera {new.name}: {counted(owner.count(k), 'photograph')} as "
+                        f"{names[owner.index(k)]}, new camera "
                         f"{path.name}, f = {new.value('fx'):.4f} px"
                     )
     if draw.without_exif:
@@ -147,12 +154,23 @@ def owners(file: CameraFile, names: Sequence[str]) -> list[int]:
     Raises:
         SurveyFileError: the camera of a photograph is not known.
     """
-    if len(file.cameras) == 1:
-        return [0] * len(names)
-    known: dict[str, int] = {}
+    taken_by: dict[str, str] = {}  # by the result, whose cameras may be more than those of the file
     if file.solution is not None:
-        network = file.solution.network
-        known = {_stem(name): k for name, k in zip(network.images, network.camera.tolist(), strict=True)}
+        network, of_result = file.solution.network, file.solution.estimate.cameras
+        taken_by = {
+            _stem(name): of_result[k].name
+            for name, k in zip(network.images, network.camera.tolist(), strict=True)
+        }
+    if len(file.cameras) == 1:
+        only = file.cameras[0].name
+        for name in names:
+            if taken_by.get(_stem(name), only) != only:
+                raise SurveyFileError(
+                    f"{name}: camera {taken_by[_stem(name)]} took it by the result, not {only}; leave out "
+                    "--camera, or give the photographs of one camera"
+                )
+        return [0] * len(names)
+    known = {stem: file.index(name) for stem, name in taken_by.items()}
     proposed = cameras_in_names(list(names))
     order: dict[str, int] = {}
     if proposed is not None:
@@ -243,7 +261,10 @@ def _draw_pairs(
         inside.mkdir(exist_ok=True)
         path = inside / f"rectified-{_file_name(title)}.yaml"
         path.write_text("\n".join(_pair_lines(pair, file.unit)) + "\n", encoding="utf-8", newline="")
-        words = f"{title}: {counted(len(common), 'pair')}, new cameras, R1, R2, P1, P2 and Q in {path.name}"
+        words = (
+            f"{title}: {counted(len(common), 'pair')} as {of[0][common[0]]} and {of[1][common[0]]}, new "
+            f"cameras, R1, R2, P1, P2 and Q in {path.name}"
+        )
         if file.solution is not None and len(v := row_differences(pair, file.solution)):
             what = "columns" if pair.axis else "rows"
             words += (

@@ -12,10 +12,11 @@ import pytest
 from PIL import Image
 
 from adapters.formats.cameras.registry import read_cameras, write_cameras
+from sfm.cli.undistorted import owners
 from sfm.model.camera import Camera, camera_from_values
-from sfm.model.camera_file import CameraFile
+from sfm.model.camera_file import CameraFile, cameras_of
 from sfm.model.conventions import AnyArray
-from sfm.model.errors import GeometryError
+from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.solution import Solution
 from sfm.products.undistorting.photographs import UndistortedPhotographs
 from sfm.products.undistorting.views import rectified_pair, row_differences, undistorted_view
@@ -147,7 +148,10 @@ def test_pairs_of_a_file_are_rectified_for_opencv(tmp_path: Path, capsys: pytest
     out = tmp_path / "out"
     assert kolinear("undistort", path, photographs, "--pairs", "--out", out) == 0
     told = capsys.readouterr().out
-    assert "cam0-cam1: 2 pairs" in told and f"{out}: 4 photographs without distortion" in told
+    assert (
+        "cam0-cam1: 2 pairs as left01.png and right01.png" in told
+        and f"{out}: 4 photographs without distortion" in told
+    )
     assert sorted(one.name for one in out.glob("*.png")) == [
         "left01.png",
         "left02.png",
@@ -193,7 +197,7 @@ def test_single_photographs_of_a_camera(tmp_path: Path, capsys: pytest.CaptureFi
     out = tmp_path / "out"
     assert kolinear("undistort", path, tmp_path / "a.png", "--out", out, "--to", "mrcal-camera") == 0
     assert (
-        "camera left: 1 photograph, new camera camera-left.cameramodel, f = 262.0000 px"
+        "camera left: 1 photograph as a.png, new camera camera-left.cameramodel, f = 262.0000 px"
         in capsys.readouterr().out
     )
     (new,) = read_cameras(out / "camera-left.cameramodel").cameras
@@ -210,6 +214,9 @@ def test_what_does_not_belong_together_is_one_line(
     told = refused(capsys, "undistort", single, photographs, "--pairs", *out)
     assert "how the cameras are mounted is not known" in told
     assert "no camera 'x'" in refused(capsys, "undistort", path, photographs, "--camera", "x", *out)
+    for more in (("--camera", "cam0"), ("--to", "ros-camera")):
+        told = refused(capsys, "undistort", path, photographs, "--pairs", *more, *out)
+        assert "--pairs takes both cameras of a rig and writes opencv-camera" in told
     assert "--alpha 2, needed 0" in refused(capsys, "undistort", single, photographs, "--alpha", "2", *out)
     assert "there is no such folder" in refused(capsys, "undistort", single, tmp_path / "none", *out)
     (tmp_path / "empty").mkdir()
@@ -236,6 +243,18 @@ def test_what_does_not_belong_together_is_one_line(
     (tmp_path / "others" / "y.png").unlink()
     told = refused(capsys, "undistort", path, tmp_path / "others" / "z.png", "--pairs", *out)
     assert "took it is not known" in told and not (tmp_path / "out").exists()
+
+
+def test_a_result_knows_whose_photographs_they_are() -> None:
+    network, truth = make_rig(seed_of("whose photographs"), moments=4, points=15)
+    file = cameras_of(Solution("x", network, truth))
+    names = list(network.images)
+    assert owners(file, names) == network.camera.tolist()
+    first = file.only(file.cameras[0].name)
+    mine = [name for name, k in zip(names, network.camera.tolist(), strict=True) if k == 0]
+    assert owners(first, [*mine, "another.jpg"]) == [0] * (len(mine) + 1)
+    with pytest.raises(SurveyFileError, match=f"camera {file.cameras[1].name} took it by the result, not"):
+        owners(first, names)
 
 
 def test_what_no_plane_shows_is_refused() -> None:
