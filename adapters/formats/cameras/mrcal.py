@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +40,8 @@ from sfm.model.errors import SurveyFileError
 
 WHAT = "a camera model of mrcal"
 MAX_BYTES = 50_000_000  # of which nearly all are the optimization inputs
+MAX_LITERAL = 500_000  # characters besides them, of which Python parses 0.3 MB in a second; a camera has 400
+OPTIMIZATION = re.compile(r"b'[^'\n]*'")  # in base 85, which has no quotes
 COUNTS = {"PINHOLE": 0, "STEREOGRAPHIC": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 LENS = "LENSMODEL_"
 STEREOGRAPHIC = (0.5, 1.0)  # alpha and beta of eucm
@@ -50,7 +53,11 @@ def read_mrcal(path: Path) -> CameraFile:
     Raises:
         SurveyFileError: not a camera model, or a lens model that is not read.
     """
-    text = text_of(path, MAX_BYTES, WHAT)
+    text = OPTIMIZATION.sub("b''", text_of(path, MAX_BYTES, WHAT))
+    if len(text) > MAX_LITERAL:
+        raise SurveyFileError(
+            f"{path}: {len(text)} characters besides the optimization inputs, {WHAT} has at most {MAX_LITERAL}"
+        )
     try:
         with warnings.catch_warnings(action="ignore"):  # of escapes in texts
             values = ast.literal_eval(text.strip())

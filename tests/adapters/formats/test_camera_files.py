@@ -251,6 +251,13 @@ def test_mrcals_own_files_are_read() -> None:
         read_cameras(path.with_name("cam0.splined.cameramodel"))
 
 
+def test_the_optimization_inputs_of_mrcal_are_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "a.cameramodel"
+    text = MRCAL.format("LENSMODEL_PINHOLE", "5, 5, 3, 2", "6, 4")
+    path.write_text(f"{text[:-2]},\n 'optimization_inputs': b'{'a#{}' * 300_000}' }}")
+    assert read_cameras(path).cameras[0].parameters.tolist() == [5, 5, 3, 2, 0, 0, 0, 0]
+
+
 def test_a_stereographic_projection_is_2_tan_of_half_the_angle() -> None:
     angle = np.radians([10.0, 45.0, 80.0])
     lens = LENSES["stereographic"]
@@ -403,6 +410,10 @@ BAD: dict[str, tuple[str, str]] = {
     "c.cameramodel": (
         "{ 'lensmodel': open('/etc/passwd') }",
         "not a camera model of mrcal (no Python literal)",
+    ),
+    "f.cameramodel": (
+        MRCAL.format("LENSMODEL_PINHOLE", "1, " * 200_000, "3, 4"),
+        "characters besides the optimization inputs, a camera model of mrcal has at most",
     ),
     "d.cameramodel": (MRCAL.format("LENSMODEL_PINHOLE", "1e400, 2, 3, 4", "3, 4"), "intrinsics is 'inf'"),
     "e.cameramodel": ("[" * 5000, "not a camera model of mrcal"),
