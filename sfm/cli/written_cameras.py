@@ -19,8 +19,11 @@ from sfm.comparison.camera_readjustment import LIMIT_PX, Readjusted, readjust_ca
 from sfm.files.open_folders import refuse_links
 from sfm.files.whole_files import refuse_existing, whole_folder
 from sfm.model.camera_file import CameraFile
+from sfm.model.conventions import METRES
 from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError
+
+KALIBR = "kalibr-camera"
 
 
 def write_camera_files(
@@ -60,7 +63,7 @@ def write_camera_files(
     file = with_residuals(file)
     file, conversions = readjust_cameras(file, form.stored, form.forms)
     refuse_inexact(conversions, inexact=inexact)
-    lines = [conversion.words for conversion in conversions]
+    lines = [*(conversion.words for conversion in conversions), *_words_on_mounts(file, form)]
     always = form.several(file.only(file.cameras[0].name))  # several cameras, also where they are no pair
     if len(file.cameras) == 1 or (form.several(file) and (target.suffix or always)):
         write_cameras(target, to, file)
@@ -71,6 +74,18 @@ def write_camera_files(
         for name, lens in zip(names, file.cameras, strict=True):
             write_cameras(folder / name, to, file.only(lens.name))
     return "\n".join([*lines, f"{target}: {counted(len(names), 'camera')} as {to}: {listed(names)}"])
+
+
+def _words_on_mounts(file: CameraFile, form: CameraFormat) -> list[str]:
+    """Return what happens to the mounts of a rig that is written whole, if the user might not expect it."""
+    if file.mounts is None or max(map(len, file.mounts.by_rig().values()), default=0) < 2:
+        return []
+    if not form.mounted(file):
+        return [f"{form.name} does not store how these cameras are mounted, as {KALIBR} does"]
+    if form.name == KALIBR and file.unit not in METRES:
+        unit = file.unit or "unknown units"
+        return [f"translations are in {unit}, which {form.program} takes for metres"]
+    return []
 
 
 def with_residuals(file: CameraFile) -> CameraFile:
@@ -117,7 +132,7 @@ def refuse_inexact(conversions: tuple[Readjusted, ...], *, inexact: bool) -> Non
                 "kolinear undistort makes photographs that it fits" if ideal else "another format may have it"
             )
             raise OutputError(
-                f"camera {conversion.former.name}: model {conversion.camera.model} differs from "
+                f"camera {conversion.former.name}: model {conversion.model} differs from "
                 f"{conversion.former.model} by {conversion.rms_px:.3f} px RMS, {conversion.max_px:.3f} px at "
                 f"most, more than {LIMIT_PX:g} px; --inexact writes it all the same, {remedy}"
             )

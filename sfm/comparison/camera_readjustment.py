@@ -57,11 +57,20 @@ class Readjusted:
     adjusted: bool  # whether the image points were adjusted again; otherwise the curve was fitted
 
     @property
+    def model(self) -> str:
+        """The new model, with the parameters that it leaves out where it is the former one."""
+        if self.camera.model != self.former.model:
+            return self.camera.model
+        gone = (self.camera.parameters == 0) & (self.former.parameters != 0)
+        names = ", ".join(np.array(self.camera.names)[gone].tolist())
+        return f"{self.camera.model} without {names}" if names else self.camera.model
+
+    @property
     def words(self) -> str:
         """The conversion in words."""
         how = "image points adjusted again" if self.adjusted else "curve fitted"
         return (
-            f"camera {self.camera.name}: {self.former.model} to {self.camera.model}, {how}, "
+            f"camera {self.camera.name}: {self.former.model} to {self.model}, {how}, "
             f"misfit {self.rms_px:.4f} px RMS, {self.max_px:.4f} px at most"
         )
 

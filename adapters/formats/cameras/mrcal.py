@@ -56,7 +56,8 @@ def read_mrcal(path: Path) -> CameraFile:
     text = OPTIMIZATION.sub("b''", text_of(path, MAX_BYTES, WHAT))
     if len(text) > MAX_LITERAL:
         raise SurveyFileError(
-            f"{path}: {len(text)} characters besides the optimization inputs, {WHAT} has at most {MAX_LITERAL}"
+            f"{path}: {len(text)} characters besides the optimization inputs, {WHAT} has at most "
+            f"{MAX_LITERAL}"
         )
     try:
         with warnings.catch_warnings(action="ignore"):  # of escapes in texts

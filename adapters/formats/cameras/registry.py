@@ -64,6 +64,7 @@ class CameraFormat:
     read: Callable[[Path], CameraFile]
     write: Callable[[Path, CameraFile], str | bytes]  # returns the content of a new file
     several: Callable[[CameraFile], bool] = lambda file: False  # whether a file holds such several cameras
+    mounted: Callable[[CameraFile], bool] = lambda file: False  # whether it stores the mounts of such cameras
     exact: Callable[[Camera], bool] = lambda camera: True  # what else a camera must be to be stored
 
     def stored(self, camera: Camera) -> Camera | None:
@@ -131,6 +132,7 @@ CAMERA_FORMATS = (
         read_kalibr,
         write_kalibr,
         several=lambda file: True,
+        mounted=lambda file: True,
     ),
     CameraFormat(
         "ros-camera",
@@ -175,6 +177,7 @@ CAMERA_FORMATS = (
         read_opencv,
         write_opencv,
         several=is_pair,
+        mounted=is_pair,
     ),
 )
 NAMES = tuple(form.name for form in CAMERA_FORMATS)

@@ -518,5 +518,26 @@ def test_convert_goes_from_file_to_file(tmp_path: Path, capsys: pytest.CaptureFi
     assert not (tmp_path / "a.json").exists()
     convert(source, tmp_path / "a.json", to_format="blender-camera", inexact=True)
     assert read_cameras(tmp_path / "a.json").cameras[0].model == "pinhole"
+    skewed = camera("brown_forward_affine", ("b2", 1e-3))
+    write_cameras(tmp_path / "skew.xml", "metashape-camera", file_of(skewed))
+    with pytest.raises(OutputError, match="model brown_forward_affine without b2 differs from"):
+        convert(tmp_path / "skew.xml", tmp_path / "c.json", to_format="nerfstudio-camera")
     with pytest.raises(KolinearError, match="a file of cameras, without a survey"):
         convert(source, tmp_path / "folder")
+
+
+def test_mounts_that_are_not_written_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, truth = make_rig(seed_of("mounts that are told"), moments=4, points=15)
+    lenses = tuple(replace(LENSES["opencv"], name=name) for name in ("left", "right"))
+    source, pair = tmp_path / "chain.yaml", tmp_path / "pair.yaml"
+    write_cameras(source, "kalibr-camera", file_of(*lenses, mounts=truth.mounts, unit="m"))
+    told = converted(lambda: convert(source, tmp_path / "each", to_format="mrcal-camera"), capsys)
+    assert told.startswith("mrcal-camera does not store how these cameras are mounted, as kalibr-camera does")
+    told = converted(lambda: convert(source, pair, to_format="opencv-camera"), capsys)
+    assert told == f"{pair}: 2 cameras as opencv-camera\n"
+    told = converted(lambda: convert(pair, tmp_path / "again.yaml", to_format="kalibr-camera"), capsys)
+    assert told.startswith("translations are in unknown units, which Kalibr takes for metres\n")
+    told = converted(
+        lambda: convert(source, tmp_path / "one.yaml", to_format="ros-camera", camera="cam0"), capsys
+    )
+    assert told == f"{tmp_path / 'one.yaml'}: 1 camera as ros-camera\n"
