@@ -68,8 +68,8 @@ def difference_figure(
 def camera_difference_figure(difference: CameraDifference) -> Figure:
     """Draw the difference of two cameras over the format: its length as colour, its direction as arrows.
 
-    Outside of the region in which both cameras are known, colours are pale. With covariances a second panel
-    shows the differences in standard deviations.
+    Outside of the region in which both cameras are known, colours are pale, without arrows. With covariances
+    a second panel shows the differences in standard deviations.
     """
     length, known = difference.length_px, difference.known
     over = length / difference.sigma_px
@@ -80,7 +80,7 @@ def camera_difference_figure(difference: CameraDifference) -> Figure:
     picture = two_panel_figure(1.2 + 4.0 * height / width) if len(panels) == 2 else single_panel_figure(4.8)
     axes = np.atleast_1d(picture.subplots(1, len(panels)))
     X, Y = np.meshgrid(difference.x, difference.y)
-    arrows = difference.difference
+    arrows = np.where(known[:, :, None], difference.difference, np.nan)
     for panel, (values, label) in zip(axes, panels, strict=True):
         top = float(np.nanmax(values[known])) or 1.0
         cell = [difference.x[1] - difference.x[0], difference.y[1] - difference.y[0]]
