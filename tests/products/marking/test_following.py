@@ -14,6 +14,7 @@ from sfm.model.distributions import chi2_isf
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, empty_estimate
 from sfm.orientation.relative import five_point_orientations
+from sfm.products.marking import adjusting
 from sfm.products.marking.adjusting import CONTAINED, MarkAdjustment, adjust_marks
 from sfm.products.marking.evidence import PictureEvidence, Pose
 from sfm.products.marking.following import follow
@@ -406,6 +407,19 @@ def test_a_mark_within_its_stated_precision_contradicts_nothing(off_px: float, f
     worst = adjusted(network, by_hand.estimate, in_control=False).worst
     assert worst is not None and worst.flagged == flagged
     assert (worst.photograph, worst.point) == (network.images[1], network.points[5])
+
+
+def test_an_adjustment_that_did_not_converge_contradicts_no_mark(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Marks nearly on a line: the steps of the adjustment end in a valley, far from its optimum."""
+    monkeypatch.setattr(adjusting, "MAX_STEPS", 0)
+    points = object_points(np.random.default_rng(9), 12)
+    xy = seen_points(*stations(np.random.default_rng(9), 4, around=1.8), points)
+    xy[1, 5] += 5.0
+    network = network_of_points(xy, np.ones((4, 12), dtype=bool), 0.1)
+    by_hand = orient_by_hand(network, empty_estimate(network, (LENS,)), NoEvidence())
+    marks = adjusted(network, by_hand.estimate, in_control=False)
+    assert not marks.adjustment.converged
+    assert marks.worst is not None and not marks.worst.flagged
 
 
 def test_nothing_is_adjusted_before_anything_is_oriented() -> None:
