@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from sfm.model.remarks.remark import Remark
     from sfm.products.drafting.draft import Draft
 
-PHOTOGRAPHS = "# Photographs: "  # comment with their folder, relative to the survey file, as a JSON string
 Pitch = Annotated[
     float | None,
     typer.Option(
@@ -122,7 +120,7 @@ def run_file(survey_file: Path) -> Path:
 class RunOptions:
     """How a survey is run, and where its result is written."""
 
-    images: Path | None = None  # folder of the photographs; None: that of the survey file
+    images: Path | None = None  # folder of the photographs; None: the one that the survey file states
     out: Path | None = None  # folder of the result; None: out/NAME
     jobs: int | None = None  # photographs at a time; None: one per core
     allow_outside: bool = False  # whether the survey file may name files outside its folder
@@ -158,6 +156,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.runtime.threads import cores
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
+        from sfm.survey.inputs.named_folders import named_folder
         from sfm.survey.inputs.photograph_names import name_photographs
         from sfm.survey.inputs.sources import reads_photographs
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
@@ -198,11 +197,12 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     others = programs_of(survey.compare.backend, survey.compare.baseline)
     folder = options.out or Path("out") / folder_name(survey.name)
     refuse_foreign_folder(folder)  # before any work is done
-    origin = Origin(survey_file, options.images or survey_file.parent)
+    images = named_folder(described, options.images)
+    origin = Origin(survey_file, images or survey_file.parent / (described.photographs or ""))
     if not options.overwrite:
         refuse_other_origin(folder, origin, survey=survey.name, photographs=from_photographs)
     if from_photographs:
-        files = find_photographs(survey, images_dir=options.images)
+        files = find_photographs(survey, images_dir=images)
         name_photographs(survey, files)  # wrong folders and names are reported before anything is compiled
     compile_first()
     jobs = options.jobs or cores()
@@ -221,7 +221,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         log.start(survey.name, survey_file, **origin.written(folder))
         try:
             result = run_survey(
-                survey, images_dir=options.images, jobs=workers, others=others, store=store, progress=log
+                survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
             )
         except UnfinishedSurveyError as error:
             reached = error.reached
@@ -262,14 +262,21 @@ def _lock_folder(folder: Path) -> Iterator[None]:
 
 
 def drafted_beside(
-    photographs: Path, out: Path | None, pitch: float | None, *, overwrite: bool = False
+    photographs: Path,
+    out: Path | None,
+    pitch: float | None,
+    *,
+    within: Path = Path("out"),
+    overwrite: bool = False,
 ) -> tuple[Path, Path]:
     """Draft the survey file of a folder of photographs, unless it is already beside the result.
 
     Args:
         photographs: folder of the photographs.
-        out: result folder; None for out/NAME OF THE FOLDER.
+        out: result folder; None for WITHIN/NAME OF THE FOLDER, with the name of the folder above it too where
+            other photographs have this name.
         pitch: pitch of a board or plate, mm; None to assume it.
+        within: folder of the results.
         overwrite: whether a result of other photographs is replaced; the survey file never is.
 
     Returns:
@@ -281,14 +288,15 @@ def drafted_beside(
     """
     with loading():
         from sfm.files.open_folders import refuse_links
-        from sfm.report.output import Origin, folder_name, read_origin, refuse_other_origin
+        from sfm.report.output import Origin, refuse_other_origin
 
-    out = Path("out") / folder_name(photographs.resolve().name) if out is None else out
+    name = None
+    if out is None:
+        name, out = _name_of_result(photographs, within)
     file = out.parent / f"{out.name}.toml"
     refuse_links(file)
     if file.exists():
-        earlier = read_origin(out)
-        drafted_of = _photographs_of(file) or (earlier.images if earlier else photographs)
+        drafted_of = _drafted_of(file, out) or photographs
         if drafted_of.resolve() != photographs.resolve():
             raise OutputError(
                 f"{file}: is the survey file of the photographs in {os.path.normpath(drafted_of)} and is "
@@ -300,20 +308,38 @@ def drafted_beside(
         refuse_pitch(pitch, file)
         print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
         return file, out
-    write_draft(draft_folder(photographs, pitch), photographs, file)
+    write_draft(draft_folder(photographs, file, pitch, name), photographs, file)
     return file, out
 
 
-def _photographs_of(file: Path) -> Path | None:
-    """Return the folder of photographs that a drafted survey file states, or None."""
-    text = file.read_text(encoding="utf-8", errors="replace")
-    line = next((row for row in text.splitlines() if row.startswith(PHOTOGRAPHS)), None)
-    if line is None:
-        return None
-    try:
-        return file.parent / str(json.loads(line.removeprefix(PHOTOGRAPHS)))
-    except ValueError:  # edited by hand
-        return None
+def _name_of_result(photographs: Path, within: Path) -> tuple[str, Path]:
+    """Return the name of the survey of a folder of photographs, and its result folder.
+
+    It is the first whose survey file is already of these photographs, else the first that no other
+    photographs have.
+    """
+    from sfm.products.drafting.draft import names_of_folder
+    from sfm.report.output import folder_name
+
+    names = [(name, within / folder_name(name)) for name in names_of_folder(photographs)]
+    owners = [_drafted_of(out.parent / f"{out.name}.toml", out) for _, out in names]
+    here = photographs.resolve()
+    own = (k for k, owner in enumerate(owners) if owner is not None and owner.resolve() == here)
+    free = (k for k, owner in enumerate(owners) if owner is None)
+    return names[next(own, next(free, 0))]
+
+
+def _drafted_of(file: Path, out: Path) -> Path | None:
+    """Return the folder of photographs of a survey file beside a result, or of the result, else None."""
+    from sfm.files.plain_text import read_toml
+    from sfm.report.output import read_origin
+
+    with suppress(KolinearError, KeyError, TypeError, AttributeError):  # edited by hand; its reader says so
+        if file.exists():
+            stated: str = read_toml(file, "a survey file")[1]["survey"]["photographs"]
+            return file.parent / stated
+    earlier = read_origin(out)
+    return earlier.images if earlier else None
 
 
 def refuse_pitch(pitch: float | None, file: Path) -> None:
@@ -333,26 +359,32 @@ def refuse_pitch(pitch: float | None, file: Path) -> None:
         )
 
 
-def draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
+def draft_folder(photographs: Path, file: Path, pitch: float | None = None, name: str | None = None) -> Draft:
     """Return the draft of the survey file of a folder of photographs; measures some of them.
 
     Args:
         photographs: the folder.
+        file: path of the survey file.
         pitch: pitch of a board or plate, mm; None to assume it.
+        name: name of the survey; None for that of the folder.
     """
     with loading():
         from sfm.products.drafting.draft import draft_survey
         from sfm.products.public_functions import one_blas_thread, sensor_widths
+        from sfm.report.output import path_from
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.survey.measuring.measured_store import MeasuredStore
 
     compile_first()
     unknown: list[Remark] = []
+    stated = path_from(file.parent, photographs)
     with working_on(str(photographs)), drawn_progress() as drawn, one_blas_thread():
         draft = draft_survey(
             photographs,
             sensor_width=sensor_widths(unknown.append),
             pitch=pitch,
+            name=name,
+            stated=None if stated == os.curdir else stated,
             store=MeasuredStore.of_user(),
             progress=drawn,
         )
@@ -360,7 +392,7 @@ def draft_folder(photographs: Path, pitch: float | None = None) -> Draft:
 
 
 def write_draft(draft: Draft, photographs: Path, file: Path) -> None:
-    """Write a drafted survey file with the folder of its photographs, and report findings on stderr.
+    """Write a drafted survey file, note the folder of its photographs, and report findings on stderr.
 
     Args:
         draft: the draft.
@@ -373,18 +405,18 @@ def write_draft(draft: Draft, photographs: Path, file: Path) -> None:
     from sfm.files.plain_text import as_plain
     from sfm.files.whole_files import whole_file
     from sfm.model.remarks.verdict import lines_of
-    from sfm.report.output import path_from
+    from sfm.survey.inputs.named_folders import note_named
 
     picture = file.with_name(f"{file.stem}{RINGS_PICTURE}")
     if draft.rings:
         with whole_file(picture) as part:
             part.write_bytes(draft.rings)
-    stated = PHOTOGRAPHS + json.dumps(path_from(file.parent, photographs))
     with whole_file(file) as part:
         try:
-            part.write_text(f"{stated}\n{draft.text}", encoding="utf-8")
+            part.write_text(draft.text, encoding="utf-8")
         except UnicodeEncodeError as error:
             raise OutputError(f"{file}: a name in it cannot be encoded in UTF-8") from error
+    note_named(file, photographs)
     for subject, finding in draft.found:
         print(as_plain(f"{subject}: {finding}"), file=sys.stderr)
     for line in lines_of(draft.remarks):

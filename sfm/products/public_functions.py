@@ -33,6 +33,7 @@ from sfm.runtime.installation import load_adapters
 from sfm.runtime.progress import SILENT, Progress
 from sfm.runtime.threads import cores
 from sfm.survey.assembly import OtherPrograms
+from sfm.survey.inputs.named_folders import named_folder
 from sfm.survey.inputs.survey import Survey, read_survey
 from sfm.survey.measuring.measured_store import MeasuredStore
 
@@ -89,7 +90,7 @@ def run_survey(
             watching = progress
         return run_stages(
             survey,
-            images_dir=None if images is None else Path(images),
+            images_dir=named_folder(survey, None if images is None else Path(images)),
             jobs=jobs or cores(),
             others=others,
             store=None if store is None else MeasuredStore(Path(store)),

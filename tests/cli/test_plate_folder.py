@@ -51,7 +51,9 @@ def test_lines_of_both_streams_keep_their_order() -> None:
 def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float | None] = []
 
-    def drafted(photographs: Path, pitch: float | None = None) -> Draft:
+    def drafted(
+        photographs: Path, file: Path, pitch: float | None = None, name: str | None = None
+    ) -> Draft:
         asked.append(pitch)
         return Draft("plate", "[survey]\n", (), (), ())
 
@@ -69,7 +71,8 @@ def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where the run failed and left no result, and after all was moved together."""
-    monkeypatch.setattr(drafting, "draft_folder", lambda *_: Draft("plate", "[survey]\n", (), (), ()))
+    stated = '[survey]\nphotographs = "../b \\"1\\"/plate"\n'
+    monkeypatch.setattr(drafting, "draft_folder", lambda *_: Draft("plate", stated, (), (), ()))
     first, second = tmp_path / "all" / 'b "1"' / "plate", tmp_path / "all" / "c" / "plate"
     for folder in (first, second):
         folder.mkdir(parents=True)

@@ -18,8 +18,15 @@ import typer
 from threadpoolctl import threadpool_limits
 
 from sfm.cli.process import FAILED, compile_first, loading
-from sfm.cli.survey_runs import AllowOutside, PicturesMb, Verbose
-from sfm.model.errors import KolinearError, MissingLibraryError, one_line
+from sfm.cli.survey_runs import AllowOutside, PicturesMb, Verbose, drafted_beside
+from sfm.model.errors import (
+    GeometryError,
+    KolinearError,
+    MissingLibraryError,
+    PhotographError,
+    SurveyFileError,
+    one_line,
+)
 from sfm.runtime.executor import Call, Done, Engine, Event, Lost, Sent, Work
 from sfm.runtime.faults import FAULT
 
@@ -36,7 +43,7 @@ def batch(
         typer.Argument(
             metavar="SURVEYS...",
             help="Survey files, glob patterns, or folders (every survey.toml in or below the folder; "
-            "without any, the *.toml files in it).",
+            "without any, the *.toml files in it, or a survey file that is drafted for its photographs).",
         ),
     ],
     out: Annotated[
@@ -69,7 +76,8 @@ def batch(
 ) -> None:
     """Run many surveys in parallel, each with a report.
 
-    One table lists all surveys.  Exit code 0 if every survey has a dependable result, 1 if not, 70 if a
+    One table lists all surveys.  Folders of photographs without a survey file get one in the folder of the
+    batch.  Exit code 0 if every survey has a dependable result, 1 if not, 70 if a
     survey failed by an error of the program, 2 if the input must be corrected.
     """
     if cluster is not None and jobs is not None:
@@ -79,10 +87,26 @@ def batch(
 
         from sfm.products.batch.job import Comparers
         from sfm.products.batch.run import calls_of, find_surveys, run_batch
-        from sfm.products.batch.table import BatchTable, print_batch, stopping_at_terminate
+        from sfm.products.batch.table import (
+            BatchTable,
+            print_batch,
+            refuse_foreign_pages,
+            stopping_at_terminate,
+        )
         from sfm.products.public_functions import colmap_writer
 
-    files = find_surveys(surveys)
+    refuse_foreign_pages(out)  # before anything is drafted there
+    without_draft: dict[Path, Exception] = {}
+
+    def draft(photographs: Path) -> Path:
+        """Return the survey file of a folder of photographs, or the folder if it has no draft."""
+        try:
+            return drafted_beside(photographs, None, None, within=out)[0]
+        except (SurveyFileError, GeometryError, PhotographError) as error:  # fails only this survey
+            without_draft[photographs.resolve()] = error
+            return photographs
+
+    files = find_surveys(surveys, draft)
     compile_first()
     engine = batch_engine(
         partial(calls_of, files, allow_outside=allow_outside),
@@ -100,6 +124,7 @@ def batch(
             resume=resume,
             allow_outside=allow_outside,
             pictures_mb=pictures_mb,
+            without_draft=without_draft,
         )
     print_batch(Console(highlight=False), rows, out / "index.html")
     if any(row.fault for row in rows):

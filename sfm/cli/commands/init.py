@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,7 +36,6 @@ def init(
 
     file = photographs / SURVEY_FILE if out is None else out
     refuse_existing(file)
-    draft = draft_folder(photographs, pitch)
+    draft = draft_folder(photographs, file, pitch)
     write_draft(draft, photographs, file)
-    beside = file.parent.resolve() == photographs.resolve()
-    print(f"Run it: kolinear run {file}{'' if beside else f' --images {photographs}'}")
+    print(f"Run it: kolinear run {shlex.quote(str(file))}")

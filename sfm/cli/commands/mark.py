@@ -143,24 +143,26 @@ def _project(
     from adapters.formats.result_tables import read_result
     from sfm.cli.survey_runs import SURVEY_FILE
     from sfm.files.globs import nearest_name
+    from sfm.products.drafting.draft import names_of_folder
     from sfm.products.marking.project import project_of_folder, project_of_survey
     from sfm.products.public_functions import sensor_widths
     from sfm.report.output import folder_name, read_origin
+    from sfm.survey.inputs.named_folders import named_folder
     from sfm.survey.inputs.survey import survey_of_file
     from sfm.survey.inputs.survey_file import read_survey_file
 
     if not source.exists():
         raise KolinearError(f"{source}: neither a survey file nor a folder{nearest_name(source)}")
-    solution, survey_file = None, source
+    solution, survey_file, photographs = None, source, None
     if source.is_dir() and (source / "cameras.csv").is_file():
         origin = read_origin(source)
         if origin is None:
             raise KolinearError(f"{source}: does not state the survey that it is the result of")
-        solution, survey_file, images = read_result(source), origin.file, images or origin.images
+        solution, survey_file, photographs = read_result(source), origin.file, images or origin.images
     elif source.is_dir() and (source / SURVEY_FILE).is_file():
         survey_file = source / SURVEY_FILE
     elif source.is_dir():
-        name = folder_name(source.resolve().name)
+        name = folder_name(next(names_of_folder(source)))
         return project_of_folder(source, sensor_widths(lambda _: None)), Path("out") / f"{name}{MARKS}", None
     described = read_survey_file(survey_file, allow_outside=allow_outside)
     marks = survey_file.with_name(f"{survey_file.stem}{MARKS}")
@@ -168,7 +170,10 @@ def _project(
         marks = described.beside(described.marked.file)
         described = described.model_copy(update={"marked": None})
     project = project_of_survey(
-        survey_of_file(described), images_dir=images, survey_file=survey_file, solution=solution
+        survey_of_file(described),
+        images_dir=photographs or named_folder(described, images),
+        survey_file=survey_file,
+        solution=solution,
     )
     control = described.control
     return project, marks, None if control is None else described.beside(control.file)

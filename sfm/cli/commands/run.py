@@ -54,7 +54,7 @@ def run(
     """Run a survey from its photographs to the report.
 
     If a folder is given, its survey.toml is run. If it has none, a survey file is drafted from the
-    photographs, written beside the result and run; edit it there and run it again with --images PHOTOS.
+    photographs, written beside the result and run; edit it there and run it again.
 
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
     reasons in the report, or a stage cannot go on; 2 if the input must be corrected.

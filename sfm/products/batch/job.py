@@ -65,6 +65,7 @@ class SurveyJob:
     inputs: str  # fingerprint of everything that the survey reads
     allow_outside: bool  # whether the survey file may name files outside its folder
     owner: Owner | None  # owner of the batch folder, who started this run
+    images: Path | None = None  # folder that a person named for its photographs
     pictures_mb: float = BUDGET_MB  # largest size of the pictures inside a report, 10^6 bytes
 
 
@@ -201,8 +202,12 @@ def failed_row(log: SurveyLog, error: Exception, row: SurveyRow) -> SurveyRow:
     return replace(row, reason=reason, fault=fault)
 
 
-def fingerprint(survey: SurveyFile) -> str:
+def fingerprint(survey: SurveyFile, images: Path | None = None) -> str:
     """Return a SHA-256 of the input of a survey: tables by content, photographs by name, size and date.
+
+    Args:
+        survey: the survey file.
+        images: folder that a person named for its photographs.
 
     Raises:
         KolinearError: photographs are missing.
@@ -214,7 +219,7 @@ def fingerprint(survey: SurveyFile) -> str:
             with table.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
     if reads_photographs(survey):
-        photographs = find_photographs(survey)
+        photographs = find_photographs(survey, images_dir=images)
         for name, path in zip(photographs.names, photographs.paths, strict=True):
             status = path.stat() if path.exists() else path.lstat()  # a link that leads nowhere
             digest.update(f"{name}\0{status.st_size}\0{status.st_mtime_ns}\0".encode())
@@ -258,7 +263,9 @@ def _run(
     store = replace(MeasuredStore.of_user(), held=held)
     ended: Findings | UnfinishedSurvey
     try:
-        ended = findings_of(run_survey(survey, others=others, store=store, progress=log))
+        ended = findings_of(
+            run_survey(survey, images_dir=job.images, others=others, store=store, progress=log)
+        )
     except UnfinishedSurveyError as error:
         ended = error.reached
     log.stage("report")

@@ -10,10 +10,11 @@ import glob
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 from sfm.files.globs import BELOW, find_files
@@ -38,10 +39,12 @@ from sfm.products.batch.job import (
     was_finished,
 )
 from sfm.products.batch.table import PAGES, refuse_foreign_pages, write_batch_pages
+from sfm.products.drafting.draft import has_photographs
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
-from sfm.survey.inputs.measurements import find_photographs
+from sfm.survey.inputs.measurements import find_photographs, masks_of
+from sfm.survey.inputs.named_folders import named_folder
 from sfm.survey.inputs.sources import reads_photographs
 from sfm.survey.inputs.start import refuse_unknown_photographs
 from sfm.survey.inputs.survey import read_survey
@@ -49,6 +52,7 @@ from sfm.survey.inputs.survey_file import SurveyFile, read_survey_file
 from sfm.survey.measuring.measured_store import MeasuredStore
 
 SURVEY_NAME = "survey.toml"  # searched for in folders
+NONE: Mapping[Path, Exception] = MappingProxyType({})
 
 
 class Watch(Protocol):
@@ -90,6 +94,7 @@ def run_batch(
     resume: bool = False,
     allow_outside: bool = False,
     pictures_mb: float = BUDGET_MB,
+    without_draft: Mapping[Path, Exception] = NONE,
 ) -> tuple[SurveyRow, ...]:
     """Run surveys and write batch.csv, batch.json and index.html beside their results.
 
@@ -103,6 +108,7 @@ def run_batch(
             is run, and only measurements in photographs are taken from an earlier run.
         allow_outside: whether survey files may name files outside their folders.
         pictures_mb: largest size of the pictures inside a report, 10^6 bytes; the others are files beside it.
+        without_draft: why no survey file could be drafted, by the folders of photographs among the files.
 
     Returns:
         One row per survey in the order of the files.
@@ -113,7 +119,7 @@ def run_batch(
     """
     refuse_foreign_pages(Path(out))
     out = Path(os.path.abspath(out))  # it contains no links
-    plans = _plan(files, allow_outside=allow_outside)
+    plans = _plan(files, without_draft, allow_outside=allow_outside)
     for plan in plans:
         refuse_other_log(out / LOGS / f"{plan.folder}.jsonl")
     MeasuredStore.of_user().remove_old()
@@ -154,12 +160,14 @@ def _no_empty_folders(out: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
+def find_surveys(names: Sequence[str], draft: Callable[[Path], Path] | None = None) -> tuple[Path, ...]:
     """Return the survey files for the names on the command line, each once.
 
     Args:
         names: files, folders or globs. A folder stands for every survey.toml in and below it, or if there is
-            none, for the *.toml files in it. Globs are for shells that do not expand them.
+            none, for the *.toml files in it, or for its photographs. Globs are for shells that do not expand
+            them.
+        draft: returns the survey file of a folder of photographs; None if folders need one.
 
     Raises:
         SurveyFileError: a name matches nothing.
@@ -170,11 +178,11 @@ def find_surveys(names: Sequence[str]) -> tuple[Path, ...]:
             raise SurveyFileError("an empty name stands for no survey")
         path = Path(name)
         if path.exists() or not glob.has_magic(name):
-            files.update(dict.fromkeys(_survey_files_in(path)))
+            files.update(dict.fromkeys(_survey_files_in(path, draft)))
             continue
         matches = _matches(path)
         for match in matches:
-            files.update(dict.fromkeys(_survey_files_in(match)))
+            files.update(dict.fromkeys(_survey_files_in(match, draft)))
     return tuple(files)
 
 
@@ -207,24 +215,34 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
     for file in files:
         with suppress(Exception):  # the run reports errors
             survey = read_survey_file(file, allow_outside=allow_outside)
-            calls += len(find_photographs(survey)) if reads_photographs(survey) else 1
+            images = named_folder(survey)
+            calls += len(find_photographs(survey, images_dir=images)) if reads_photographs(survey) else 1
     return max(1, calls)
 
 
-def _survey_files_in(path: Path) -> list[Path]:
-    """Return the survey files of a folder, or a file itself."""
+def _survey_files_in(path: Path, draft: Callable[[Path], Path] | None) -> list[Path]:
+    """Return the survey files of a folder or the one drafted for its photographs, or a file itself."""
     if not path.is_dir():
         return [path.resolve()]
     below = find_files(path, f"**/{SURVEY_NAME}") or find_files(path, "*.toml")
+    if not below and draft is not None and has_photographs(path):
+        below = [draft(path)]
     if not below:
-        raise SurveyFileError(f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it")
+        raise SurveyFileError(
+            f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it, nor photographs"
+        )
     return [file.resolve() for file in below]
 
 
-def _plan(files: Sequence[Path], *, allow_outside: bool) -> tuple[_Plan, ...]:
+def _plan(
+    files: Sequence[Path], without_draft: Mapping[Path, Exception], *, allow_outside: bool
+) -> tuple[_Plan, ...]:
     """Read all survey files and give each a separate folder."""
     read: list[tuple[Path, SurveyFile | Exception]] = []
     for file in files:
+        if file in without_draft:
+            read.append((file, without_draft[file]))
+            continue
         try:
             read.append((file, read_survey_file(file, allow_outside=allow_outside)))
         except Exception as error:  # an unforeseen error only fails this survey
@@ -271,9 +289,16 @@ def _run(
                 if isinstance(plan.survey, Exception):
                     raise plan.survey
                 refuse_foreign_folder(out / plan.folder)
-                inputs = fingerprint(plan.survey)
+                images = named_folder(plan.survey)
                 job = SurveyJob(
-                    plan.file, out, plan.folder, inputs, allow_outside, owner_of(out / LOCK), pictures_mb
+                    plan.file,
+                    out,
+                    plan.folder,
+                    fingerprint(plan.survey, images),
+                    allow_outside,
+                    owner_of(out / LOCK),
+                    images,
+                    pictures_mb,
                 )
                 earlier = finished_row(job) if resume else None
                 if earlier is not None and not was_finished(out / plan.folder):
@@ -322,7 +347,8 @@ def _work(job: SurveyJob, survey: SurveyFile, comparers: Comparers) -> Work:
     parts: tuple[Call, ...] = ()
     if reads_photographs(survey):
         given = read_survey(job.file, allow_outside=job.allow_outside)
-        photographs = find_photographs(survey)
+        photographs = find_photographs(survey, images_dir=job.images)
+        survey = survey.with_masks(masks_of(survey, images_dir=job.images).folder)
         refuse_unknown_photographs(given, photographs.names)  # before the photographs are measured
         parts = tuple(
             Call(measure_one, (survey, name, path))

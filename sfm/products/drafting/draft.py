@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import fill
@@ -17,7 +17,7 @@ import numpy as np
 
 from sfm.files.globs import find_files, why_no_folder
 from sfm.files.open_folders import is_home_file
-from sfm.files.plain_text import as_plain, is_plain
+from sfm.files.plain_text import as_plain, is_name, is_plain
 from sfm.model.display import agreeing, counted
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark, unless_note
@@ -58,6 +58,7 @@ SIGMA_PX, CORNER_SIGMA_PX = 0.05, 0.1  # of circles; and of corners, crossings a
 OUTSIDE = "not used outside the folder: move the masks, or uncomment the line for --allow-outside"
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
+IMAGES = "images"  # folder of the photographs in a project of COLMAP and the programs that follow it
 MAX_SHOWN = 8  # names listed on a line
 
 
@@ -80,6 +81,8 @@ def draft_survey(
     *,
     sensor_width: SensorWidth = lambda make, model: None,
     pitch: float | None = None,
+    name: str | None = None,
+    stated: str | None = None,
     store: MeasuredStore | None = None,
     progress: Progress = SILENT,
 ) -> Draft:
@@ -90,6 +93,8 @@ def draft_survey(
             if they contain the photographs of the cameras of a rig.
         sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
         pitch: distance of neighbouring dots or crossings if there is a plate, mm; assumed if not given.
+        name: name of the survey; the first of `names_of_folder` if not given.
+        stated: the folder as the survey file states it; None for a survey file in the folder.
         store: stores the targets that the trial measures.
         progress: receives the steps of the trial.
 
@@ -115,10 +120,10 @@ def draft_survey(
         )
     paths = [folder / name for name in used]
     trial = try_targets(paths, folder=folder, masks=masks, store=store, progress=progress)
-    name = as_plain(folder.resolve().name) or "survey"
+    name = name or next(names_of_folder(folder))
     positions = sum(metadata[photograph].position is not None for photograph in used)
     left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
-    content = _Content(name, grouping, trial, pitch, left_out, positions, masked, unused)
+    content = _Content(name, stated, grouping, trial, pitch, left_out, positions, masked, unused)
     if trial.plate is not None:
         silent = _text(content, models=False)
         cameras = with_lens_models(silent, grouping.cameras, folder, store=store, progress=progress)
@@ -133,6 +138,7 @@ class _Content:
     """What a folder contains, as a draft states it."""
 
     name: str  # of the survey
+    stated: str | None  # folder of the photographs, relative to the survey file; None if it is there
     grouping: Grouping
     trial: TargetTrial
     pitch: float | None  # of a plate, mm; None if it is assumed
@@ -149,17 +155,29 @@ class _Content:
         return FREE_BY_TARGETS if self.trial.codes != "none" else ()
 
 
+def names_of_folder(folder: Path) -> Iterator[str]:
+    """Yield names for the survey of a folder of photographs, the usual one first.
+
+    Folders named `images` are in the folder of their project, which has the name of the object. A further
+    name takes the folder above too, where surveys of several folders would have the same.
+
+    Args:
+        folder: contains the photographs.
+    """
+    parts = [as_plain(part) for part in folder.resolve().parts[1:]] or ["survey"]
+    if parts[-1].casefold() == IMAGES and len(parts) > 1:
+        yield parts[-2]
+    else:
+        yield parts[-1]
+    for k in range(2, len(parts) + 1):
+        yield " ".join(parts[-k:])
+
+
 def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
     """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
-    files: list[Path] = []
-    for depth in DEPTHS:
-        files = files or [
-            path
-            for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
-            if path.suffix.lower() in SUFFIXES or conversion_of(path)
-        ]
+    files = _files_of(folder)
     files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
     if all(conversion_of(path) for path in files):
         _refuse_folder(folder, files)
@@ -177,6 +195,27 @@ def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[s
         except PhotographError as error:
             unreadable.append((name, str(error).removeprefix(f"{path.name}: ")))
     return metadata, tuple(unreadable)
+
+
+def has_photographs(folder: Path) -> bool:
+    """Return whether a survey file can be drafted for a folder, as far as names show.
+
+    Args:
+        folder: the folder.
+    """
+    return bool(_files_of(folder))
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Return the files of a folder that are photographs by their names, else those of its subfolders."""
+    files: list[Path] = []
+    for depth in DEPTHS:
+        files = files or [
+            path
+            for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
+            if path.suffix.lower() in SUFFIXES or conversion_of(path)
+        ]
+    return files
 
 
 def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
@@ -211,6 +250,8 @@ def _text(content: _Content, *, models: bool = True) -> str:
         f"name = {_quoted(content.name)}",
         f"unit = {_quoted(UNIT)}  # of the object coordinates; write the one of your scale bars",
     ]
+    if content.stated is not None:
+        lines.append(_photographs_line(content.stated))
     if content.masked:
         commented = "# " if content.unused else ""
         lines.append(f"{commented}masks = {_quoted(content.masked)}  # what is black there is ignored")
@@ -253,6 +294,13 @@ def _text(content: _Content, *, models: bool = True) -> str:
         'backend = "colmap"  # adjust with COLMAP too and compare; "none" saves the time',
     ]
     return "\n".join(lines) + "\n"
+
+
+def _photographs_line(stated: str) -> str:
+    """Return the line on the folder of the photographs, a comment if no key can state it."""
+    if is_name(stated):
+        return f"photographs = {_quoted(stated)}  # their folder, from the folder of this file"
+    return f"# the photographs are in {as_plain(stated)}, which only --images can name"
 
 
 def _camera_lines(camera: CameraGroup, free: Sequence[str], *, models: bool) -> list[str]:

@@ -13,7 +13,7 @@ from sfm.model.errors import SurveyFileError
 from sfm.model.solution import Solution
 from sfm.photographs.exif import read_metadata
 from sfm.products.drafting.camera_groups import SensorWidth, group_photographs
-from sfm.products.drafting.draft import UNIT, metadata_of_folder
+from sfm.products.drafting.draft import UNIT, metadata_of_folder, names_of_folder
 from sfm.survey.inputs.cameras import start_cameras
 from sfm.survey.inputs.given_values import KnownPoints, ScaleBar
 from sfm.survey.inputs.measurements import PhotographList, find_photographs
@@ -79,7 +79,7 @@ def project_of_folder(folder: Path, sensor_width: SensorWidth = lambda make, mod
         )
         for camera in grouping.cameras
     ]
-    name = folder.resolve().name or "survey"
+    name = next(names_of_folder(folder))
     survey = Survey(name=name, unit=UNIT, cameras=tuple(cameras), folder=folder, source=str(folder))
     return project_of_survey(survey)
 

@@ -165,15 +165,16 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
 
     Args:
         survey: a survey with photographs, or its file.
-        images_dir: folder of the photographs in place of the survey's folder. Photographs in this folder may
-            be links to files in the user's home folder.
+        images_dir: folder of the photographs in place of the one that the survey states. Photographs in this
+            folder may be links to files in the user's home folder.
 
     Raises:
-        SurveyFileError: no such folder, a camera without photographs, a photograph of two cameras, a
-            photograph in no group although its camera has groups, or a name with control or invisible
-            characters.
+        SurveyFileError: no such folder, or one that the survey may not name, a camera without photographs, a
+            photograph of two cameras, a photograph in no group although its camera has groups, or a name with
+            control or invisible characters.
     """
-    folder = Path(images_dir) if images_dir is not None else survey.folder
+    folder = folder_of_photographs(survey, images_dir=images_dir)
+    home = survey.folder if images_dir is None and folder.is_relative_to(survey.folder) else folder
     if not folder.is_dir():
         raise SurveyFileError(
             f"{folder}: {why_no_folder(folder)}; needed the folder of the photographs of survey {survey.name}"
@@ -182,8 +183,8 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
     def refuse_outside(path: Path) -> None:
         if images_dir is not None and is_home_file(path):
             return
-        name = path.relative_to(folder).as_posix()
-        path_inside(folder, name, survey.source, allow_outside=survey.allow_outside)
+        name = path.relative_to(home).as_posix()
+        path_inside(home, name, survey.source, allow_outside=survey.allow_outside)
 
     def matching(camera: str, glob: str) -> list[Path]:
         try:
@@ -220,16 +221,43 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
     return PhotographList(names, paths, np.array(cameras, dtype=np.int64), folder)
 
 
+def folder_of_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> Path:
+    """Return the base folder of the globs of photographs.
+
+    Args:
+        survey: a survey with photographs, or its file.
+        images_dir: folder of the photographs in place of the one that the survey states.
+
+    Raises:
+        SurveyFileError: the survey states a folder outside its own, which no one named for it.
+    """
+    if images_dir is not None:
+        return Path(images_dir)
+    if survey.photographs is None:
+        return survey.folder
+    folder = path_inside(survey.folder, survey.photographs, survey.source, allow_outside=True)
+    if not (survey.allow_outside or folder.resolve().is_relative_to(survey.folder.resolve())):
+        raise SurveyFileError(
+            f"{survey.source}: photographs = {survey.photographs!r:.100} leaves the survey's folder; name it "
+            "once by kolinear run with --images, or use --allow-outside for survey files that you trust"
+        )
+    return folder
+
+
 def masks_of(survey: Survey | SurveyFile, *, images_dir: Path | None = None) -> Masks:
     """Return the masks of a survey: those in the folder of the photographs, else beside the survey file.
 
     Args:
         survey: a survey with photographs, or its file.
-        images_dir: folder of the photographs in place of the survey's folder.
+        images_dir: folder of the photographs in place of the one that the survey states.
+
+    Raises:
+        SurveyFileError: as `folder_of_photographs`.
     """
     folder = survey.masks
-    if folder is not None and images_dir is not None and folder.is_relative_to(survey.folder):
-        among = Path(images_dir) / folder.relative_to(survey.folder)
+    elsewhere = images_dir is not None or survey.photographs is not None
+    if folder is not None and elsewhere and folder.is_relative_to(survey.folder):
+        among = folder_of_photographs(survey, images_dir=images_dir) / folder.relative_to(survey.folder)
         folder = among if among.is_dir() else folder
     return Masks(folder)
 

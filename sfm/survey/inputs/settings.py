@@ -143,6 +143,7 @@ class Head(Section):
     equipment: FileOrNone = None  # equipment file with the bars and frames of [[equipment]]
     temperature: Temperature | None = None  # of the equipment during the survey, deg C
     temperature_sigma: Length = 1.0  # standard deviation of temperature, K
+    photographs: Name | None = None  # folder of the photographs, relative to the survey file; else its own
     masks: Name | None = None  # folder of masks NAME.png of photographs; what is black in them is ignored
 
 

@@ -136,7 +136,8 @@ class Survey:
     start_points: KnownPoints | None = None
     start_cameras: StartCameras | None = None
     masks: Path | None = None  # folder of masks NAME.png, of which black parts are ignored
-    folder: Path = Path()  # base folder of the globs of photographs
+    folder: Path = Path()  # folder of the survey file, and of the globs of photographs
+    photographs: str | None = None  # other folder of these globs, relative to it
     allow_outside: bool = True  # whether photographs may be outside the folder
     source: str = ""  # name of the survey in error messages; else its name
 
@@ -348,6 +349,7 @@ def survey_of_file(file: SurveyFile) -> Survey:
         start_points=read(read_points, file.approximate.points),
         start_cameras=read(read_start_cameras, file.approximate.cameras),
         folder=file.folder,
+        photographs=file.photographs,
         allow_outside=file.allow_outside,
         source=file.source,
     )

@@ -77,6 +77,7 @@ class SurveyFile(Section):
     compare: CompareSettings = CompareSettings()
     _path: Path = PrivateAttr(default=Path("survey.toml"))
     _allow_outside: bool = PrivateAttr(default=False)
+    _masks: Path | None = PrivateAttr(default=None)
 
     @property
     def path(self) -> Path:
@@ -100,8 +101,13 @@ class SurveyFile(Section):
 
     @property
     def folder(self) -> Path:
-        """Base folder of the globs of photographs."""
+        """Folder of the survey file, and of the photographs unless `photographs` states another."""
         return self._path.parent
+
+    @property
+    def photographs(self) -> str | None:
+        """Folder of the photographs as stated, relative to the survey file; None if it has its own."""
+        return self.head.photographs
 
     @property
     def texture(self) -> TiePointSettings:
@@ -139,7 +145,19 @@ class SurveyFile(Section):
     @property
     def masks(self) -> Path | None:
         """Folder of the masks; None without any."""
+        if self._masks is not None:
+            return self._masks
         return None if self.head.masks is None else self.beside(self.head.masks)
+
+    def with_masks(self, folder: Path | None) -> SurveyFile:
+        """Return this survey file with the folder where its masks were found.
+
+        Args:
+            folder: folder of the masks; None without any.
+        """
+        found = self.model_copy()
+        found._masks = folder
+        return found
 
     def beside(self, name: str) -> Path:
         """Return the path of a file from its name relative to the survey file.
