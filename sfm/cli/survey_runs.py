@@ -139,7 +139,6 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.photographs.reading import SUFFIXES
         from sfm.pipeline import run_survey
         from sfm.products.public_functions import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.report.figures.plot_process import plot_process
@@ -166,8 +165,6 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
 
     if not survey_file.exists():
         raise KolinearError(f"{survey_file}: neither a survey file nor a folder{nearest_name(survey_file)}")
-    if survey_file.suffix.lower() in SUFFIXES:
-        raise KolinearError(f"{survey_file}: is a photograph, not a survey file; give its folder")
     with working_on(str(survey_file)):
         described = read_survey_file(survey_file, allow_outside=options.allow_outside)
     from_photographs = options.from_photographs

@@ -331,6 +331,9 @@ Image.init()
 PHONE = (".heic", ".heif", ".hif", ".avif")
 RAW = (".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
        ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f")  # fmt: skip
+# Endings of videos, whose frames must be extracted first.
+VIDEO = (".3gp", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
+         ".mxf", ".ogv", ".webm", ".wmv")  # fmt: skip
 MAX_FILE_BYTES = 2**30
 MAX_PIXELS = 250_000_000  # the largest aerial scans; digital backs have 151 million
 # A larger picture in fewer bytes is a decompression bomb; a JPEG of a single grey value has 250 px per byte.
@@ -371,6 +374,11 @@ def conversion_of(path: Path) -> str:
         return (
             "a raw file, which is not read; develop all alike to TIFF, without lens correction, cropping or "
             "turning, such as with dcraw -T -t 0 FILE"
+        )
+    if path.suffix.lower() in VIDEO:
+        return (
+            "a video, which is not read; extract sharp frames into their own folder, such as two a second, "
+            "by ffmpeg -i VIDEO -vf fps=2 FRAMES/%04d.png, and give that folder"
         )
     return ""
 

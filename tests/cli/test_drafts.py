@@ -73,7 +73,7 @@ def test_a_draft_is_run_from_anywhere(
 def test_a_strangers_file_names_no_folder(
     rendered: Path, started: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Nor a copy of one's own elsewhere, nor one's own after the folder became a link; --images names it once."""
+    """Nor does one's own after the folder became a link; --images names it once."""
     assert kolinear("init", rendered, "--out", "drafts/own.toml") == 0
     text = Path("drafts/own.toml").read_text("utf-8")
     Path("unpacked").mkdir()
@@ -148,7 +148,8 @@ def test_folders_of_one_name_do_not_collide(
         assert kolinear("run", folder) == 0
         told.append("which exists" in capsys.readouterr().err)
     assert told == [False] * 4 + [True] * 2
-    surveys = {path.stem: tomllib.loads(path.read_text("utf-8"))["survey"] for path in Path("out").glob("*.toml")}
+    drafts = [*Path("out").glob("*.toml")]
+    surveys = {draft.stem: tomllib.loads(draft.read_text("utf-8"))["survey"] for draft in drafts}
     assert {name: survey["name"] for name, survey in surveys.items()} == {
         "tower": "tower",
         "bridge": "bridge",
@@ -210,3 +211,23 @@ def test_masks_of_a_draft_are_found_beside_its_photographs(rendered: Path, start
     assert kolinear("batch", "drafts/photos.toml", "--jobs", 1) in (0, 1)
     single, batched = (rows_of(Path(f) / "image_points.csv") for f in ("out/photos", "out/batch/photos"))
     assert single == batched and min(float(row["x_px"]) for row in single) > 200
+
+
+def test_a_video_is_refused_with_what_to_do(
+    rendered: Path, started: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By every command that takes photographs; beside photographs it does not matter."""
+    Path("clips").mkdir()
+    for name in ("Flug über Köln.MP4", "v.avi"):
+        Path("clips", name).write_bytes(bytes(1_244_590))
+    for command in ("run", "init", "mark"):
+        for given in ("clips/Flug über Köln.MP4", "clips/v.avi", "clips"):
+            assert kolinear(command, given) == 2
+            said = capsys.readouterr().err
+            assert "a video, which is not read" in said and "ffmpeg -i" in said and "1000000" not in said
+            assert len(said.splitlines()) == 1
+    assert kolinear("batch", "clips/v.avi") == 1
+    assert "ffmpeg -i" in capsys.readouterr().out
+    shutil.copytree(rendered, "photos")
+    shutil.copy("clips/v.avi", "photos/v.avi")
+    assert kolinear("init", "photos") == 0

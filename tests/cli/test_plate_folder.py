@@ -51,9 +51,7 @@ def test_lines_of_both_streams_keep_their_order() -> None:
 def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[float | None] = []
 
-    def drafted(
-        photographs: Path, file: Path, pitch: float | None = None, name: str | None = None
-    ) -> Draft:
+    def drafted(photographs: Path, file: Path, pitch: float | None = None, name: str | None = None) -> Draft:
         asked.append(pitch)
         return Draft("plate", "[survey]\n", (), (), ())
 

@@ -21,7 +21,7 @@ from sfm.files.plain_text import as_plain, is_name, is_plain
 from sfm.model.display import agreeing, counted
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark, unless_note
-from sfm.photographs.exif import USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
+from sfm.photographs.exif import USUAL_SIGMAS_M, VIDEO, Metadata, conversion_of, read_metadata
 from sfm.photographs.masks import MASKS, Masks, find_masks
 from sfm.photographs.reading import SUFFIXES
 from sfm.products.drafting.camera_groups import (
@@ -176,7 +176,7 @@ def names_of_folder(folder: Path) -> Iterator[str]:
 def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
     """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
     if not folder.is_dir():
-        raise SurveyFileError(f"{folder}: {why_no_folder(folder)}")
+        raise SurveyFileError(f"{folder}: {conversion_of(folder) or why_no_folder(folder)}")
     files = _files_of(folder)
     files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
     if all(conversion_of(path) for path in files):
@@ -213,7 +213,7 @@ def _files_of(folder: Path) -> list[Path]:
         files = files or [
             path
             for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
-            if path.suffix.lower() in SUFFIXES or conversion_of(path)
+            if path.suffix.lower() in SUFFIXES or (conversion_of(path) and path.suffix.lower() not in VIDEO)
         ]
     return files
 
@@ -226,7 +226,8 @@ def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
         if every
         else "it is empty"
     )
-    content += f": {conversion_of(raw[0])}" if raw else ""
+    unread = (conversion_of(path) for path in (*raw, *every))
+    content += next((f": {words}" for words in unread if words), "")
     content += "".join(
         f"; try {as_plain(str(path))}" for path in every if path.name != MASKS and _has_photographs(path)
     )

@@ -13,6 +13,8 @@ from pydantic import Field, PrivateAttr, ValidationError
 from sfm.files.open_folders import path_inside
 from sfm.files.plain_text import as_plain, is_plain, read_toml
 from sfm.model.errors import SurveyFileError
+from sfm.photographs.exif import conversion_of
+from sfm.photographs.reading import SUFFIXES
 from sfm.survey.inputs.calibration import TABLES
 from sfm.survey.inputs.checks.contradictions import refuse_contradictions
 from sfm.survey.inputs.equipment import read_equipment
@@ -205,6 +207,10 @@ def read_survey_file(path: Path, *, allow_outside: bool = False) -> SurveyFile:
         raise SurveyFileError(
             f"{as_plain(str(path))}: the path has control or invisible characters; rename the file or folder"
         )
+    if path.suffix.lower() in SUFFIXES:
+        raise SurveyFileError(f"{path}: is a photograph, not a survey file; give its folder")
+    if unread := conversion_of(path):
+        raise SurveyFileError(f"{path}: is no survey file but {unread}")
     fields = SurveyFile.model_fields.items()
     repeated = {field.alias or name for name, field in fields if get_origin(field.annotation) is tuple}
     text, table = read_toml(path, "a survey file", repeated=repeated)
