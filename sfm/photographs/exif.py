@@ -24,6 +24,14 @@ from PIL import ExifTags, Image
 
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import PhotographError
+from sfm.photographs.camera_files import (
+    HEIF,
+    INSTALL,
+    CameraHeader,
+    header_of,
+    is_camera_file,
+    missing_library,
+)
 
 # warnings.catch_warnings is not thread-safe, and several threads read photographs.
 _PILLOW = Lock()
@@ -327,10 +335,8 @@ def _sigma(value: float) -> float:
 
 
 Image.init()
-# Endings of files of cameras and telephones that must be converted first.
-PHONE = (".heic", ".heif", ".hif", ".avif")
-RAW = (".3fr", ".arw", ".cr2", ".cr3", ".crw", ".dng", ".erf", ".iiq", ".kdc", ".mrw", ".nef", ".nrw", ".orf",
-       ".pef", ".raf", ".raw", ".rw2", ".srw", ".x3f")  # fmt: skip
+# Ending of files of telephones that must be converted first.
+AVIF = ".avif"
 # Endings of videos, whose frames must be extracted first.
 VIDEO = (".3gp", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
          ".mxf", ".ogv", ".webm", ".wmv")  # fmt: skip
@@ -365,16 +371,11 @@ def read_bytes(path: Path) -> bytes:
 
 def conversion_of(path: Path) -> str:
     """Return, by its ending, what kind of file must be converted first, and how; empty for other files."""
-    if path.suffix.lower() in PHONE:
-        return (
-            "a HEIF file, which is not read; convert all at full size and quality, such as with "
-            "heif-convert -q 100 IN.heic OUT.jpg"
-        )
-    if path.suffix.lower() in RAW:
-        return (
-            "a raw file, which is not read; develop all alike to TIFF, without lens correction, cropping or "
-            "turning, such as with dcraw -T -t 0 FILE"
-        )
+    if library := missing_library(path):
+        kind = "HEIF" if path.suffix.lower() in HEIF else "raw"
+        return f"a {kind} file, which is read with {library}, and it is not installed: {INSTALL}"
+    if path.suffix.lower() == AVIF:
+        return "an AVIF file, which is not read; convert all at full size and quality to JPEG or PNG"
     if path.suffix.lower() in VIDEO:
         return (
             "a video, which is not read; extract sharp frames into their own folder, such as two a second, "
@@ -390,7 +391,7 @@ def _refuse_unconverted(path: Path) -> None:
 
 
 @contextmanager
-def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image]:
+def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image | CameraHeader]:
     """Open the header of a photograph without decoding pixels.
 
     Args:
@@ -401,6 +402,9 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
         PhotographError: the file does not exist, has no known format, or claims to be too large.
     """
     _refuse_unconverted(path)
+    if is_camera_file(path):
+        yield _camera_header(path, source)
+        return
     with _PILLOW, warnings.catch_warnings(action="ignore"):
         # Pillow's limit is below the size of aerial scans
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
@@ -415,12 +419,29 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
         finally:
             Image.MAX_IMAGE_PIXELS = limit
         with image:
-            if image.width * image.height > MAX_PIXELS:
-                raise PhotographError(
-                    f"{path.name}: {image.width} x {image.height} px; "
-                    f"photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
-                )
+            _refuse_large(path, image.size)
             yield image
+
+
+def _camera_header(path: Path, source: Path | io.BytesIO) -> CameraHeader:
+    """Return the header of a file of a telephone or a raw file, as `opened_header`."""
+    if source is path and path.exists() and not path.is_file():  # reading a pipe would never end
+        raise PhotographError(f"{path.name}: not a file, a photograph is needed")
+    with _PILLOW, warnings.catch_warnings(action="ignore"):
+        try:
+            header = header_of(path, source)
+        except Exception as error:  # the libraries fail on damaged files in many ways
+            raise PhotographError(f"{path.name}: {_reason(path, error)}") from error
+    _refuse_large(path, header.size)
+    return header
+
+
+def _refuse_large(path: Path, size: tuple[int, int]) -> None:
+    if size[0] * size[1] > MAX_PIXELS:
+        raise PhotographError(
+            f"{path.name}: {size[0]} x {size[1]} px; "
+            f"photographs of at most {MAX_PIXELS / 1e6:.0f} million pixels are read"
+        )
 
 
 def refuse_bomb(path: Path, size: tuple[int, int], data: bytes) -> None:

@@ -15,12 +15,14 @@ import numpy as np
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import PhotographError
+from sfm.photographs.camera_files import HEIF, RAW, is_camera_file, pixels_of
 from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 
 # PhotographError states the fault of a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+PLAIN = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm", ".pgm", ".webp")
+SUFFIXES = (*PLAIN, *HEIF, *RAW)
 CHANNELS = ("luminance", "red", "green", "blue")
 # IEC 61966-2-1 (sRGB): linear below this signal, a power law above it.
 SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_POWER = 0.04045, 12.92, 0.055, 2.4
@@ -48,7 +50,7 @@ def read_photograph(path: str | Path, *, channel: str = "luminance") -> AnyArray
     """Read one photograph as stored, with all bits; it is never rotated by its EXIF orientation.
 
     Args:
-        path: JPEG, TIFF, PNG or another format that OpenCV reads.
+        path: JPEG, TIFF, PNG or another format that OpenCV reads; HEIF or raw with kolinear[photographs].
         channel: luminance (Rec. 601), red, green or blue; all are the same for grey photographs.
 
     Returns:
@@ -96,7 +98,7 @@ def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
     """Read a photograph as a screen shows it, in colour and as stored; see `read_photograph`.
 
     Args:
-        path: JPEG, TIFF, PNG or another format that OpenCV reads.
+        path: JPEG, TIFF, PNG or another format that OpenCV reads; HEIF or raw with kolinear[photographs].
         shrink: 1, 2, 4 or 8: the sides are divided by it. A JPEG is decoded at that size, which saves most of
             the time.
 
@@ -116,6 +118,8 @@ def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
     with opened_header(path, io.BytesIO(data)) as header:
         size = header.size
     refuse_bomb(path, size, data)
+    if is_camera_file(path):
+        return _displayed(_camera_pixels(path, data), shrink)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags[shrink] | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -123,6 +127,36 @@ def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
     if image is None:
         raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
     return image
+
+
+def _camera_pixels(path: Path, data: bytes) -> AnyArray:
+    """Return the pixels of a file of a telephone or a raw file, see `pixels_of`."""
+    try:
+        return pixels_of(path, data)
+    except Exception as error:  # the libraries fail on damaged files in many ways
+        raise PhotographError(
+            f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)"
+        ) from error
+
+
+def _channel_of(pixels: AnyArray, channel: str) -> AnyArray:
+    """Return a channel of red, green and blue (H, W, 3), or grey pixels as they are, (H, W)."""
+    if pixels.ndim == 2:
+        return pixels
+    if channel == "luminance":
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY))
+    return np.ascontiguousarray(pixels[:, :, ("red", "green", "blue").index(channel)])
+
+
+def _displayed(pixels: AnyArray, shrink: int) -> AnyArray:
+    """Return pixels as `read_for_display` does."""
+    if pixels.dtype == np.uint16:
+        pixels = (pixels >> 8).astype(np.uint8)
+    pixels = cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR if pixels.ndim == 2 else cv2.COLOR_RGB2BGR)
+    if shrink > 1:
+        size = -(-pixels.shape[1] // shrink), -(-pixels.shape[0] // shrink)
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(pixels)
 
 
 def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray:
@@ -136,6 +170,8 @@ def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray
         size = header.size
     if not may_be_plain:
         refuse_bomb(path, size, data)
+    if is_camera_file(path):
+        return _of_size(path, _channel_of(_camera_pixels(path, data), channel), size)
     colour = cv2.IMREAD_GRAYSCALE if channel == "luminance" else cv2.IMREAD_COLOR
     try:
         image = cv2.imdecode(
@@ -145,13 +181,19 @@ def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray
         image = None
     if image is None:
         raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
-    if image.shape[1::-1] != size:
-        decoded = f"{image.shape[1]} x {image.shape[0]}"
-        raise PhotographError(f"{path.name}: {decoded} px, its header states {size[0]} x {size[1]}")
+    image = _of_size(path, image, size)
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
     if image.ndim == 3:
         image = np.ascontiguousarray(image[:, :, {"blue": 0, "green": 1, "red": 2}[channel]])
+    return image
+
+
+def _of_size(path: Path, image: AnyArray, size: tuple[int, int]) -> AnyArray:
+    """Return pixels; refuse those of another size than the header states."""
+    if image.shape[1::-1] != size:
+        decoded = f"{image.shape[1]} x {image.shape[0]}"
+        raise PhotographError(f"{path.name}: {decoded} px, its header states {size[0]} x {size[1]}")
     return image
 
 

@@ -13,6 +13,7 @@ import pytest
 from sfm.adjustment.solve import adjust
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
+from sfm.photographs import camera_files
 from sfm.photographs.reading import read_photograph
 from sfm.pipeline import run_survey
 from sfm.products.drafting.draft import draft_survey
@@ -107,13 +108,17 @@ def test_a_survey_with_a_crop_goes_on(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("a.HEIC", "a HEIF file, .* heif-convert"),
-        ("a.nef", "a raw file, .* dcraw -T -t 0"),
+        ("a.HEIC", "a HEIF file, .* pillow-heif.*kolinear.photographs."),
+        ("a.nef", "a raw file, .* rawpy"),
         ("a.dng", "a raw file"),
+        ("a.avif", "an AVIF file, .* convert"),
     ],
 )
-def test_what_must_be_converted_is_reported_with_how(name: str, told: str, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_reported_with_the_remedy(
+    name: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Raw files are TIFF files whose first picture is a small preview."""
+    monkeypatch.setattr(camera_files, "_is_installed", lambda _: False)
     cv2.imwrite(str(tmp_path / "a.tif"), np.full((30, 40), 90, dtype=np.uint8))
     (tmp_path / "a.tif").rename(tmp_path / name)
     with pytest.raises(PhotographError, match=told):

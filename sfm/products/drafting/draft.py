@@ -21,9 +21,10 @@ from sfm.files.plain_text import as_plain, is_name, is_plain
 from sfm.model.display import agreeing, counted
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark, unless_note
-from sfm.photographs.exif import USUAL_SIGMAS_M, VIDEO, Metadata, conversion_of, read_metadata
+from sfm.photographs.camera_files import is_camera_file
+from sfm.photographs.exif import AVIF, USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.photographs.masks import MASKS, Masks, find_masks
-from sfm.photographs.reading import SUFFIXES
+from sfm.photographs.reading import PLAIN, SUFFIXES
 from sfm.products.drafting.camera_groups import (
     BY_TIMES,
     CameraGroup,
@@ -182,6 +183,7 @@ def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[s
     if all(conversion_of(path) for path in files):
         _refuse_folder(folder, files)
     metadata, unreadable = {}, []
+    developed = {path.with_suffix(""): path for path in files if path.suffix.lower() in PLAIN}
     for path in files:
         name = path.relative_to(folder).as_posix()
         if not is_plain(name):
@@ -189,6 +191,10 @@ def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[s
             continue
         if not (path.resolve().is_relative_to(folder.resolve()) or is_home_file(path)):
             unreadable.append((name, "a link out of the folder, and not to a file in your home folder"))
+            continue
+        other = developed.get(path.with_suffix(""))
+        if other not in (None, path) and is_camera_file(path):
+            unreadable.append((name, f"of the same exposure as {other.name}"))
             continue
         try:
             metadata[name] = read_metadata(path)
@@ -213,7 +219,7 @@ def _files_of(folder: Path) -> list[Path]:
         files = files or [
             path
             for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
-            if path.suffix.lower() in SUFFIXES or (conversion_of(path) and path.suffix.lower() not in VIDEO)
+            if path.suffix.lower() in SUFFIXES or path.suffix.lower() == AVIF
         ]
     return files
 
@@ -231,7 +237,7 @@ def _refuse_folder(folder: Path, raw: Sequence[Path] = ()) -> NoReturn:
     content += "".join(
         f"; try {as_plain(str(path))}" for path in every if path.name != MASKS and _has_photographs(path)
     )
-    raise SurveyFileError(f"{folder}: no photographs ({', '.join(SUFFIXES)}), {content}")
+    raise SurveyFileError(f"{folder}: no photographs ({', '.join(PLAIN)}, HEIF or raw), {content}")
 
 
 def _has_photographs(folder: Path) -> bool:
