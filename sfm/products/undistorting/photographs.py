@@ -12,6 +12,7 @@ from PIL import ExifTags, Image
 
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import PhotographError
+from sfm.photographs.camera_files import CameraHeader
 from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
 from sfm.products.undistorting.views import View
 
@@ -55,6 +56,8 @@ class UndistortedPhotographs:
         data = read_bytes(path)
         refuse_truncated(path, data)
         with opened_header(path, io.BytesIO(data)) as header:
+            if isinstance(header, CameraHeader):
+                raise PhotographError(f"{path.name}: this kind cannot be written as {out.suffix}")
             size, kind = header.size, header.format or ""
             exif = header.info.get("exif") or _exif(header)
             icc = header.info.get("icc_profile") if header.mode in COLOURS else None
