@@ -78,7 +78,7 @@ class MarkAdjustment:
             a.network.images[seen.image[k]],
             a.network.points[seen.point[k]],
             float(test[k]),
-            self.named is not None,
+            self.named is not None and a.converged,  # else residuals are not those of an optimum
         )
 
     @property
@@ -160,8 +160,6 @@ def adjust_marks(
             if named is None or not tested.rejected[named]:
                 test = np.nan_to_num(np.abs(tested.standardised)).max(axis=1)
                 named = int(np.argmax(np.where(tested.rejected, test, -1.0)))
-    if not chosen.converged:  # its residuals are not those of an optimum, and contradict nothing
-        named = None
     whole = merge_estimate(chosen.estimate, images, points)
     return MarkAdjustment(chosen, whole, images, points, np.flatnonzero(used), named)
 

@@ -105,8 +105,10 @@ class Following:
     @property
     def doubted(self) -> frozenset[tuple[str, str]]:
         """The marks of the photograph with the mark that does not fit; empty if all fit."""
-        worst = None if self.adjustment is None else self.adjustment.worst
-        if worst is None or not worst.flagged:
+        if self.adjustment is None or self.adjustment.named is None:
+            return frozenset()
+        worst = self.adjustment.worst
+        if worst is None:
             return frozenset()
         return frozenset(key for key in self.marked.keys if key[0] == worst.photograph)
 
