@@ -23,7 +23,10 @@ LAYERS = (
     ),
     ("sfm.judgement.survey_result",),
     ("sfm.judgement",),
-    ("sfm.survey", "sfm.products.inspection", "sfm.products.drafting", "sfm.products.refining"),
+    (
+        *("sfm.survey", "sfm.products.inspection", "sfm.products.drafting", "sfm.products.refining"),
+        *("sfm.products.calibration",),
+    ),
     ("sfm.report",),
     (  # pages of products
         *("sfm.products.epochs.page", "sfm.products.inspection.page", "sfm.products.refining.page"),

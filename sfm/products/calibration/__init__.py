@@ -1,0 +1,1 @@
+"""Calibration: how well a camera is known, where it is, and what would improve it."""
