@@ -1,0 +1,81 @@
+"""Cross-validation: halves of the photographs differ by chance only if nothing else is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.model.camera import project
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network, rows_of
+from sfm.products.calibration.crossvalidation import cross_validate
+from tests.products.calibration.boards import CAMERA, SIGMA_PX, simulated_board
+from tests.synthetic import seed_of
+
+SIMULATIONS, LENS_K3 = 20, 1e-5
+
+
+def ratios(fixed: bool, simulations: int, change: str = "") -> dict[str, list[float]]:
+    """Return difference over prediction of each division, in simulated calibrations with a model error."""
+    found: dict[str, list[float]] = {}
+    for number in range(simulations):
+        rng = seed_of(f"halves {number}")
+        lens = CAMERA
+        if change == "lens":  # K3 is not adjusted
+            K3 = CAMERA.names.index("K3")
+            lens = CAMERA.with_parameters(CAMERA.parameters + LENS_K3 * (np.arange(len(CAMERA.names)) == K3))
+        board = simulated_board(rng, photographs=16, camera=lens, fixed=fixed)
+        network = board.noisy(rng)
+        if change == "zoom":
+            network = zoomed(network, board.truth, rng)
+        start = replace(board.truth, cameras=(CAMERA,))
+        a = sfm.adjust(network, start, datum="control" if fixed else "free", reject="none")
+        validated = cross_validate(a)
+        assert not validated.untested
+        for halves in validated.differences:
+            assert halves.photographs == (8, 8) and halves.camera == "cam" and halves.dof <= len(CAMERA.free)
+            found.setdefault(halves.division, []).append(halves.ratio)
+    return found
+
+
+def zoomed(network: Network, truth: Estimate, rng: np.random.Generator) -> Network:
+    """Return the network whose last photographs have a c that is 0.3 % larger."""
+    xy = network.image_points.xy.copy()
+    camera = truth.cameras[0]
+    longer = camera.with_parameters(camera.parameters * (1 + 0.003 * (np.arange(len(camera.names)) == 0)))
+    for i, rows in enumerate(rows_of(network.image_points.image, len(network.images))):
+        if i >= len(network.images) // 2:
+            points = truth.points[network.image_points.point[rows]]
+            true = project(longer, truth.position[i], truth.rotation[i], points)
+            xy[rows] = true + SIGMA_PX * rng.standard_normal(true.shape)
+    return replace(network, image_points=replace(network.image_points, xy=xy))
+
+
+@pytest.mark.parametrize("fixed", [True, False], ids=["fixed board", "free board"])
+def test_without_model_error_the_difference_is_as_predicted(fixed: bool) -> None:
+    for division, of_division in ratios(fixed, SIMULATIONS).items():
+        assert 0.8 < np.sqrt(np.square(of_division).mean()) < 1.25, (division, of_division)
+
+
+@pytest.mark.parametrize("fixed", [True, False], ids=["fixed board", "free board"])
+def test_a_lens_that_the_model_does_not_describe_is_seen(fixed: bool) -> None:
+    found = ratios(fixed, 5, "lens")
+    assert (np.max(list(found.values()), axis=0) > 2).all(), found
+
+
+def test_a_camera_that_changed_is_seen_in_first_and_last() -> None:
+    found = ratios(True, 5, "zoom")
+    assert min(found["first and last photographs"]) > 2
+    assert np.median(found["first and last photographs"]) > np.median(found["every other photograph"])
+
+
+def test_few_photographs_have_no_halves() -> None:
+    board = simulated_board(seed_of("few"), photographs=4)
+    a = sfm.adjust(board.noisy(seed_of("n")), board.truth, datum="control", reject="none")
+    validated = cross_validate(a)
+    assert not validated.differences and len(validated.untested) == 4
+    assert validated.untested[0][1] == "camera cam: half of its photographs are 2, needed 3"
+    assert validated.clearest("cam") is None
