@@ -1,0 +1,314 @@
+"""The next photographs of a calibration: the poses that make the worst corner of the format known best.
+
+Candidates are a grid of views of the object: tilted about both axes of the image and rolled or not, near and
+far as in the photographs so far, with the object in the middle, at the sides and in the corners of the
+format. A candidate shows at least the share of the object that every photograph so far shows, since a board
+without tags is read only as a whole. Its image points, with its own unknown pose eliminated, add to the
+information on interior orientation and object points:
+
+    Qxx' = Qxx - Qxx A' (I + A Qxx A')^-1 A Qxx
+
+for the whitened derivatives A. The candidate that lowers the largest sigma of projection in the corners most
+is taken, and the next one is sought with it.
+
+Source: Foerstner, Wrobel (2016), sec. 4.2.7 (update of a covariance); Fedorov (1972), Theory of Optimal
+Experiments (greedy design); Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (views of a calibration).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from sfm.adjustment.covariance import marginal_of
+from sfm.adjustment.quality.correlations import observed_part
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import predict
+from sfm.model.camera import (
+    Camera,
+    parameter_jacobian,
+    pixel_from_tangents,
+    pixel_jacobian,
+    tangents_from_pixel,
+)
+from sfm.model.conventions import FloatArray, IntArray, skew
+from sfm.model.network import ImagePoints
+from sfm.products.calibration.projection import (
+    ProjectionUncertainty,
+    grid_of,
+    projection_uncertainty,
+)
+from sfm.runtime.threads import own_threads
+
+# About the axes of the image; together 41 degrees. Plates are photographed from 20 to 40 degrees off their
+# normal, see docs/how-to/calibrate-a-camera.md.
+TILTS_DEG = (-30.0, 0.0, 30.0)
+PLACES = (1 / 6, 1 / 2, 5 / 6)  # of the middle of the object, in widths and heights of the format
+ROLLS_DEG = (0.0, 90.0)
+MAX_POINTS = 60  # of the object in the search; the weights of the others are theirs
+DIAGONAL = np.linspace(0.0, 0.45, 46)  # from a corner towards the middle; where a fisheye has its first ray
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A photograph to take next."""
+
+    position: FloatArray  # projection centre, object unit, (3,)
+    rotation: FloatArray  # R, image to object axes, (3, 3)
+    tilt_deg: tuple[float, float]  # about the x and y axes of the image
+    roll_deg: float
+    place: tuple[float, float]  # of the middle of the object, in widths and heights of the format
+    distance: float  # of the middle of the object, object unit
+    xy: FloatArray  # image points of the object, px; NaN where not seen, (n, 2)
+
+
+@dataclass(frozen=True)
+class NextPoses:
+    """The next photographs of a camera, with sigma of projection at infinity in the worst corner."""
+
+    camera: str
+    poses: tuple[Pose, ...]
+    before: float  # of the photographs so far, px
+    after: tuple[float, ...]  # with the first pose, with the first two, and so on, px
+
+
+def next_poses(adjustment: Adjustment, camera: int = 0, count: int = 3) -> NextPoses:
+    """Return the poses of a camera that lower the sigma of projection of its worst corner most.
+
+    Args:
+        adjustment: finished, with its covariance.
+        camera: index of the camera.
+        count: number of poses.
+
+    Example:
+        >>> from sfm.products.calibration.poses import next_poses
+        >>> further = next_poses(result.adjustment, count=1)
+        >>> len(further.poses), further.after[0] < further.before
+        (1, True)
+    """
+    lens = adjustment.estimate.cameras[camera]
+    corners = corners_of(lens)
+    before = worst_corner(adjustment, camera, corners)
+    if not np.isfinite(before) or not lens.free.any():
+        return NextPoses(lens.name, (), before, ())
+    taken = _chosen(adjustment, camera, corners, list(candidates(adjustment, camera)), count)
+    after = []
+    for number in range(1, len(taken) + 1):
+        planned = with_poses(adjustment, camera, taken[:number])
+        after.append(worst_corner(planned, camera, corners))
+    return NextPoses(lens.name, tuple(taken), before, tuple(after))
+
+
+def corners_of(camera: Camera) -> FloatArray:
+    """Return the corners of the format, or the places nearest to them that have a ray, px, (4, 2)."""
+    size = np.array(camera.size_px) - 1.0
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
+    places = []
+    for corner in corners:
+        line = corner + 2 * DIAGONAL[:, None] * (size / 2 - corner)
+        inner = np.isfinite(tangents_from_pixel(camera, line)).all(axis=1)
+        places.append(line[int(inner.argmax())])
+    return np.array(places)
+
+
+def worst_corner(adjustment: Adjustment, camera: int, corners: FloatArray) -> float:
+    """Return the largest sigma of projection at infinity, RMS of both coordinates, px.
+
+    Args:
+        adjustment: finished, with its covariance.
+        camera: index of the camera.
+        corners: places, px, (4, 2).
+    """
+    return float(projection_uncertainty(adjustment, camera).sigma_at(corners, np.inf).max())
+
+
+def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
+    """Yield the views that may be photographed next.
+
+    Args:
+        adjustment: finished.
+        camera: index of the camera.
+    """
+    network, estimate = adjustment.network, adjustment.estimate
+    lens = estimate.cameras[camera]
+    seen = network.image_points.select(~adjustment.rejected)
+    of_camera = network.camera[seen.image] == camera
+    shown = np.unique(seen.point[of_camera])
+    points = estimate.points[shown]
+    per_photograph = np.bincount(seen.image[of_camera])
+    least = int(per_photograph[per_photograph > 0].min())
+    images = np.flatnonzero(per_photograph)
+    middle = points.mean(axis=0)
+    away = estimate.position[images] - middle
+    distances = np.quantile(np.linalg.norm(away, axis=1), (0.0, 0.5, 1.0))
+    facing = _facing(points - middle, away)
+    width, height = lens.size_px
+    places = [(x, y) for x, y in product(PLACES, PLACES)]
+    tangents = tangents_from_pixel(lens, np.array(places) * (width, height) - 0.5)
+    for a, b, roll, distance in product(TILTS_DEG, TILTS_DEG, ROLLS_DEG, distances):
+        rotation = facing @ _turned(np.radians(a), np.radians(b), np.radians(roll))
+        for place, tangent in zip(places, tangents, strict=True):
+            if not np.isfinite(tangent).all():
+                continue
+            position = middle - rotation @ (distance * np.array([*tangent, -1.0]))
+            xy = np.full((len(network.points), 2), np.nan)
+            xy[shown] = _seen_from(lens, position, rotation, points)
+            if np.isfinite(xy[:, 0]).sum() >= least:
+                yield Pose(position, rotation, (a, b), roll, place, float(distance), xy)
+
+
+def _seen_from(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the image points inside the format, px, NaN for the others, (n, 2)."""
+    UVW = (points - position) @ rotation
+    in_front = UVW[:, 2] < 0
+    depth = np.where(in_front, UVW[:, 2], np.nan)[:, None]
+    xy = pixel_from_tangents(camera, -UVW[:, :2] / depth)
+    inside = np.all((xy >= 0) & (xy <= np.array(camera.size_px) - 1), axis=1)
+    return np.where(inside[:, None], xy, np.nan)
+
+
+def _facing(points: FloatArray, away: FloatArray) -> FloatArray:
+    """Return R of a camera before the object, along the normal of its plane and its longer side, (3, 3)."""
+    _, _, axes = np.linalg.svd(points, full_matrices=False)
+    z = axes[2] * (np.sign((away @ axes[2]).sum()) or 1.0)
+    x = axes[0]
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _turned(a: float, b: float, roll: float) -> FloatArray:
+    """Return the rotation about the x axis, the y axis and the axis of the camera, rad, (3, 3)."""
+    ca, sa, cb, sb, ck, sk = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(roll), np.sin(roll)
+    x = np.array([[1, 0, 0], [0, ca, -sa], [0, sa, ca]])
+    y = np.array([[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]])
+    z = np.array([[ck, -sk, 0], [sk, ck, 0], [0, 0, 1]])
+    return np.asarray(x @ y @ z)
+
+
+def with_poses(adjustment: Adjustment, camera: int, poses: Sequence[Pose]) -> Adjustment:
+    """Return the predicted adjustment of the photographs so far and further ones.
+
+    Args:
+        adjustment: finished, with its covariance.
+        camera: index of the camera.
+        poses: the further photographs.
+    """
+    network, estimate = adjustment.network, adjustment.estimate
+    m, sigma = len(network.images), adjustment.sigma0
+    seen = network.image_points.select(~adjustment.rejected)
+    covariance = sigma**2 * adjustment.image_covariance[~adjustment.rejected]
+    usual = (sigma * adjustment.usual_px) ** 2 * np.eye(2)
+    parts = [ImagePoints(seen.image, seen.point, seen.xy, covariance)]
+    for number, pose in enumerate(poses):
+        point = np.flatnonzero(np.isfinite(pose.xy[:, 0]))
+        image = np.full(len(point), m + number)
+        parts.append(ImagePoints(image, point, pose.xy[point], np.tile(usual, (len(point), 1, 1))))
+    moment = network.moment
+    if moment is not None:
+        moment = np.concatenate([moment, moment.max() + 1 + np.arange(len(poses))])
+    further = replace(
+        network,
+        images=(*network.images, *(f"next {number + 1}" for number in range(len(poses)))),
+        camera=np.concatenate([network.camera, np.full(len(poses), camera)]),
+        moment=moment,
+        image_points=ImagePoints.joined(parts),
+        sources=network.sources[:1],
+    )
+    planned = replace(
+        estimate,
+        position=np.vstack([estimate.position, *(pose.position[None] for pose in poses)]),
+        rotation=np.concatenate([estimate.rotation, *(pose.rotation[None] for pose in poses)]),
+    )
+    return predict(further, planned, datum="control" if adjustment.datum == "control" else "free")
+
+
+def _chosen(
+    adjustment: Adjustment, camera: int, corners: FloatArray, views: list[Pose], count: int
+) -> list[Pose]:
+    """Return the views that lower the worst corner most, one after the other."""
+    lens = adjustment.estimate.cameras[camera]
+    shown = np.zeros(0, dtype=np.int64)
+    if views:
+        shown = np.flatnonzero(np.any([np.isfinite(view.xy[:, 0]) for view in views], axis=0))
+    places = np.linspace(0, len(shown) - 1, min(len(shown), MAX_POINTS))
+    sample = shown[np.unique(places.astype(np.int64))]
+    if not len(sample):
+        return []
+    with own_threads():
+        marginal = marginal_of(adjustment, cross=False)
+        columns = marginal.layout.interior_column[camera]
+        Q = marginal.joint(columns, sample)
+    effect = _corner_effect(adjustment, camera, corners)
+    f = len(columns)
+    known = np.concatenate([np.arange(f), f + np.flatnonzero(np.diagonal(Q)[f:] > 0)])
+    Q = Q[np.ix_(known, known)]
+    sigma = adjustment.sigma0 * adjustment.usual_px
+    rows = [_information(adjustment, lens, view, sample, known) / sigma for view in views]
+    taken: list[Pose] = []
+    for _ in range(min(count, len(views))):
+        scores = [_worst(effect, Q, A, f) for A in rows]
+        best = int(np.argmin(scores))
+        Q = _updated(Q, rows[best])
+        taken.append(views[best])
+    return taken
+
+
+def _corner_effect(adjustment: Adjustment, camera: int, corners: FloatArray) -> FloatArray:
+    """Return the effects of the free parameters on the corners after a rotation, px, (4, 2, f).
+
+    The rotation is fitted to the part of the format that has image points.
+    """
+    lens, network = adjustment.estimate.cameras[camera], adjustment.network
+    seen = network.image_points.select(~adjustment.rejected)
+    nodes = np.stack(np.meshgrid(*grid_of(lens)), axis=-1).reshape(-1, 2)
+    nodes = nodes[observed_part(seen.xy[network.camera[seen.image] == camera], nodes)[1]]
+    free: IntArray = np.flatnonzero(lens.free)
+    effects = ProjectionUncertainty(lens, free, np.zeros((0, 0)))
+    inner, outer = effects.derivatives(nodes, np.inf), effects.derivatives(corners, np.inf)
+    inner = inner[np.isfinite(inner).all(axis=(1, 2))].reshape(-1, 6 + len(free))
+    turn = np.linalg.lstsq(inner[:, 3:6], inner[:, 6:], rcond=None)[0]
+    return np.asarray(outer[:, :, 6:] - outer[:, :, 3:6] @ turn)
+
+
+def _information(
+    adjustment: Adjustment, lens: Camera, view: Pose, sample: IntArray, known: IntArray
+) -> FloatArray:
+    """Return the derivatives of the image points of a view by the unknowns, its pose eliminated, px.
+
+    Each point of the sample has the weight of all points that it stands for.
+    """
+    seen = np.flatnonzero(np.isfinite(view.xy[sample, 0]))
+    points = adjustment.estimate.points[sample[seen]]
+    UVW = (points - view.position) @ view.rotation
+    uv = -UVW[:, :2] / UVW[:, 2:]
+    by_ray = np.concatenate([np.tile(np.eye(2), (len(uv), 1, 1)), uv[:, :, None]], axis=2)
+    by_point = pixel_jacobian(lens, view.xy[sample[seen]]) @ by_ray / -UVW[:, 2][:, None, None]
+    pose = np.concatenate([by_point, by_point @ skew(UVW)], axis=2).reshape(-1, 6)
+    interior = parameter_jacobian(lens, uv)[:, :, np.flatnonzero(lens.free)]
+    f = interior.shape[2]
+    A = np.zeros((len(seen), 2, f + 3 * len(sample)))
+    A[:, :, :f] = interior
+    for row, place in enumerate(seen):
+        A[row, :, f + 3 * place : f + 3 * place + 3] = by_point[row] @ view.rotation.T
+    A = A.reshape(2 * len(seen), -1)[:, known]
+    ok = np.isfinite(A).all(axis=1) & np.isfinite(pose).all(axis=1)
+    A, pose = A[ok], pose[ok]
+    basis, _ = np.linalg.qr(pose)
+    share = np.isfinite(view.xy[:, 0]).sum() / max(len(seen), 1)
+    return np.asarray(np.sqrt(share) * (A - basis @ (basis.T @ A)))
+
+
+def _updated(Q: FloatArray, A: FloatArray) -> FloatArray:
+    """Return the covariance with further observations of whitened derivatives A."""
+    AQ = A @ Q
+    return np.asarray(Q - AQ.T @ np.linalg.solve(np.eye(len(A)) + AQ @ A.T, AQ))
+
+
+def _worst(effect: FloatArray, Q: FloatArray, A: FloatArray, f: int) -> float:
+    """Return the largest variance of a corner with further observations."""
+    AQ = A @ Q
+    half = np.linalg.solve(np.linalg.cholesky(np.eye(len(A)) + AQ @ A.T), AQ[:, :f])
+    with_view = Q[:f, :f] - half.T @ half
+    return float(np.einsum("nis,st,nit->n", effect, with_view, effect).max())
