@@ -1,0 +1,117 @@
+"""Which parameters of its camera model a set of photographs bears: leaner and wider models compared.
+
+Each alternative leaves out a group of adjusted parameters, or adds one that was held: the last radial term,
+decentring, affinity, shear. It is adjusted with all unknowns, and decided by the likelihood that decides all
+choices of a survey: the gain of ln likelihood, minus the price of the parameters.
+
+Source: `sfm.judgement.model_choice`; Kass and Raftery (1995), J. Am. Stat. Assoc. 90.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.datum import Datum
+from sfm.adjustment.result import Adjustment
+from sfm.adjustment.solve import AdjustmentOptions, adjust
+from sfm.model.camera import Camera
+from sfm.model.conventions import BoolArray
+from sfm.model.distortion.models import Role
+from sfm.model.errors import GeometryError
+from sfm.model.likelihood import price_of
+
+GROUPS = {  # roles that are added or left out together
+    "radial": (Role.RADIAL, Role.DENOMINATOR),
+    "decentring": (Role.DECENTRING,),
+    "affinity": (Role.AFFINITY,),
+    "shear": (Role.SHEAR,),
+}
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A camera model with parameters added to the adjusted one, or left out of it."""
+
+    camera: str
+    added: bool  # whether parameters were added; otherwise they were left out
+    parameters: tuple[str, ...]  # that were added or left out
+    gain: float  # of ln likelihood by the wider of the two models; NaN without a solution
+    price: float  # of its further parameters
+
+    @property
+    def borne(self) -> bool:
+        """Whether the photographs bear the wider of the two models."""
+        return self.gain > self.price
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the photographs bear another model than the adjusted one."""
+        return bool(np.isfinite(self.gain)) and self.borne == self.added
+
+
+def compare_models(adjustment: Adjustment, camera: int = 0) -> tuple[Alternative, ...]:
+    """Return the alternatives to the free parameters of a camera.
+
+    Args:
+        adjustment: finished.
+        camera: index of the camera.
+
+    Example:
+        >>> from sfm.products.calibration.models import compare_models
+        >>> {alternative.camera for alternative in compare_models(result.adjustment)} <= {"D3"}
+        True
+    """
+    present = adjustment.estimate.cameras[camera]
+    if not present.free.any():
+        return ()
+    network = adjustment.network
+    here = network.camera[network.image_points.image[~adjustment.rejected]] == camera
+    others = list(_alternatives(present))
+    search = float(np.log(max(len(others), 1) / adjustment.levels.family))
+    own = _squares(adjustment, camera, present.free)
+    compared = []
+    for added, changed in others:
+        lean, wide = own, _squares(adjustment, camera, present.free ^ changed)
+        if not added:
+            lean, wide = wide, own
+        gain = float("nan")
+        if lean is not None and wide is not None and wide[0] > 0:
+            gain = wide[1] / 2 * float(np.log(lean[0] / wide[0]))
+        names = tuple(name for name, new in zip(present.names, changed, strict=True) if new)
+        price = price_of(len(names), int(here.sum()), search if added else 0.0)
+        compared.append(Alternative(present.name, added, names, gain, price))
+    return tuple(compared)
+
+
+def _alternatives(camera: Camera) -> Iterator[tuple[bool, BoolArray]]:
+    """Yield whether parameters are added, and which ones are added or left out, (n,)."""
+    for group, roles in GROUPS.items():
+        mine = np.flatnonzero(camera.plays(*roles))
+        free, held = mine[camera.free[mine]], mine[~camera.free[mine]]
+        last = slice(-1, None) if group == "radial" else slice(None)
+        for added, chosen in ((False, free[last]), (True, held[:1] if group == "radial" else held)):
+            if len(chosen):
+                yield added, np.isin(np.arange(len(camera.names)), chosen)
+
+
+def _squares(adjustment: Adjustment, camera: int, free: BoolArray) -> tuple[float, int] | None:
+    """Return v'Pv and redundancy with other free parameters; None without a solution."""
+    network, estimate, kept = adjustment.network, adjustment.estimate, ~adjustment.rejected
+    cameras = list(estimate.cameras)
+    values = np.where(free | ~cameras[camera].free, cameras[camera].parameters, 0.0)
+    cameras[camera] = replace(cameras[camera], free=free, parameters=values)
+    try:
+        adjusted = adjust(
+            replace(network, image_points=network.image_points.select(kept)),
+            replace(estimate, cameras=tuple(cameras)),
+            datum=Datum("control" if adjustment.datum == "control" else "free"),
+            reject="none",
+            covariance=False,
+            options=AdjustmentOptions(image_sigma_factor=adjustment.image_sigma_factor[kept]),
+        )
+    except (GeometryError, np.linalg.LinAlgError):
+        return None
+    return (adjusted.vPv, adjusted.redundancy) if adjusted.converged else None
