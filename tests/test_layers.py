@@ -31,6 +31,7 @@ LAYERS = (
     (  # pages of products
         *("sfm.products.epochs.page", "sfm.products.inspection.page", "sfm.products.refining.page"),
         *("sfm.products.planning.page", "sfm.products.planning.further_page"),
+        *("sfm.products.calibration.page",),
     ),
     ("sfm.pipeline",),
     ("sfm.products", "sfm.cli"),

@@ -18,6 +18,7 @@ import typer
 from sfm.cli.commands.accept import accept
 from sfm.cli.commands.adjust import adjust
 from sfm.cli.commands.batch import batch
+from sfm.cli.commands.calibrate import calibrate
 from sfm.cli.commands.compare import compare
 from sfm.cli.commands.convert import convert
 from sfm.cli.commands.doctor import doctor
@@ -50,6 +51,7 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("run", run, "PHOTOS|SURVEY.toml", "photographs -> report"),
     Command("init", init, "PHOTOS", "draft the survey file of a folder of photographs"),
+    Command("calibrate", calibrate, "PHOTOS", "a camera, how far to trust it, and which photograph next"),
     Command("adjust", adjust, "SURVEY.toml", "measured image points -> report"),
     Command("batch", batch, "SURVEYS...", "many surveys, on this computer or a cluster"),
     Command("targets", targets, "--out sheet.pdf", "coded targets or tags to print"),

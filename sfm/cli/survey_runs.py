@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
@@ -18,6 +18,7 @@ from sfm.model.errors import KolinearError, OutputError
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
+    from sfm.judgement.survey_result import SurveyResult
     from sfm.model.remarks.remark import Remark
     from sfm.products.drafting.draft import Draft
 
@@ -116,6 +117,19 @@ def run_file(survey_file: Path) -> Path:
     return run_survey_file(survey_file, RunOptions(pictures_mb=15.0))
 
 
+class SurveyProduct(Protocol):
+    """What a command makes of a survey, beside its report."""
+
+    def revise(self, survey_file: Path, result: SurveyResult) -> bool:
+        """Return whether the survey file was changed because of a result, so that it is run once more."""
+
+    def write(self, result: SurveyResult, folder: Path) -> None:
+        """Write further files into the folder of the result, which is not complete yet."""
+
+    def show(self, folder: Path) -> bool:
+        """Print the product in place of the summary; return whether the result is dependable."""
+
+
 @dataclass(frozen=True)
 class RunOptions:
     """How a survey is run, and where its result is written."""
@@ -130,6 +144,7 @@ class RunOptions:
     weighted: bool = False  # whether that orientation is observed, not fixed
     overwrite: bool = False  # whether a result of other photographs is replaced
     pictures_mb: float = 0.0  # largest size of the pictures in the report, 10^6 bytes
+    product: SurveyProduct | None = None  # what is made of the survey, beside its report
 
 
 def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
@@ -220,6 +235,11 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             result = run_survey(
                 survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
             )
+            if options.product is not None and options.product.revise(survey_file, result):
+                survey = survey_of_file(read_survey_file(survey_file, allow_outside=options.allow_outside))
+                result = run_survey(
+                    survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
+                )
         except UnfinishedSurveyError as error:
             reached = error.reached
             page = write_unfinished(
@@ -232,17 +252,28 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             print_unfinished(reached, page)
             raise SystemExit(FAILED) from error
         findings = findings_of(result)
+
+        def finish(part: Path) -> None:
+            if options.product is not None:
+                options.product.write(findings.result, part)
+            log.close_into(part, findings)
+
         page = write_result(
             findings,
             folder,
             write_colmap=colmap_writer(result),
-            finish=lambda part: log.close_into(part, findings),
+            finish=finish,
             jobs=workers,
             budget_mb=options.pictures_mb,
             progress=log,
             plot_process=plots,
         )
-    if not print_result(findings, page, seconds=time.perf_counter() - begun, verbose=options.verbose):
+    seconds = time.perf_counter() - begun
+    if options.product is not None:
+        dependable = options.product.show(folder)
+    else:
+        dependable = print_result(findings, page, seconds=seconds, verbose=options.verbose)
+    if not dependable:
         raise SystemExit(FAILED)
     return folder
 
@@ -265,6 +296,7 @@ def drafted_beside(
     *,
     within: Path = Path("out"),
     overwrite: bool = False,
+    edit: Callable[[str], str] | None = None,
 ) -> tuple[Path, Path]:
     """Draft the survey file of a folder of photographs, unless it is already beside the result.
 
@@ -275,6 +307,7 @@ def drafted_beside(
         pitch: pitch of a board or plate, mm; None to assume it.
         within: folder of the results.
         overwrite: whether a result of other photographs is replaced; the survey file never is.
+        edit: changes the text of a new draft; a file that exists stays as it is.
 
     Returns:
         The survey file and the result folder.
@@ -305,7 +338,8 @@ def drafted_beside(
         refuse_pitch(pitch, file)
         print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
         return file, out
-    write_draft(draft_folder(photographs, file, pitch, name), photographs, file)
+    draft = draft_folder(photographs, file, pitch, name)
+    write_draft(draft if edit is None else replace(draft, text=edit(draft.text)), photographs, file)
     return file, out
 
 

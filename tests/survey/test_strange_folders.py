@@ -168,6 +168,7 @@ PLANNED = (
 )
 COMMANDS: dict[str, Command] = {
     "adjust": (lambda f: ("adjust", observed(f)), ("out", "out/s", "out/.s.lock")),
+    "calibrate": (lambda f: ("calibrate", observed(f)), ("out", "out/s", "out/.s.lock")),
     "run": (
         lambda f: ("run", write_photograph_survey(f / "s", "s", photographs=3)),
         ("out", "out/s", "out/.s.lock"),

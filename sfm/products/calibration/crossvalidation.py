@@ -130,9 +130,8 @@ def _divisions(adjustment: Adjustment) -> Iterator[tuple[str, BoolArray]]:
     together = np.arange(m) if network.moment is None else network.moment
     _, group = np.unique(together, return_inverse=True)
     members = np.bincount(group)
-    # a camera without others at its moments is divided by itself
-    alone = members[group] == 1
-    family = np.where(alone, network.camera, -1)
+    # without rigs, each camera is divided by itself
+    family = np.full(m, -1) if (members > 1).any() else network.camera
     order = np.bincount(group, np.arange(m)) / members
     far = np.bincount(group, distance) / members
     outer = np.bincount(group, radius) / members

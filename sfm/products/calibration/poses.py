@@ -2,9 +2,10 @@
 
 Candidates are a grid of views of the object: tilted about both axes of the image and rolled or not, near and
 far as in the photographs so far, with the object in the middle, at the sides and in the corners of the
-format. A candidate shows at least the share of the object that every photograph so far shows, since a board
-without tags is read only as a whole. Its image points, with its own unknown pose eliminated, add to the
-information on interior orientation and object points:
+format. A candidate shows at least as many points as every photograph so far, since a board without tags is
+read only as a whole. They keep half the distance of their neighbours from the border, or the least distance
+at which a point was measured so far. The image points of a candidate, its own unknown pose eliminated, add to
+the information on interior orientation and object points:
 
     Qxx' = Qxx - Qxx A' (I + A Qxx A')^-1 A Qxx
 
@@ -22,6 +23,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.correlations import observed_part
@@ -144,7 +146,10 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
     middle = points.mean(axis=0)
     away = estimate.position[images] - middle
     distances = np.quantile(np.linalg.norm(away, axis=1), (0.0, 0.5, 1.0))
-    facing = _facing(points - middle, away)
+    facing = _facing(points - middle, away, estimate.rotation[images])
+    neighbour = cKDTree(points).query(points, k=2)[1][:, 1] if len(points) > 1 else np.zeros(1, dtype=int)
+    measured = seen.xy[of_camera]
+    least_px = float(np.minimum(measured, np.array(lens.size_px) - 1 - measured).min())
     width, height = lens.size_px
     places = [(x, y) for x, y in product(PLACES, PLACES)]
     tangents = tangents_from_pixel(lens, np.array(places) * (width, height) - 0.5)
@@ -155,26 +160,30 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
                 continue
             position = middle - rotation @ (distance * np.array([*tangent, -1.0]))
             xy = np.full((len(network.points), 2), np.nan)
-            xy[shown] = _seen_from(lens, position, rotation, points)
+            all_xy = _projected(lens, position, rotation, points)
+            apart = np.linalg.norm(all_xy - all_xy[neighbour], axis=1) / 2
+            border = np.minimum(all_xy, np.array(lens.size_px) - 1 - all_xy).min(axis=1)
+            inside = border >= np.minimum(apart, least_px)
+            xy[shown[inside]] = all_xy[inside]
             if np.isfinite(xy[:, 0]).sum() >= least:
                 yield Pose(position, rotation, (a, b), roll, place, float(distance), xy)
 
 
-def _seen_from(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the image points inside the format, px, NaN for the others, (n, 2)."""
+def _projected(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
+    """Return the image points, px, NaN behind the camera and beyond its last ray, (n, 2)."""
     UVW = (points - position) @ rotation
-    in_front = UVW[:, 2] < 0
-    depth = np.where(in_front, UVW[:, 2], np.nan)[:, None]
-    xy = pixel_from_tangents(camera, -UVW[:, :2] / depth)
-    inside = np.all((xy >= 0) & (xy <= np.array(camera.size_px) - 1), axis=1)
-    return np.where(inside[:, None], xy, np.nan)
+    depth = np.where(UVW[:, 2] < 0, UVW[:, 2], np.nan)[:, None]
+    return pixel_from_tangents(camera, -UVW[:, :2] / depth)
 
 
-def _facing(points: FloatArray, away: FloatArray) -> FloatArray:
-    """Return R of a camera before the object, along the normal of its plane and its longer side, (3, 3)."""
+def _facing(points: FloatArray, away: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Return R of a camera before the object, along the normal of its plane and its longer side, (3, 3).
+
+    The object is upright as in most photographs.
+    """
     _, _, axes = np.linalg.svd(points, full_matrices=False)
     z = axes[2] * (np.sign((away @ axes[2]).sum()) or 1.0)
-    x = axes[0]
+    x = axes[0] * (np.sign((rotations[:, :, 0] @ axes[0]).sum()) or 1.0)
     return np.column_stack([x, np.cross(z, x), z])
 
 

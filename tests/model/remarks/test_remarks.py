@@ -151,6 +151,7 @@ LIMITS: dict[
     "margin_not_calibrated": ("rms", 0.51, 1.0),
     "principal_point_far": ("share", 0.1, None),
     "pixels_distorted": ("share", 0.01, 0.05),
+    "halves_differ": ("times", 2.0, None),
     "windows_elsewhere": ("shift", 2.0, None),
     "photographs_differ": ("shift", 2.0, None),
     "windows_disagree": ("share", 0.3, 0.6),

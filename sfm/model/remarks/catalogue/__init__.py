@@ -25,6 +25,7 @@ SUBJECTS: Mapping[str, tuple[Kind, ...]] = MappingProxyType(
         "The adjustment": hypotheses.ADJUSTMENT,
         "Causes and assumptions": hypotheses.ROWS,
         "Cameras": cameras.ROWS,
+        "Calibrations": cameras.CALIBRATIONS,
         "Photographs": photographs.ROWS,
         "Points and image points": measuring.POINTS,
         "Datum and scale": given_values.DATUM,

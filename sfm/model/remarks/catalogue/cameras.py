@@ -155,3 +155,24 @@ ROWS = (
         "Set pixel_mm to two equal numbers, or free b1 (fx and fy).",
     ),
 )
+CALIBRATIONS = (
+    Kind(
+        "halves_differ",
+        # Difference over its prediction. Where errors are half as large again as stated, it is 1.5.
+        Grade("times", warning=2.0),
+        "Halves of the photographs give different cameras {camera} ({division}): {difference} RMS, {times} "
+        "times what chance explains ({p:<}).",
+        "zoom, focus or a lens that moved between the photographs, an object that changed its shape, a rig "
+        "that moved, or a camera model that does not suit the lens",
+        "Hold focus and zoom, and photograph anew; or free the parameters that the page names, or choose "
+        "another model. Until then, multiply the uncertainty of projection by {times}.",
+    ),
+    Kind(
+        "model_insufficient",
+        "warning",
+        "The model of camera {camera} is insufficient: residuals depend on the place in the format, by "
+        "{field} RMS ({p:<}), {times} times the uncertainty of projection.",
+        "distortion that the model cannot describe, or a sensor that is not flat",
+        "Free the parameters that the page names, or choose another model with --model.",
+    ),
+)

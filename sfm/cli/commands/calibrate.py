@@ -1,0 +1,180 @@
+"""The command `calibrate`: from photographs of a board, plate, tags or targets to a judged camera."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sfm.cli.survey_runs import (
+    SURVEY_FILE,
+    Jobs,
+    Out,
+    Overwrite,
+    Pitch,
+    RunOptions,
+    SurveyOrPhotographs,
+    drafted_beside,
+    refuse_pitch,
+    run_survey_file,
+)
+from sfm.model.errors import KolinearError
+
+if TYPE_CHECKING:
+    from sfm.judgement.survey_result import SurveyResult
+    from sfm.products.calibration.calibration import Calibration
+
+SHOWN = ("trust", "next")  # sections of the page that are printed
+SIGMA_ADDED = "  # ADDED: the image points contradict a true plate"
+
+
+def calibrate(
+    photographs: SurveyOrPhotographs,
+    out: Out = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            metavar="NAME",
+            help="Camera model of a drafted survey file.  [default: the one that the photographs favour]",
+        ),
+    ] = None,
+    distance: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--distance",
+            metavar="D",
+            help="Distance from the camera, in the unit of the survey, at which the uncertainty of "
+            "projection is stated; may be repeated. Infinity is always added.  [default: that of the object]",
+        ),
+    ] = None,
+    pitch: Pitch = None,
+    overwrite: Overwrite = False,
+    jobs: Jobs = None,
+) -> None:
+    """Calibrate the cameras of photographs, and judge the calibration.
+
+    The survey is run as by `kolinear run`. One more page in the folder of the result, calibration.html,
+    states whether the cameras can be trusted, where, what is wrong, and which photographs would help most;
+    calibration.json has the same for programs. Where a plate is not as given, its points are adjusted.
+
+    Exit code 0 with a dependable calibration, with or without remarks; 1 if it is not dependable, for the
+    reasons on the page, or a stage cannot go on; 2 if the input must be corrected.
+    """
+    distances = tuple(distance or ())
+    for value in distances:
+        if not value > 0:
+            raise KolinearError(f"--distance {value:g}, expected more than 0")
+    if model is not None:
+        _refuse_unknown(model)
+    survey_file, images = photographs, None
+    product = _Product(distances)
+    if photographs.is_dir() and (photographs / SURVEY_FILE).is_file():
+        survey_file = photographs / SURVEY_FILE
+        print(f"Running {survey_file}", file=sys.stderr)
+    elif photographs.is_dir():
+        images = photographs
+
+        def edit(text: str) -> str:
+            product.drafted = True
+            return _for_calibration(text, model)
+
+        survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite, edit=edit)
+        pitch = None
+    if survey_file.is_file():
+        refuse_pitch(pitch, survey_file)
+        if model is not None and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
+            raise KolinearError(
+                f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
+                "model in it, or remove it"
+            )
+    run_survey_file(
+        survey_file,
+        RunOptions(
+            images=images,
+            out=out,
+            jobs=jobs,
+            from_photographs=None if images is None else True,
+            overwrite=overwrite,
+            pictures_mb=15.0,
+            product=product,
+        ),
+    )
+
+
+def _refuse_unknown(model: str) -> None:
+    from sfm.model.distortion.models import MODELS
+
+    if model not in MODELS:
+        raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
+
+
+def _for_calibration(text: str, model: str | None) -> str:
+    """Return a drafted survey file without comparison, and with the model that is asked for."""
+    none = 'backend = "none"  # "colmap" adjusts with COLMAP too'
+    text = re.sub(r'^backend = ".*$', none, text, flags=re.M)
+    if model is not None:
+        text = re.sub(r"^free = .*\n", "", text, flags=re.M)  # the program chooses those of the model
+        text = re.sub(r'^model = ".*$', f'model = "{model}"', text, flags=re.M)
+    return text
+
+
+@dataclass
+class _Product:
+    """The calibration of a survey."""
+
+    distances: tuple[float, ...]
+    drafted: bool = False  # whether the survey file was drafted just now, and may be changed
+    calibrations: list[Calibration] = field(default_factory=list)
+
+    def revise(self, survey_file: Path, result: SurveyResult) -> bool:
+        """Free the points of a plate that is not as given, with the precision that the image points show."""
+        text = survey_file.read_text(encoding="utf-8")
+        shape = next((said for said in result.remarks if said.kind == "shape_of_control"), None)
+        if not self.drafted or shape is None or re.search(r"^plate_sigma", text, re.M):
+            return False
+        sigma = shape.number("sigma")
+        if not sigma > 0:
+            return False
+        row = f"plate_sigma = {sigma:.3g}"
+        added = re.sub(r"^(pitch = .*\n)", rf"\1{row}{SIGMA_ADDED}\n", text, count=1, flags=re.M)
+        if added == text:
+            return False
+        from sfm.files.whole_files import whole_file
+
+        with whole_file(survey_file, replaces=True) as part:
+            part.write_text(added, encoding="utf-8")
+        print(f"{survey_file}: {shape.text} {row} was added.", file=sys.stderr)
+        return True
+
+    def write(self, result: SurveyResult, folder: Path) -> None:
+        """Write the page of the calibration and its files."""
+        from sfm.products.calibration.calibration import calibrate as calibrated
+        from sfm.report.pages import page_of, texts_of
+
+        calibration = calibrated(result, self.distances)
+        self.calibrations.append(calibration)
+        for name, content in texts_of(page_of(calibration, folder=str(folder.name))).items():
+            (folder / name).write_text(content, encoding="utf-8", newline="")
+
+    def show(self, folder: Path) -> bool:
+        """Print the verdict and the figures of the cameras."""
+        from sfm.cli.console import print_verdict
+        from sfm.files.plain_text import as_plain
+        from sfm.products.calibration.page import page
+        from sfm.report.page import Heading, Table
+
+        declared = page(self.calibrations[-1], folder=str(folder))
+        print_verdict(declared.verdict)
+        for part in (part for section in declared.sections if section.key in SHOWN for part in section.parts):
+            if isinstance(part, Heading):
+                print(as_plain(part.text))
+            elif isinstance(part, Table):
+                print("".join(f"  {line}\n" for line in part.text.splitlines()), end="")
+        print(f"Report: {folder / 'report.html'}")
+        print(f"Calibration: {folder / declared.path}")
+        return declared.verdict.level != "bad"

@@ -1,0 +1,287 @@
+"""Calibration of cameras as a product: what a survey of photographs says about each of its cameras.
+
+For every adjusted camera: uncertainty of projection, the region in which it is known, what its model leaves
+over, leaner and wider models, differences between halves of the photographs, and the next poses. For the
+object: its shape from the image points alone, against the given one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm.adjustment.quality.correlations import observed_part
+from sfm.adjustment.result import Adjustment
+from sfm.judgement.calibrated_cameras import InteriorParameter, families, interior_parameters
+from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, free_network
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.distributions import level_of_single
+from sfm.model.errors import GeometryError
+from sfm.model.remarks.remark import Remark, kinds_of, remark
+from sfm.model.similarity import fit_similarity
+from sfm.products.calibration.crossvalidation import CrossValidation, cross_validate
+from sfm.products.calibration.models import Alternative, compare_models
+from sfm.products.calibration.poses import NextPoses, corners_of, next_poses
+from sfm.products.calibration.projection import ProjectionUncertainty, grid_of, projection_uncertainty
+from sfm.products.calibration.residual_field import ResidualField, residual_field
+
+# Sigma of projection over the smallest one, beyond which the camera counts as extrapolated: mrcal's picture
+# of a region, and three times the error is nine times the weight of a point.
+KNOWN_FACTOR = 3.0
+MIN_SHAPE = 4  # points of the object; three have the shape of any others but for their distances
+
+
+@dataclass(frozen=True)
+class CameraCalibration:
+    """What is known about one camera."""
+
+    camera: Camera
+    photographs: int
+    xy: FloatArray  # its accepted image points, px, (k, 2)
+    known: ProjectionUncertainty
+    near: float  # nearest, median and farthest distance of its image points, object unit
+    usual: float
+    far: float
+    parameters: tuple[InteriorParameter, ...]
+    field: ResidualField
+    alternatives: tuple[Alternative, ...]
+    demanded: tuple[str, ...]  # held parameters that the image points contradict
+    next: NextPoses
+
+    @property
+    def name(self) -> str:
+        """Name of the camera."""
+        return self.camera.name
+
+    @property
+    def middle(self) -> FloatArray:
+        """Middle of the format, px, (1, 2)."""
+        return (np.array([self.camera.size_px]) - 1) / 2
+
+    @property
+    def corners(self) -> FloatArray:
+        """Corners of the format, or the outermost places on its diagonals that have a ray, px, (4, 2)."""
+        return corners_of(self.camera)
+
+    @property
+    def degrees(self) -> tuple[float, float, float]:
+        """Angles of view along the rows, the columns and the diagonal, degrees; NaN beyond the last ray."""
+        width, height = np.array(self.camera.size_px) - 0.5
+        x, y = self.camera.principal_point_px - 0.5
+        ends = ((-0.5, y), (width, y)), ((x, -0.5), (x, height)), ((-0.5, -0.5), (width, height))
+        angles = []
+        for pair in ends:
+            uv = tangents_from_pixel(self.camera, np.array(pair))
+            rays = np.column_stack([uv, -np.ones(2)])
+            rays /= np.linalg.norm(rays, axis=1)[:, None]
+            angles.append(float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))))
+        return angles[0], angles[1], angles[2]
+
+    @property
+    def left_over(self) -> float:
+        """What the model leaves over, over the sigma of projection at infinity where the camera is known."""
+        xy, inside = self.known_region(np.inf)
+        sigma = self.known.sigma_at(xy[inside], np.inf)
+        return self.field.rms_px / float(np.sqrt((sigma**2).mean())) if len(sigma) else 0.0
+
+    def is_insufficient(self, level: float) -> bool:
+        """Return whether the residuals contradict the model, by more than the camera is known to.
+
+        Args:
+            level: probability of calling a model that fits insufficient.
+        """
+        return bool(self.field.whole < level and self.left_over >= 1)
+
+    def known_region(self, distance: float) -> tuple[FloatArray, BoolArray]:
+        """Return places of a grid over the format, px, (n, 2), and where the camera is known, (n,).
+
+        It is known between its image points, where sigma is at most KNOWN_FACTOR times the smallest one.
+
+        Args:
+            distance: object unit, or infinity.
+        """
+        xy = np.stack(np.meshgrid(*grid_of(self.camera)), axis=-1).reshape(-1, 2)
+        sigma = self.known.sigma_at(xy, distance)
+        inside = observed_part(self.xy, xy)[1] & np.isfinite(sigma)
+        if inside.any():
+            inside &= sigma <= KNOWN_FACTOR * float(sigma[inside].min())
+        return xy, inside
+
+
+@dataclass(frozen=True)
+class ObjectShape:
+    """Points of the object from the image points alone, fitted by a similarity to their given coordinates."""
+
+    points: IntArray  # indices in the network, (n,)
+    given: FloatArray  # coordinates, object unit, (n, 3)
+    difference: FloatArray  # found minus given, object unit, (n, 3)
+    sigma: FloatArray  # standard deviations of the found coordinates, object unit, (n, 3)
+
+    @property
+    def flat(self) -> bool:
+        """Whether the given points lie in a plane."""
+        size = np.linalg.svd(self.given - self.given.mean(axis=0), compute_uv=False)
+        return bool(size[2] < 1e-9 * size[0])
+
+    @property
+    def off_plane(self) -> tuple[FloatArray, FloatArray]:
+        """Differences across the plane of the given points and their sigmas, object unit, (n,) each."""
+        normal = np.linalg.svd(self.given - self.given.mean(axis=0))[2][2]
+        return self.difference @ normal, np.sqrt((self.sigma**2) @ normal**2)
+
+    @property
+    def significant(self) -> BoolArray:
+        """Which points differ by more than chance explains, by three standard deviations, (n,)."""
+        return np.asarray((np.abs(self.difference) > 3 * self.sigma).any(axis=1))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The calibrated cameras of a survey."""
+
+    result: SurveyResult
+    distances: tuple[float, ...]  # of the pictures and figures, object unit, the last one infinite
+    cameras: tuple[CameraCalibration, ...]
+    validation: CrossValidation
+    shape: ObjectShape | None  # None without given coordinates of the object
+    remarks: tuple[Remark, ...]  # of the survey, and on the calibration
+
+
+def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibration:
+    """Return what a survey says about its cameras.
+
+    Args:
+        result: result of the survey.
+        distances: distances of points from the camera, object unit; that of the object if not given. Infinity
+            is always one of them.
+
+    Raises:
+        GeometryError: a distance that is not positive, or no camera was adjusted.
+
+    Source: `sfm.products.calibration.projection` and the other modules of this room.
+    """
+    for distance in distances:
+        if not distance > 0:
+            raise GeometryError(f"distance {distance:g}, expected more than 0")
+    adjustment = result.adjustment
+    demanded = contradicted_parameters(adjustment)
+    cameras = tuple(
+        _camera_of(adjustment, k, demanded)
+        for k in _first_of_families(adjustment)
+        if adjustment.estimate.cameras[k].free.any()
+    )
+    if not cameras:
+        raise GeometryError(
+            f"survey {result.survey}: no camera was adjusted, so that nothing is calibrated; free its "
+            "parameters, or give more photographs"
+        )
+    finite = sorted({d for d in distances if np.isfinite(d)})
+    if not finite:
+        finite = [float(np.median([camera.usual for camera in cameras]))]
+    validation = cross_validate(adjustment)
+    remarks = (*result.remarks, *_remarks(adjustment, result, cameras, validation))
+    return Calibration(
+        result,
+        (*finite, np.inf),
+        cameras,
+        validation,
+        _shape_of(adjustment),
+        remarks,
+    )
+
+
+def _first_of_families(adjustment: Adjustment) -> tuple[int, ...]:
+    """Return the first camera of each family of cameras with common parameters."""
+    cameras = adjustment.estimate.cameras
+    return tuple(
+        next(k for k, camera in enumerate(cameras) if camera is first) for _, first in families(adjustment)
+    )
+
+
+def _camera_of(adjustment: Adjustment, k: int, demanded: Sequence[tuple[str, str]]) -> CameraCalibration:
+    """Return what is known about a camera."""
+    network, estimate = adjustment.network, adjustment.estimate
+    camera = estimate.cameras[k]
+    seen = network.image_points.select(~adjustment.rejected)
+    seen = seen.select(network.camera[seen.image] == k)
+    away = np.linalg.norm(estimate.points[seen.point] - estimate.position[seen.image], axis=1)
+    near, usual, far = np.quantile(away, (0.0, 0.5, 1.0))
+    owners = {camera.owner_of(s) for s in range(len(camera.names))}
+    return CameraCalibration(
+        camera,
+        len(np.unique(seen.image)),
+        seen.xy,
+        projection_uncertainty(adjustment, k),
+        float(near),
+        float(usual),
+        float(far),
+        tuple(parameter for parameter in interior_parameters(adjustment) if parameter.owner in owners),
+        residual_field(adjustment, k),
+        compare_models(adjustment, k),
+        tuple(name for owner, name in demanded if owner in owners),
+        next_poses(adjustment, k),
+    )
+
+
+def _remarks(
+    adjustment: Adjustment,
+    result: SurveyResult,
+    cameras: Sequence[CameraCalibration],
+    validation: CrossValidation,
+) -> Iterator[Remark]:
+    """Yield the remarks on halves that differ and on models that are insufficient."""
+    level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras)))
+    told = "distortion_not_described" in kinds_of(result.remarks)
+    for camera in cameras:
+        halves = validation.clearest(camera.name)
+        if halves is not None and halves.probability < level:
+            yield remark(
+                "halves_differ",
+                camera=camera.name,
+                division=halves.division,
+                difference=(halves.rms_px, "px"),
+                times=halves.ratio,
+                p=halves.probability,
+            )
+        if camera.is_insufficient(level) and not told:
+            yield remark(
+                "model_insufficient",
+                camera=camera.name,
+                field=(camera.field.rms_px, "px"),
+                times=camera.left_over,
+                p=camera.field.whole,
+            )
+
+
+def _shape_of(adjustment: Adjustment) -> ObjectShape | None:
+    """Return the shape of the object by its image points alone; None without given points to compare."""
+    given = adjustment.network.control.complete
+    if len(given) < MIN_SHAPE or adjustment.datum != "control":
+        return None
+    try:
+        free = free_network(adjustment)
+    except np.linalg.LinAlgError:
+        return None
+    if free is None or not free.converged or free.undetermined:
+        return None
+    place = {name: j for j, name in enumerate(free.network.points)}
+    rows = [(j, place[adjustment.network.points[j]]) for j in given.point.tolist()
+            if adjustment.network.points[j] in place]  # fmt: skip
+    index = np.array([j for j, _ in rows], dtype=np.int64)
+    found = np.array([k for _, k in rows], dtype=np.int64)
+    xyz = given.xyz[np.isin(given.point, index)]
+    known = np.isfinite(free.estimate.points[found]).all(axis=1)
+    if known.sum() < MIN_SHAPE:
+        return None
+    index, found, xyz = index[known], found[known], xyz[known]
+    try:
+        onto = fit_similarity(free.estimate.points[found], xyz)
+    except GeometryError:
+        return None
+    covariance = onto.scale**2 * onto.rotation @ free.covariance.points[found] @ onto.rotation.T
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    return ObjectShape(index, xyz, onto.apply(free.estimate.points[found]) - xyz, sigma)
