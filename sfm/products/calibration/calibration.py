@@ -81,20 +81,21 @@ class CameraCalibration:
             angles.append(float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))))
         return angles[0], angles[1], angles[2]
 
-    @property
-    def left_over(self) -> float:
-        """What the model leaves over, over the sigma of projection at infinity where the camera is known."""
-        xy, inside = self.known_region(np.inf)
-        sigma = self.known.sigma_at(xy[inside], np.inf)
-        return self.field.rms_px / float(np.sqrt((sigma**2).mean())) if len(sigma) else 0.0
-
     def is_insufficient(self, level: float) -> bool:
-        """Return whether the residuals contradict the model, by more than the camera is known to.
+        """Return whether the residuals contradict the model.
+
+        They depend on the place in the format by more than chance, and either by more than the camera is
+        known to far away, or a further parameter of the model explains them.
 
         Args:
             level: probability of calling a model that fits insufficient.
         """
-        return bool(self.field.whole < level and self.left_over >= 1)
+        if not self.field.whole < level:
+            return False
+        wider = any(alternative.added and alternative.borne for alternative in self.alternatives)
+        xy, inside = self.known_region(np.inf)
+        sigma = self.known.sigma_at(xy[inside], np.inf)
+        return wider or bool(self.field.rms_px >= np.sqrt((sigma**2).mean()))
 
     def known_region(self, distance: float) -> tuple[FloatArray, BoolArray]:
         """Return places of a grid over the format, px, (n, 2), and where the camera is known, (n,).
@@ -252,7 +253,6 @@ def _remarks(
                 "model_insufficient",
                 camera=camera.name,
                 field=(camera.field.rms_px, "px"),
-                times=camera.left_over,
                 p=camera.field.whole,
             )
 

@@ -143,7 +143,10 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
         degrees = [f"{angle:.1f}" if np.isfinite(angle) else "over 180" for angle in camera.degrees]
         x, y = camera.camera.principal_point_px
         rows: list[tuple[str, str]] = [
-            ("photographs", f"{camera.photographs} of {width} x {height} px, {len(camera.xy)} image points"),
+            (
+                "photographs",
+                f"{camera.photographs} of {width} x {height} px, {counted(len(camera.xy), 'image point')}",
+            ),
             ("model", f"{camera.camera.model}, adjusted: {', '.join(_free(camera)) or 'nothing'}"),
         ]
         for name, value, sigma in _focal(camera):
@@ -282,8 +285,8 @@ def _wrong(calibration: Calibration) -> Iterator[Part]:
     yield Note(
         "A parameter is needed if it raises ln of the likelihood by more than its price, which grows with "
         "the number of image points. The same rule chose a central or a fisheye lens in the draft. "
-        "Insufficient: mean residuals over the format are beyond chance, and beyond the uncertainty of "
-        "projection."
+        "Insufficient: mean residuals over the format are beyond chance, and a further parameter explains "
+        "them or they exceed the uncertainty of projection."
     )
     fields = [camera for camera in calibration.cameras if len(camera.field.mean)]
     if fields:

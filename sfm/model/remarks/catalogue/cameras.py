@@ -171,7 +171,7 @@ CALIBRATIONS = (
         "model_insufficient",
         "warning",
         "The model of camera {camera} is insufficient: residuals depend on the place in the format, by "
-        "{field} RMS ({p:<}), {times} times the uncertainty of projection.",
+        "{field} RMS ({p:<}).",
         "distortion that the model cannot describe, or a sensor that is not flat",
         "Free the parameters that the page names, or choose another model with --model.",
     ),

@@ -1,0 +1,119 @@
+"""The calibration of a survey: figures, remarks and page."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sfm
+from sfm.judgement.survey_result import SurveyResult
+from sfm.model.errors import GeometryError
+from sfm.model.remarks.remark import kinds_of, of_kind
+from sfm.products.calibration.calibration import Calibration, calibrate
+from sfm.products.calibration.page import page, verdict_of
+from sfm.report.pages import html, text
+from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board
+from tests.products.calibration.surveys import write_board_survey
+from tests.synthetic import seed_of
+
+
+def surveyed(folder: Path, board: SimulatedBoard, **more: str) -> SurveyResult:
+    return sfm.run_survey(sfm.read_survey(write_board_survey(folder / "s", board, **more)))
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """A calibration without model error."""
+    board = simulated_board(seed_of("calibration"), photographs=16)
+    return calibrate(surveyed(tmp_path_factory.mktemp("sound"), board), (300.0,))
+
+
+def test_a_sound_calibration_is_trusted(sound: Calibration) -> None:
+    verdict = verdict_of(sound)
+    assert verdict.level == "good", verdict.text
+    assert verdict.headline.startswith("Camera cam is known to 0.0")
+    (camera,) = sound.cameras
+    assert sound.distances == (300.0, np.inf)
+    assert not camera.is_insufficient(0.01) and not camera.demanded and len(camera.next.poses) == 3
+    assert not any(alternative.contradicts for alternative in camera.alternatives)
+    assert all(halves.ratio < 2 for halves in sound.validation.differences)
+    assert camera.degrees == pytest.approx((52.9, 41.0, 63.6), abs=1.5)
+
+
+def test_the_known_region_has_image_points(sound: Calibration) -> None:
+    (camera,) = sound.cameras
+    xy, inside = camera.known_region(np.inf)
+    assert 0.3 < inside.mean() < 1
+    assert not inside[(xy == 0).all(axis=1)].any() or (camera.xy < 30).all(axis=1).any()
+
+
+def test_the_page_answers_four_questions_and_has_the_same_for_programs(sound: Calibration) -> None:
+    declared = page(sound, folder="out/board")
+    titles = [section.title for section in declared.sections]
+    assert titles == ["Can I trust it?", "Where?", "What is wrong?", "What next?"]
+    words = text(declared)
+    assert "1205" in words or "120" in words  # f in px
+    assert "kolinear convert out/board OUT --to FORMAT" in words and "deg, diagonal" in words
+    assert "<h2" in html(declared)
+    stored = json.loads(declared.texts["calibration.json"])
+    (camera,) = stored["cameras"]
+    c = sound.cameras[0].camera.value("c")
+    assert camera["focal_px"]["f"]["value"] == pytest.approx(c / 0.005)
+    assert camera["projection"][1]["distance"] == "infinity" and len(camera["halves"]) == 4
+    assert len(camera["next_poses"]["poses"]) == 3 and not camera["residual_field"]["insufficient"]
+    assert camera["projection"][0]["middle_px"] < camera["projection"][1]["middle_px"]
+    rows = declared.texts["projection_uncertainty.csv"].splitlines()
+    assert rows[0] == "camera,distance,x_px,y_px,sigma_px,known" and len(rows) > 500
+
+
+def test_a_model_that_does_not_fit_is_called_insufficient(tmp_path: Path) -> None:
+    K3 = 4e-5 * (np.arange(len(CAMERA.names)) == CAMERA.names.index("K3"))
+    lens = CAMERA.with_parameters(CAMERA.parameters + K3)
+    board = simulated_board(seed_of("calibration"), photographs=16, camera=lens)
+    found = calibrate(surveyed(tmp_path, board))
+    (camera,) = found.cameras
+    assert camera.is_insufficient(0.001) and ("K3",) in {a.parameters for a in camera.alternatives if a.borne}
+    assert {"model_insufficient", "distortion_not_described"} & set(
+        kinds_of(found.remarks)
+    ) or camera.demanded
+    (differ,) = of_kind(found.remarks, "halves_differ")
+    assert differ.number("times") > 2 and differ.names("camera") == ("cam",)
+    assert verdict_of(found).level != "good"
+    assert "It is insufficient" in text(page(found))
+
+
+def test_a_bent_board_is_seen(tmp_path: Path) -> None:
+    found = calibrate(surveyed(tmp_path, simulated_board(seed_of("calibration"), photographs=16, bent=2.0)))
+    assert found.shape is not None and found.shape.flat
+    off, sigma = found.shape.off_plane
+    assert 0.8 < np.ptp(off) / 2.0 < 1.2 and np.median(sigma) < 0.2  # its sagitta
+    assert "Board" in text(page(found)) and "coordinates adjusted, given with" in text(page(found))
+    assert "given_scatter" in kinds_of(found.remarks) and verdict_of(found).level == "fair"
+
+
+def test_frontal_photographs_do_not_make_a_camera(tmp_path: Path) -> None:
+    board = simulated_board(seed_of("frontal"), tilt_deg=0.0, distance=(400.0, 400.0), photographs=8)
+    found = calibrate(surveyed(tmp_path, board))
+    assert verdict_of(found).level == "bad", verdict_of(found).text
+    assert "Do not trust this calibration" in verdict_of(found).headline
+    assert html(page(found))
+
+
+def test_three_photographs_are_not_divided(tmp_path: Path) -> None:
+    found = calibrate(surveyed(tmp_path, simulated_board(seed_of("three"), photographs=3)))
+    assert not found.validation.differences
+    assert "half of its photographs are" in text(page(found))
+
+
+def test_a_held_camera_is_no_calibration(tmp_path: Path) -> None:
+    result = surveyed(tmp_path, simulated_board(seed_of("held")), free="free = []")
+    with pytest.raises(GeometryError, match="no camera was adjusted, so that nothing is calibrated"):
+        calibrate(result)
+
+
+def test_distances_are_positive(sound: Calibration) -> None:
+    with pytest.raises(GeometryError, match="distance -1, expected more than 0"):
+        calibrate(sound.result, (-1.0,))
