@@ -166,12 +166,12 @@ class _Product:
         from sfm.cli.console import print_verdict
         from sfm.files.plain_text import as_plain
         from sfm.products.calibration.page import page
-        from sfm.report.page import Heading, Table
+        from sfm.report.page import Heading, Statement, Table
 
         declared = page(self.calibrations[-1], folder=str(folder))
         print_verdict(declared.verdict)
         for part in (part for section in declared.sections if section.key in SHOWN for part in section.parts):
-            if isinstance(part, Heading):
+            if isinstance(part, Heading | Statement):
                 print(as_plain(part.text))
             elif isinstance(part, Table):
                 print("".join(f"  {line}\n" for line in part.text.splitlines()), end="")

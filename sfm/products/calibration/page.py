@@ -62,7 +62,7 @@ from sfm.report.phrases import finer_unit_of, length_of, significant, with_expon
 HEADLINES: Mapping[Level, str] = {
     "good": "{found}.",
     "fair": "{found}. Read the remarks first.",
-    "bad": "Do not trust this calibration: {found}.",
+    "bad": "Do not trust this calibration.",
 }
 NAME = "calibration"
 LEVELS = 10  # contours, in equal ratios
@@ -150,7 +150,10 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
             ("model", f"{camera.camera.model}, adjusted: {', '.join(_free(camera)) or 'nothing'}"),
         ]
         for name, value, sigma in _focal(camera):
-            rows.append((f"{name}, focal length", " ± ".join(with_exponent(value, sigma)) + " px"))
+            stated = (
+                " ± ".join(with_exponent(value, sigma)) + " px" if np.isfinite(sigma) else "not determined"
+            )
+            rows.append((f"{name}, focal length", stated))
         c_mm = camera.camera.c_px * float(np.mean(camera.camera.pixel_mm))
         rows += [
             ("c, principal distance", f"{c_mm:.5g} mm with pixels of {_pixels(camera)}"),
@@ -159,14 +162,7 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
             ("image points", f"sigma0 {a.sigma0_px:.3f} px, RMS residual {a.rms_px:.3f} px"),
         ]
         for distance in reversed(calibration.distances):
-            middle, corner = _sigmas(camera, distance)
-            rows.append(
-                (
-                    f"projection at {_at(distance, unit)}",
-                    f"1 sigma {significant(middle)} px in the middle, {significant(corner)} px in the worst "
-                    f"corner; known in {100 * _share(camera, distance):.0f} % of the format",
-                )
-            )
+            rows.append((f"projection at {_at(distance, unit)}", _projection(camera, distance)))
         halves = calibration.validation.clearest(camera.name)
         if halves is not None:
             rows.append(
@@ -184,6 +180,16 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
         "predicts it, one standard deviation per coordinate. The point is fixed to the object through each "
         "photograph, so that what poses absorb does not count. It is true as far as the model fits; see what "
         f"is wrong. Known: between image points, with a sigma of at most {KNOWN_FACTOR:g} times the best."
+    )
+
+
+def _projection(camera: CameraCalibration, distance: float) -> str:
+    middle, corner = _sigmas(camera, distance)
+    if not np.isfinite(corner):
+        return "not determined"
+    return (
+        f"1 sigma {significant(middle)} px in the middle, {significant(corner)} px in the worst corner; "
+        f"known in {100 * _share(camera, distance):.0f} % of the format"
     )
 
 
@@ -484,6 +490,8 @@ def _next(calibration: Calibration, folder: str) -> Iterator[Part]:
             f"Worst corner now: {significant(further.before)} px (1 sigma, far points). Of all views of a "
             "grid of tilts, distances and places, these lower it most. Keep focus and zoom."
         )
+    if verdict_of(calibration).level == "bad":
+        return
     yield Heading("Use it")
     yield facts(
         [

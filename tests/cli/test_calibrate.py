@@ -1,0 +1,67 @@
+"""The command `calibrate`: from a folder of photographs of a board to a judged camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.commands import kolinear, refused
+from tests.plates import BOARD, PIXEL_MM, TRUTH, plate_pictures
+from tests.products.calibration.boards import simulated_board
+from tests.products.calibration.surveys import write_board_survey
+from tests.synthetic import seed_of
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("calibrate") / "board"
+    folder.mkdir()
+    for k, picture in enumerate(plate_pictures(BOARD, seed_of("calibrate"), 8)):
+        cv2.imwrite(str(folder / f"photo {k}.png"), picture, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return folder
+
+
+def test_a_folder_of_a_board_becomes_a_judged_camera(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert kolinear("calibrate", photographs, "--out", out, "--distance", 200, "--jobs", 1) == 0
+    said = capsys.readouterr().out
+    assert "projection at infinity" in said and "Next 3 photographs" in said
+    assert f"Calibration: {out / 'calibration.html'}" in said
+    stored = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    (camera,) = stored["cameras"]
+    f = camera["focal_px"]["f"]
+    assert abs(f["value"] - TRUTH["c"] / PIXEL_MM) < 5 * f["sigma"] + 0.05
+    assert [row["distance"] for row in camera["projection"]] == [200, "infinity"]
+    listed = (out / "manifest.json").read_text(encoding="utf-8")
+    assert all(f'"{name}"' in listed for name in ("calibration.html", "calibration.json", "report.html"))
+    text = (tmp_path / "out.toml").read_text(encoding="utf-8")
+    assert 'backend = "none"' in text
+    assert kolinear("calibrate", photographs, "--out", out, "--model", "opencv") == 2
+    assert "--model opencv is for drafting a survey file, but this one exists" in capsys.readouterr().err
+
+
+def test_the_model_of_a_draft_may_be_given(photographs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert kolinear("calibrate", photographs, "--out", out, "--model", "opencv", "--jobs", 1) == 0
+    (camera,) = json.loads((out / "calibration.json").read_text(encoding="utf-8"))["cameras"]
+    assert camera["model"] == "opencv" and set(camera["focal_px"]) == {"fx", "fy"}
+
+
+def test_wrong_options_are_refused_before_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--model 'pinehole', expected one of" in refused(
+        capsys, "calibrate", tmp_path, "--model", "pinehole"
+    )
+    assert "--distance -1, expected more than 0" in refused(capsys, "calibrate", tmp_path, "--distance", -1)
+
+
+def test_a_survey_file_is_calibrated_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = write_board_survey(tmp_path / "s", simulated_board(seed_of("command"), photographs=10))
+    before = path.read_bytes()
+    assert kolinear("calibrate", path) == 0
+    assert (tmp_path / "out" / "board" / "calibration.html").is_file() and path.read_bytes() == before
