@@ -9,7 +9,7 @@ import numpy as np
 from sfm.model.camera import Camera, camera_from_values, project
 from sfm.model.conventions import FloatArray
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network
+from sfm.model.network import ImagePoints, Network, rows_of
 
 FREE = ("c", "x0", "y0", "K1", "K2", "P1", "P2")
 LENS = (("x0", 0.05), ("y0", -0.03), ("K1", -2e-3), ("K2", 2e-5), ("P1", 5e-5))
@@ -94,3 +94,14 @@ def simulated_board(
         network = network.with_control(names, board_points(), 0.0)
     truth = Estimate((camera,), np.array(position), np.array(rotation), points)
     return SimulatedBoard(network, truth)
+
+
+def zoomed(board: SimulatedBoard) -> SimulatedBoard:
+    """Return the photographs, the second half of which has a c that is 0.3 % larger."""
+    seen, truth = board.network.image_points, board.truth
+    xy, camera = seen.xy.copy(), truth.cameras[0]
+    longer = camera.with_parameters(camera.parameters * (1 + 0.003 * (np.arange(len(camera.names)) == 0)))
+    for i, rows in enumerate(rows_of(seen.image, len(board.network.images))):
+        if i >= len(board.network.images) // 2:
+            xy[rows] = project(longer, truth.position[i], truth.rotation[i], truth.points[seen.point[rows]])
+    return replace(board, network=replace(board.network, image_points=replace(seen, xy=xy)))

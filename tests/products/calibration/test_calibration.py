@@ -15,7 +15,7 @@ from sfm.model.remarks.remark import kinds_of, of_kind
 from sfm.products.calibration.calibration import Calibration, calibrate
 from sfm.products.calibration.page import page, verdict_of
 from sfm.report.pages import html, text
-from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board
+from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board, zoomed
 from tests.products.calibration.surveys import write_board_survey
 from tests.synthetic import seed_of
 
@@ -101,6 +101,14 @@ def test_frontal_photographs_do_not_make_a_camera(tmp_path: Path) -> None:
     assert verdict_of(found).headline == "Do not trust this calibration."
     words = text(page(found))
     assert html(page(found)) and "not determined" in words and "Use it" not in words
+
+
+def test_a_zoomed_camera_is_named(tmp_path: Path) -> None:
+    found = calibrate(surveyed(tmp_path, zoomed(simulated_board(seed_of("zoomed"), photographs=16))))
+    (differ,) = of_kind(found.remarks, "halves_differ")
+    assert differ.names("division") == ("first and last photographs",) and differ.number("times") > 2
+    assert verdict_of(found).level != "good"
+    assert any("camera" in line.text and line.severity != "note" for line in verdict_of(found).lines)
 
 
 def test_three_photographs_are_not_divided(tmp_path: Path) -> None:

@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 import sfm
-from sfm.model.camera import project
-from sfm.model.estimate import Estimate
-from sfm.model.network import Network, rows_of
 from sfm.products.calibration.crossvalidation import cross_validate
-from tests.products.calibration.boards import CAMERA, SIGMA_PX, simulated_board
+from tests.products.calibration.boards import CAMERA, simulated_board, zoomed
 from tests.synthetic import seed_of
 
 SIMULATIONS, LENS_K3 = 20, 1e-5
@@ -28,9 +25,9 @@ def ratios(fixed: bool, simulations: int, change: str = "") -> dict[str, list[fl
             K3 = CAMERA.names.index("K3")
             lens = CAMERA.with_parameters(CAMERA.parameters + LENS_K3 * (np.arange(len(CAMERA.names)) == K3))
         board = simulated_board(rng, photographs=16, camera=lens, fixed=fixed)
-        network = board.noisy(rng)
         if change == "zoom":
-            network = zoomed(network, board.truth, rng)
+            board = zoomed(board)
+        network = board.noisy(rng)
         start = replace(board.truth, cameras=(CAMERA,))
         a = sfm.adjust(network, start, datum="control" if fixed else "free", reject="none")
         validated = cross_validate(a)
@@ -39,19 +36,6 @@ def ratios(fixed: bool, simulations: int, change: str = "") -> dict[str, list[fl
             assert halves.photographs == (8, 8) and halves.camera == "cam" and halves.dof <= len(CAMERA.free)
             found.setdefault(halves.division, []).append(halves.ratio)
     return found
-
-
-def zoomed(network: Network, truth: Estimate, rng: np.random.Generator) -> Network:
-    """Return the network whose last photographs have a c that is 0.3 % larger."""
-    xy = network.image_points.xy.copy()
-    camera = truth.cameras[0]
-    longer = camera.with_parameters(camera.parameters * (1 + 0.003 * (np.arange(len(camera.names)) == 0)))
-    for i, rows in enumerate(rows_of(network.image_points.image, len(network.images))):
-        if i >= len(network.images) // 2:
-            points = truth.points[network.image_points.point[rows]]
-            true = project(longer, truth.position[i], truth.rotation[i], points)
-            xy[rows] = true + SIGMA_PX * rng.standard_normal(true.shape)
-    return replace(network, image_points=replace(network.image_points, xy=xy))
 
 
 @pytest.mark.parametrize("fixed", [True, False], ids=["fixed board", "free board"])
