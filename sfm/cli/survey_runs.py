@@ -123,8 +123,8 @@ class SurveyProduct(Protocol):
     def revise(self, survey_file: Path, result: SurveyResult) -> bool:
         """Return whether the survey file was changed because of a result, so that it is run once more."""
 
-    def write(self, result: SurveyResult, folder: Path) -> None:
-        """Write further files into the folder of the result, which is not complete yet."""
+    def write(self, result: SurveyResult, part: Path, folder: Path) -> None:
+        """Write further files into the folder of the result, which is complete later and named otherwise."""
 
     def show(self, folder: Path) -> bool:
         """Print the product in place of the summary; return whether the result is dependable."""
@@ -255,7 +255,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
 
         def finish(part: Path) -> None:
             if options.product is not None:
-                options.product.write(findings.result, part)
+                options.product.write(findings.result, part, folder)
             log.close_into(part, findings)
 
         page = write_result(

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 
 import cv2
 import pytest
 
+from sfm.cli.commands.calibrate import _for_calibration
 from tests.commands import kolinear, refused
+from tests.places import SHARED
 from tests.plates import BOARD, PIXEL_MM, TRUTH, plate_pictures
 from tests.products.calibration.boards import simulated_board
 from tests.products.calibration.surveys import write_board_survey
 from tests.synthetic import seed_of
+
+STEREO, CAMCAL = SHARED / "data" / "stereo-chessboard" / "images", SHARED / "data" / "camcal" / "images"
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +37,7 @@ def test_a_folder_of_a_board_becomes_a_judged_camera(
     said = capsys.readouterr().out
     assert "projection at infinity" in said and "Next 3 photographs" in said
     assert f"Calibration: {out / 'calibration.html'}" in said
+    assert f"kolinear convert {out} OUT --to FORMAT" in (out / "calibration.html").read_text(encoding="utf-8")
     stored = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
     (camera,) = stored["cameras"]
     f = camera["focal_px"]["f"]
@@ -65,3 +71,37 @@ def test_a_survey_file_is_calibrated_too(tmp_path: Path, monkeypatch: pytest.Mon
     before = path.read_bytes()
     assert kolinear("calibrate", path) == 0
     assert (tmp_path / "out" / "board" / "calibration.html").is_file() and path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "line", ['model = "brown"', '# model = "brown"  # without it: what', 'model = "opencv_fisheye"  # so']
+)
+def test_a_model_replaces_that_of_the_draft(line: str) -> None:
+    text = f'[[camera]]\n{line}\nfree = ["c", "x0"]\n[compare]\nbackend = "colmap"  # or none\n'
+    changed = _for_calibration(text, "full_opencv")
+    assert tomllib.loads(changed)["camera"] == [{"model": "full_opencv"}]
+    assert tomllib.loads(changed)["compare"] == {"backend": "none"}
+    assert "free" in _for_calibration(text, None) and line in _for_calibration(text, None)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not STEREO.is_dir(), reason="no photographs of the stereo pair here")
+def test_a_print_that_is_not_flat_is_adjusted(tmp_path: Path) -> None:
+    out = tmp_path / "stereo"
+    assert kolinear("calibrate", STEREO, "--out", out, "--jobs", 1) == 0
+    assert "plate_sigma = 0.0" in (tmp_path / "stereo.toml").read_text(encoding="utf-8")
+    stored = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    left, right = stored["cameras"]
+    assert left["sigma0_px"] < 0.09 and 0.2 < stored["object_shape"]["largest_off_plane"] < 0.35
+    assert left["projection"][0]["middle_px"] < left["projection"][1]["middle_px"] / 3
+    assert {"halves_differ"} <= {one["kind"] for one in stored["verdict"]["remarks"]}
+    assert max(halves["ratio"] for halves in right["halves"]) > 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CAMCAL.is_dir(), reason="no photographs of camcal here")
+def test_the_camera_of_camcal_changed_between_its_photographs(tmp_path: Path) -> None:
+    out = tmp_path / "camcal"
+    assert kolinear("calibrate", CAMCAL, "--out", out, "--jobs", 1) == 0
+    (camera,) = json.loads((out / "calibration.json").read_text(encoding="utf-8"))["cameras"]
+    assert max(halves["ratio"] for halves in camera["halves"]) > 5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,7 +26,7 @@ from sfm.model.errors import KolinearError
 
 if TYPE_CHECKING:
     from sfm.judgement.survey_result import SurveyResult
-    from sfm.products.calibration.calibration import Calibration
+    from sfm.report.page import Page
 
 SHOWN = ("trust", "next")  # sections of the page that are printed
 SIGMA_ADDED = "  # ADDED: the image points contradict a true plate"
@@ -119,7 +119,7 @@ def _for_calibration(text: str, model: str | None) -> str:
     text = re.sub(r'^backend = ".*$', none, text, flags=re.M)
     if model is not None:
         text = re.sub(r"^free = .*\n", "", text, flags=re.M)  # the program chooses those of the model
-        text = re.sub(r'^model = ".*$', f'model = "{model}"', text, flags=re.M)
+        text = re.sub(r'^(?:# )?model = ".*$', f'model = "{model}"', text, flags=re.M)
     return text
 
 
@@ -129,7 +129,7 @@ class _Product:
 
     distances: tuple[float, ...]
     drafted: bool = False  # whether the survey file was drafted just now, and may be changed
-    calibrations: list[Calibration] = field(default_factory=list)
+    page: Page | None = None  # once it is written
 
     def revise(self, survey_file: Path, result: SurveyResult) -> bool:
         """Free the points of a plate that is not as given, with the precision that the image points show."""
@@ -151,24 +151,23 @@ class _Product:
         print(f"{survey_file}: {shape.text} {row} was added.", file=sys.stderr)
         return True
 
-    def write(self, result: SurveyResult, folder: Path) -> None:
+    def write(self, result: SurveyResult, part: Path, folder: Path) -> None:
         """Write the page of the calibration and its files."""
         from sfm.products.calibration.calibration import calibrate as calibrated
         from sfm.report.pages import page_of, texts_of
 
-        calibration = calibrated(result, self.distances)
-        self.calibrations.append(calibration)
-        for name, content in texts_of(page_of(calibration, folder=str(folder.name))).items():
-            (folder / name).write_text(content, encoding="utf-8", newline="")
+        self.page = page_of(calibrated(result, self.distances), folder=str(folder))
+        for name, content in texts_of(self.page).items():
+            (part / name).write_text(content, encoding="utf-8", newline="")
 
     def show(self, folder: Path) -> bool:
         """Print the verdict and the figures of the cameras."""
         from sfm.cli.console import print_verdict
         from sfm.files.plain_text import as_plain
-        from sfm.products.calibration.page import page
         from sfm.report.page import Heading, Statement, Table
 
-        declared = page(self.calibrations[-1], folder=str(folder))
+        declared = self.page
+        assert declared is not None
         print_verdict(declared.verdict)
         for part in (part for section in declared.sections if section.key in SHOWN for part in section.parts):
             if isinstance(part, Heading | Statement):
