@@ -56,7 +56,7 @@ def calibrate(
     overwrite: Overwrite = False,
     jobs: Jobs = None,
 ) -> None:
-    """Calibrate the cameras of photographs, and judge the calibration.
+    """Calibrate cameras from photographs, and judge the result.
 
     The survey is run as by `kolinear run`. One more page in the folder of the result, calibration.html,
     states whether the cameras can be trusted, where, what is wrong, and which photographs would help most;
