@@ -9,7 +9,7 @@ Source: `sfm.judgement.model_choice`; Kass and Raftery (1995), J. Am. Stat. Asso
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,20 +68,22 @@ def compare_models(adjustment: Adjustment, camera: int = 0) -> tuple[Alternative
     if not present.free.any():
         return ()
     network = adjustment.network
-    here = network.camera[network.image_points.image[~adjustment.rejected]] == camera
+    owner = network.camera[network.image_points.image[~adjustment.rejected]]
     others = list(_alternatives(present))
     search = float(np.log(max(len(others), 1) / adjustment.levels.family))
-    own = _squares(adjustment, camera, present.free)
+    none = np.zeros_like(present.free)
+    own = _squares(adjustment, camera, none)
     compared = []
     for added, changed in others:
-        lean, wide = own, _squares(adjustment, camera, present.free ^ changed)
+        lean, wide = own, _squares(adjustment, camera, changed)
         if not added:
             lean, wide = wide, own
         gain = float("nan")
         if lean is not None and wide is not None and wide[0] > 0:
             gain = wide[1] / 2 * float(np.log(lean[0] / wide[0]))
         names = tuple(name for name, new in zip(present.names, changed, strict=True) if new)
-        price = price_of(len(names), int(here.sum()), search if added else 0.0)
+        seen = int(np.isin(owner, _sharing(adjustment.estimate.cameras, camera, changed)).sum())
+        price = price_of(len(names), seen, search if added else 0.0)
         compared.append(Alternative(present.name, added, names, gain, price))
     return tuple(compared)
 
@@ -97,12 +99,17 @@ def _alternatives(camera: Camera) -> Iterator[tuple[bool, BoolArray]]:
                 yield added, np.isin(np.arange(len(camera.names)), chosen)
 
 
-def _squares(adjustment: Adjustment, camera: int, free: BoolArray) -> tuple[float, int] | None:
-    """Return v'Pv and redundancy with other free parameters; None without a solution."""
+def _squares(adjustment: Adjustment, camera: int, changed: BoolArray) -> tuple[float, int] | None:
+    """Return v'Pv and redundancy with some parameters free in place of held, or held at 0; None if it fails.
+
+    They change for all cameras that share them with the camera.
+    """
     network, estimate, kept = adjustment.network, adjustment.estimate, ~adjustment.rejected
     cameras = list(estimate.cameras)
-    values = np.where(free | ~cameras[camera].free, cameras[camera].parameters, 0.0)
-    cameras[camera] = replace(cameras[camera], free=free, parameters=values)
+    for k in _sharing(estimate.cameras, camera, changed):
+        other = cameras[k]
+        values = np.where(changed & other.free, 0.0, other.parameters)
+        cameras[k] = replace(other, free=other.free ^ changed, parameters=values)
     try:
         adjusted = adjust(
             replace(network, image_points=network.image_points.select(kept)),
@@ -115,3 +122,14 @@ def _squares(adjustment: Adjustment, camera: int, free: BoolArray) -> tuple[floa
     except (GeometryError, np.linalg.LinAlgError):
         return None
     return (adjusted.vPv, adjusted.redundancy) if adjusted.converged else None
+
+
+def _sharing(cameras: Sequence[Camera], camera: int, changed: BoolArray) -> list[int]:
+    """Return the indices of a camera and of those that share the changed parameters with it."""
+    present, parameters = cameras[camera], np.flatnonzero(changed).tolist()
+    groups = [present.group_of(s) for s in parameters]
+
+    def shares(other: Camera) -> bool:
+        return other.model == present.model and [other.group_of(s) for s in parameters] == groups
+
+    return [k for k, other in enumerate(cameras) if k == camera or (all(groups) and shares(other))]

@@ -16,7 +16,7 @@ from sfm.products.calibration.calibration import Calibration, calibrate
 from sfm.products.calibration.page import page, verdict_of
 from sfm.report.pages import html, text
 from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board, zoomed
-from tests.products.calibration.surveys import write_board_survey
+from tests.products.calibration.surveys import ALL, write_board_survey
 from tests.synthetic import seed_of
 
 
@@ -126,3 +126,13 @@ def test_a_held_camera_is_no_calibration(tmp_path: Path) -> None:
 def test_distances_are_positive(sound: Calibration) -> None:
     with pytest.raises(GeometryError, match="distance -1, expected more than 0"):
         calibrate(sound.result, (-1.0,))
+
+
+def test_photographs_with_a_c_of_their_own_share_a_model(tmp_path: Path) -> None:
+    board = zoomed(simulated_board(seed_of("zoomed"), photographs=16))
+    found = calibrate(surveyed(tmp_path, board, free=f'{ALL}\nper_photograph = ["c"]'))
+    assert verdict_of(found).level == "good", verdict_of(found).text
+    (camera,) = found.cameras
+    needed = {alternative.parameters: alternative.borne for alternative in camera.alternatives}
+    assert needed["K2",] and not needed["K3",]
+    assert min(alternative.gain for alternative in camera.alternatives) > -0.01  # wider models fit as well
