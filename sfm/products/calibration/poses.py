@@ -10,7 +10,7 @@ the information on interior orientation and object points:
     Qxx' = Qxx - Qxx A' (I + A Qxx A')^-1 A Qxx
 
 for the whitened derivatives A. The candidate that lowers the largest sigma of projection in the corners most
-is taken, and the next one is sought with it.
+is taken, and the next one is sought with it among the others.
 
 Source: Foerstner, Wrobel (2016), sec. 4.2.7 (update of a covariance); Fedorov (1972), Theory of Optimal
 Experiments (greedy design); Fraser (1997), ISPRS J. Photogramm. Remote Sens. 52(4) (views of a calibration).
@@ -256,11 +256,12 @@ def _chosen(
     sigma = adjustment.sigma0 * adjustment.usual_px
     rows = [_information(adjustment, lens, view, sample, known) / sigma for view in views]
     taken: list[Pose] = []
+    views = list(views)
     for _ in range(min(count, len(views))):
         scores = [_worst(effect, Q, A, f) for A in rows]
         best = int(np.argmin(scores))
-        Q = _updated(Q, rows[best])
-        taken.append(views[best])
+        Q = _updated(Q, rows.pop(best))
+        taken.append(views.pop(best))
     return taken
 
 

@@ -57,6 +57,7 @@ def test_each_pose_helps_and_shows_the_object() -> None:
     assert further.camera == "cam" and len(further.poses) == 3
     assert (np.diff([further.before, *further.after]) < 0).all()
     least = np.bincount(a.network.image_points.image).min()
+    assert len({(*pose.position, *pose.rotation.ravel()) for pose in further.poses}) == 3
     for pose in further.poses:
         assert np.isfinite(pose.xy[:, 0]).sum() >= least
         assert np.allclose(pose.rotation @ pose.rotation.T, np.eye(3))
