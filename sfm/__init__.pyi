@@ -22,6 +22,7 @@ from sfm.model.solution import Solution as Solution
 from sfm.orientation.incremental.sequence import OrientSettings as OrientSettings
 from sfm.orientation.incremental.sequence import orient as orient
 from sfm.photographs.reading import read_photograph as read_photograph
+from sfm.products import calibration as calibration
 from sfm.products import epochs as epochs
 from sfm.products import geometry as geometry
 from sfm.products import planning as planning

@@ -17,6 +17,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.judgement.calibrated_cameras import InteriorParameter, families, interior_parameters
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, free_network
 from sfm.judgement.survey_result import SurveyResult
+from sfm.model.arguments import checked_arguments
 from sfm.model.camera import Camera, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import level_of_single
@@ -152,6 +153,7 @@ class Calibration:
     remarks: tuple[Remark, ...]  # of the survey, and on the calibration
 
 
+@checked_arguments()
 def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibration:
     """Return what a survey says about its cameras.
 

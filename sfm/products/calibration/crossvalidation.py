@@ -22,6 +22,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
+from sfm.model.arguments import checked_arguments
 from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_sf
@@ -86,6 +87,7 @@ class CrossValidation:
         return min(self.of_camera(camera), key=lambda halves: halves.probability, default=None)
 
 
+@checked_arguments()
 def cross_validate(adjustment: Adjustment) -> CrossValidation:
     """Return the differences of the cameras of an adjustment between halves of its photographs.
 
@@ -95,9 +97,11 @@ def cross_validate(adjustment: Adjustment) -> CrossValidation:
         adjustment: finished, with its covariance. Rejected image points take no part.
 
     Example:
-        >>> from sfm.products.calibration.crossvalidation import cross_validate
-        >>> cross_validate(result.adjustment).differences
-        ()
+        >>> from sfm.products.calibration import cross_validate
+        >>> {halves.division for halves in cross_validate(result.adjustment).differences} >= {
+        ...     "near and far photographs"
+        ... }
+        True
     """
     differences: list[HalvesDifference] = []
     untested: list[tuple[str, str]] = []

@@ -29,6 +29,7 @@ from sfm.adjustment.covariance import marginal_of
 from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
+from sfm.model.arguments import checked_arguments
 from sfm.model.camera import (
     Camera,
     parameter_jacobian,
@@ -77,6 +78,7 @@ class NextPoses:
     after: tuple[float, ...]  # with the first pose, with the first two, and so on, px
 
 
+@checked_arguments()
 def next_poses(adjustment: Adjustment, camera: int = 0, count: int = 3) -> NextPoses:
     """Return the poses of a camera that lower the sigma of projection of its worst corner most.
 
@@ -86,7 +88,7 @@ def next_poses(adjustment: Adjustment, camera: int = 0, count: int = 3) -> NextP
         count: number of poses.
 
     Example:
-        >>> from sfm.products.calibration.poses import next_poses
+        >>> from sfm.products.calibration import next_poses
         >>> further = next_poses(result.adjustment, count=1)
         >>> len(further.poses), further.after[0] < further.before
         (1, True)

@@ -121,7 +121,7 @@ def projection_uncertainty(adjustment: Adjustment, camera: str | int = 0) -> Pro
 
     Example:
         >>> import numpy as np
-        >>> from sfm.products.calibration.projection import projection_uncertainty
+        >>> from sfm.products.calibration import projection_uncertainty
         >>> known = projection_uncertainty(result.adjustment)
         >>> known.covariance_at(np.array([[100.0, 100.0]]), np.inf).shape
         (1, 2, 2)
