@@ -10,6 +10,8 @@ interior orientation. Its shift is linear in the mean motion of the photographs 
 so their joint covariance gives its covariance. At an infinite distance only the rotations count.
 
 A parameter that the pose absorbs, such as the principal point by a rotation, thus adds no uncertainty.
+Neither do motions and scale of the object as a whole, unless it is held: given points with a standard
+deviation would turn it by their errors, and more the worse they are given.
 
 Source: Kogan (2021), mrcal documentation, "Projection uncertainty", which states this definition for boards
 that move in front of a camera; Foerstner, Wrobel (2016), sec. 2.7 (propagation of covariances).
@@ -107,8 +109,8 @@ def grid_of(camera: Camera) -> tuple[FloatArray, FloatArray]:
 def projection_uncertainty(adjustment: Adjustment, camera: str | int = 0) -> ProjectionUncertainty:
     """Return the uncertainty of projection of a camera of an adjustment.
 
-    In an adjustment without control, the object is what its points are in the mean: the datum is that of
-    inner constraints on all points.
+    The object is what its points are in the mean: the datum is that of inner constraints on all points, or on
+    the given ones if all of them have standard deviations. Given points that are held are the object.
 
     Args:
         adjustment: finished, with its covariance.
@@ -145,14 +147,46 @@ def projection_uncertainty(adjustment: Adjustment, camera: str | int = 0) -> Pro
         unknowns, place = np.unique(
             np.concatenate([columns.ravel(), layout.interior_column[k]]), return_inverse=True
         )
-        joint = marginal.joint(unknowns, np.zeros(0, dtype=np.int64))
+        points = _weighted_points(adjustment)
+        joint = marginal.joint(unknowns, points)
     motion = np.zeros((len(images), 6, 6))
     motion[:, :3, :3] = -np.swapaxes(adjustment.estimate.rotation[images], 1, 2)
     motion[:, 3:, 3:] = np.eye(3)
     by_unknowns = (motion @ by / len(images)).transpose(1, 0, 2).reshape(6, -1)
-    A = np.zeros((6 + len(layout.interior_column[k]), len(unknowns)))
+    A = np.zeros((6 + len(layout.interior_column[k]), len(joint)))
     for part in range(6):
         np.add.at(A[part], place[: columns.size], by_unknowns[part])
     A[6 + np.arange(len(A) - 6), place[columns.size :]] = 1.0
+    A[:6, len(unknowns) :] = -_motion_with_object(adjustment, images, points)
     adjusted = np.asarray(layout.interior_free[k])
     return ProjectionUncertainty(cameras[k], adjusted, A @ joint @ A.T)
+
+
+def _weighted_points(adjustment: Adjustment) -> IntArray:
+    """Return the measured points that are given, (p,); none if some of them have no standard deviation."""
+    given, seen = adjustment.network.control.complete, adjustment.network.image_points
+    points = given.point[np.isin(given.point, seen.point[~adjustment.rejected])]
+    held = not (np.diagonal(given.covariance, axis1=1, axis2=2) > 0).all()
+    return points[:0] if adjustment.datum != "control" or held or len(points) < 3 else points
+
+
+def _motion_with_object(adjustment: Adjustment, images: IntArray, points: IntArray) -> FloatArray:
+    """Return the derivatives of the mean motion of photographs by points that carry the object, (6, 3 p).
+
+    A similarity fitted to the shifts of the points moves the photographs with them.
+    """
+    if not len(points):
+        return np.zeros((6, 0))
+    estimate = adjustment.estimate
+    middle = estimate.points[points].mean(axis=0)
+
+    def by_similarity(places: FloatArray) -> FloatArray:  # translation, rotation, scale
+        away = places - middle
+        shift = np.tile(np.eye(3), (len(away), 1, 1))
+        return np.concatenate([shift, -skew(away), away[:, :, None]], axis=2)
+
+    into_image = np.swapaxes(estimate.rotation[images], 1, 2)
+    turn = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 1))])
+    moved = -into_image @ by_similarity(estimate.position[images])
+    mean = np.vstack([moved.mean(axis=0), (into_image @ turn).mean(axis=0)])
+    return np.asarray(mean @ np.linalg.pinv(by_similarity(estimate.points[points]).reshape(-1, 7)))

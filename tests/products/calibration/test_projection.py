@@ -96,6 +96,24 @@ def test_the_datum_does_not_matter() -> None:
         assert np.allclose(known.sigma_at(PIXELS, distance), other.sigma_at(PIXELS, distance), rtol=1e-3)
 
 
+@pytest.mark.parametrize("sigma", [0.01, 0.1, 1.0, 100.0])
+def test_knowing_the_board_does_not_make_the_camera_less_certain(sigma: float) -> None:
+    board = simulated_board(seed_of("projection"), fixed=False)
+    network = board.network.with_control(board.network.points, board.truth.points, sigma)
+    held = board.network.with_control(board.network.points, board.truth.points, 0.0)
+    known, unknown, best = (
+        projection_uncertainty(predict(seen, board.truth, datum=datum))
+        for seen, datum in ((network, "control"), (board.network, "free"), (held, "control"))
+    )
+    for distance in DISTANCES:
+        weighted, free = known.sigma_at(PIXELS, distance), unknown.sigma_at(PIXELS, distance)
+        assert (weighted <= free * (1 + 1e-3)).all(), (distance, weighted / free)
+        if sigma > 10:
+            assert np.allclose(weighted, free, rtol=1e-2)
+        if sigma < 0.05:
+            assert np.allclose(weighted, best.sigma_at(PIXELS, distance), rtol=0.2)
+
+
 def test_an_undetermined_camera_has_no_finite_uncertainty() -> None:
     board = simulated_board(seed_of("frontal"), tilt_deg=0.0, distance=(400.0, 400.0), photographs=6)
     known = projection_uncertainty(sfm.adjust(board.noisy(seed_of("n")), board.truth, datum="control"))
