@@ -82,6 +82,13 @@ class CameraCalibration:
             angles.append(float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))))
         return angles[0], angles[1], angles[2]
 
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Parameters that the photographs demand in addition to those that were adjusted."""
+        borne = [alternative for alternative in self.alternatives if alternative.added and alternative.borne]
+        names = [name for alternative in borne for name in alternative.parameters]
+        return tuple(dict.fromkeys([*names, *self.demanded]))
+
     def is_insufficient(self, level: float) -> bool:
         """Return whether the residuals contradict the model.
 
@@ -150,6 +157,7 @@ class Calibration:
     cameras: tuple[CameraCalibration, ...]
     validation: CrossValidation
     shape: ObjectShape | None  # None without given coordinates of the object
+    level: float  # of the tests of halves and of residuals, which share the false alarm
     remarks: tuple[Remark, ...]  # of the survey, and on the calibration
 
 
@@ -186,13 +194,15 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
     if not finite:
         finite = [float(np.median([camera.usual for camera in cameras]))]
     validation = cross_validate(adjustment)
-    remarks = (*result.remarks, *_remarks(adjustment, result, cameras, validation))
+    level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras)))
+    remarks = (*result.remarks, *_remarks(result, cameras, validation, level))
     return Calibration(
         result,
         (*finite, np.inf),
         cameras,
         validation,
         _shape_of(adjustment),
+        level,
         remarks,
     )
 
@@ -231,17 +241,18 @@ def _camera_of(adjustment: Adjustment, k: int, demanded: Sequence[tuple[str, str
 
 
 def _remarks(
-    adjustment: Adjustment,
     result: SurveyResult,
     cameras: Sequence[CameraCalibration],
     validation: CrossValidation,
+    level: float,
 ) -> Iterator[Remark]:
-    """Yield the remarks on halves that differ and on models that are insufficient."""
-    level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras)))
-    told = "distortion_not_described" in kinds_of(result.remarks)
+    """Yield the remarks on halves that differ or are not there, and on models that are insufficient."""
+    told = {"distortion_not_described", "held_parameter"} & set(kinds_of(result.remarks))
     for camera in cameras:
         halves = validation.clearest(camera.name)
-        if halves is not None and halves.probability < level:
+        if halves is None:
+            yield remark("halves_missing", camera=camera.name, photographs=camera.photographs)
+        elif halves.probability < level:
             yield remark(
                 "halves_differ",
                 camera=camera.name,
@@ -250,13 +261,15 @@ def _remarks(
                 times=halves.ratio,
                 p=halves.probability,
             )
-        if camera.is_insufficient(level) and not told:
+        if camera.is_insufficient(level) and "distortion_not_described" not in told:
             yield remark(
                 "model_insufficient",
                 camera=camera.name,
                 field=(camera.field.rms_px, "px"),
                 p=camera.field.whole,
             )
+        elif camera.missing and not told:
+            yield remark("parameters_missing", camera=camera.name, parameters=camera.missing)
 
 
 def _shape_of(adjustment: Adjustment) -> ObjectShape | None:

@@ -83,8 +83,13 @@ class CrossValidation:
         return tuple(difference for difference in self.differences if difference.camera == camera)
 
     def clearest(self, camera: str) -> HalvesDifference | None:
-        """Return the difference of a camera that chance explains least; None without any."""
-        return min(self.of_camera(camera), key=lambda halves: halves.probability, default=None)
+        """Return the difference of a camera that chance explains least; None without any.
+
+        Of several whose probability is too small for a number, the largest over its prediction.
+        """
+        return min(
+            self.of_camera(camera), key=lambda halves: (halves.probability, -halves.ratio), default=None
+        )
 
 
 @checked_arguments()

@@ -13,7 +13,6 @@ from scipy.spatial import ConvexHull
 from sfm.model.conventions import finer_unit
 from sfm.model.display import counted, listed
 from sfm.model.distortion.models import Role
-from sfm.model.distributions import level_of_single
 from sfm.model.remarks.verdict import Level, Verdict, judge
 from sfm.products.calibration.calibration import (
     KNOWN_FACTOR,
@@ -284,7 +283,7 @@ def _format(panel: Axes, camera: CameraCalibration, title: str) -> None:
 
 
 def _wrong(calibration: Calibration) -> Iterator[Part]:
-    level = calibration.result.adjustment.levels.family
+    level = calibration.level
     yield Heading("Model")
     for camera in calibration.cameras:
         yield from _model_parts(camera, level)
@@ -334,14 +333,13 @@ def _model_parts(camera: CameraCalibration, level: float) -> Iterator[Part]:
         Column("photographs say"),
     )
     insufficient, field = camera.is_insufficient(level), camera.field
-    missing = [n for a in camera.alternatives if a.added and a.borne for n in a.parameters]
-    missing += [name for name in camera.demanded if name not in missing]
     needless = [
         n
         for a in camera.alternatives
         if not a.added and not a.borne and np.isfinite(a.gain)
         for n in a.parameters
     ]
+    suffices = "Over the format, " if camera.missing else "It suffices: "
     words = [f"Camera {camera.name}: {camera.camera.model} with {', '.join(_free(camera))}."]
     if insufficient:
         words.append(
@@ -350,16 +348,19 @@ def _model_parts(camera: CameraCalibration, level: float) -> Iterator[Part]:
         )
     elif field.whole < level:
         words.append(
-            f"It suffices: residuals depend on the place in the format by {significant(field.rms_px)} px RMS "
+            f"{suffices}residuals depend on the place in the format by {significant(field.rms_px)} px RMS "
             f"({_p(field.whole)}), less than the uncertainty of projection."
         )
     elif np.isfinite(field.whole):
-        words.append(f"It suffices: residuals do not depend on the place in the format ({_p(field.whole)}).")
-    if missing:
-        words.append(f"The photographs demand {listed(missing)}: add to free in the survey file.")
+        words.append(f"{suffices}residuals do not depend on the place in the format ({_p(field.whole)}).")
+    else:
+        words.append("Its residuals are not tested: no part of the format has points of enough photographs.")
+    if camera.missing:
+        words.append(f"The photographs demand {listed(camera.missing)}: add to free in the survey file.")
     if needless:
         words.append(f"They do not need {listed(needless)}, which may be left out.")
-    yield Statement(" ".join(words), "fair" if insufficient or missing else "good")
+    trusted = not (insufficient or camera.missing) and np.isfinite(field.whole)
+    yield Statement(" ".join(words), "good" if trusted else "fair")
     yield Table(heads, rows)
 
 
@@ -398,10 +399,9 @@ def _halves_parts(calibration: Calibration) -> Iterator[Part]:
         Column("over expected", format=".2f"),
         Column("by chance"),
     )
-    level = level_of_single(calibration.result.adjustment.levels.family, max(len(validation.differences), 1))
 
     def row(halves: HalvesDifference) -> tuple[object, ...]:
-        contradicts = halves.probability < level
+        contradicts = halves.probability < calibration.level
         said = Mark(_p(halves.probability), "fair" if contradicts else "good")
         of_both = " and ".join(map(str, halves.photographs))
         return (
@@ -620,7 +620,7 @@ def _camera_summary(calibration: Calibration, camera: CameraCalibration) -> dict
         "residual_field": {
             "rms_px": camera.field.rms_px,
             "p": camera.field.whole,
-            "insufficient": camera.is_insufficient(a.levels.family),
+            "insufficient": camera.is_insufficient(calibration.level),
         },
         "models": [
             {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,27 @@ def test_a_model_that_does_not_fit_is_called_insufficient(tmp_path: Path) -> Non
     assert "It is insufficient" in text(page(found))
 
 
+@pytest.mark.parametrize("number", range(2))
+def test_a_parameter_that_is_demanded_is_in_the_verdict(tmp_path: Path, number: int) -> None:
+    K3 = 3e-6 * (np.arange(len(CAMERA.names)) == CAMERA.names.index("K3"))  # the corners are wrong by 0.6 px
+    lens = CAMERA.with_parameters(CAMERA.parameters + K3)
+    board = simulated_board(seed_of(f"demanded {number}"), photographs=8, camera=lens)
+    found = calibrate(surveyed(tmp_path, board, name=f"demanded-{number}"))
+    assert found.cameras[0].missing == ("K3",)
+    assert {"parameters_missing", "held_parameter", "model_insufficient"} & set(kinds_of(found.remarks))
+    assert verdict_of(found).level == "fair", verdict_of(found).text
+    assert "demand K3" in text(page(found)) and "It suffices" not in text(page(found))
+
+
+def test_page_and_remarks_test_residuals_at_one_level(sound: Calibration) -> None:
+    (camera,) = sound.cameras
+    between = (sound.level + sound.result.adjustment.levels.family) / 2
+    field = replace(camera.field, whole=between, mean=camera.field.mean + 1.0)
+    assert not replace(camera, field=field).is_insufficient(sound.level)
+    changed = replace(sound, cameras=(replace(camera, field=field),))
+    assert "It is insufficient" not in text(page(changed))
+
+
 def test_a_bent_board_is_seen(tmp_path: Path) -> None:
     found = calibrate(surveyed(tmp_path, simulated_board(seed_of("calibration"), photographs=16, bent=2.0)))
     assert found.shape is not None and found.shape.flat
@@ -114,7 +136,9 @@ def test_a_zoomed_camera_is_named(tmp_path: Path) -> None:
 def test_three_photographs_are_not_divided(tmp_path: Path) -> None:
     found = calibrate(surveyed(tmp_path, simulated_board(seed_of("three"), photographs=3)))
     assert not found.validation.differences
-    assert "half of its photographs are" in text(page(found))
+    words = text(page(found))
+    assert "half of its photographs are" in words and "Its residuals are not tested" in words
+    assert "halves_missing" in kinds_of(found.remarks) and verdict_of(found).level == "fair"
 
 
 def test_a_held_camera_is_no_calibration(tmp_path: Path) -> None:

@@ -63,3 +63,14 @@ def test_few_photographs_have_no_halves() -> None:
     assert not validated.differences and len(validated.untested) == 4
     assert validated.untested[0][1] == "camera cam: half of its photographs are 2, needed 3"
     assert validated.clearest("cam") is None
+
+
+def test_the_clearest_of_differences_beyond_all_chance_is_the_largest() -> None:
+    board = simulated_board(seed_of("beyond"), photographs=8)
+    a = sfm.adjust(board.noisy(seed_of("n")), board.truth, datum="control", reject="none")
+    validated = cross_validate(a)
+    beyond = tuple(
+        replace(halves, probability=0.0, chi2=chi2)
+        for halves, chi2 in zip(validated.differences, (2e3, 9e3, 4e3, 3e3), strict=True)
+    )
+    assert replace(validated, differences=beyond).clearest("cam") is beyond[1]

@@ -175,4 +175,19 @@ CALIBRATIONS = (
         "distortion that the model cannot describe, or a sensor that is not flat",
         "Free the parameters that the page names, or choose another model with --model.",
     ),
+    Kind(
+        "parameters_missing",
+        "warning",
+        "The photographs of camera {camera} demand {parameters}, which {parameters:was|were} not adjusted.",
+        "distortion that the adjusted parameters do not describe, above all beyond the image points",
+        "Add {parameters} to free of the camera in the survey file.",
+    ),
+    Kind(
+        "halves_missing",
+        "warning",
+        "No halves of the {photographs} photographs of camera {camera} can be compared. Nothing checks its "
+        "uncertainty of projection, which is true only if its model is.",
+        "too few photographs, or halves that do not determine the camera",
+        "Take 8 to 20 photographs of the object, tilted and turned.",
+    ),
 )
