@@ -95,18 +95,22 @@ def page(calibration: Calibration, *, folder: str = "RESULT") -> Page:
 
 def verdict_of(calibration: Calibration) -> Verdict:
     """Return the verdict on a calibration."""
-    found = ". ".join(_statement(camera) for camera in calibration.cameras)
+    found = ". ".join(_statement(calibration, camera) for camera in calibration.cameras)
     return judge(calibration.remarks, {level: text.format(found=found) for level, text in HEADLINES.items()})
 
 
-def _statement(camera: CameraCalibration) -> str:
+def _statement(calibration: Calibration, camera: CameraCalibration) -> str:
     middle, corner = _sigmas(camera, np.inf)
     if not np.isfinite(corner):
         return f"Camera {camera.name} is not determined"
-    return (
+    known = (
         f"Camera {camera.name} is known to {significant(middle)} px in the middle and "
         f"{significant(corner)} px in the worst corner (1 sigma, far points)"
     )
+    halves = calibration.validation.clearest(camera.name)
+    if halves is None or not halves.probability < calibration.level:
+        return known
+    return f"{known}, but halves of its photographs differ by {significant(halves.rms_px)} px"
 
 
 def _sigmas(camera: CameraCalibration, distance: float) -> tuple[float, float]:

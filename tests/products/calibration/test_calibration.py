@@ -130,6 +130,7 @@ def test_a_zoomed_camera_is_named(tmp_path: Path) -> None:
     (differ,) = of_kind(found.remarks, "halves_differ")
     assert differ.names("division") == ("first and last photographs",) and differ.number("times") > 2
     assert verdict_of(found).level != "good"
+    assert "but halves of its photographs differ by" in verdict_of(found).headline
     assert any("camera" in line.text and line.severity != "note" for line in verdict_of(found).lines)
 
 
