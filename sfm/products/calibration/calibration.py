@@ -14,11 +14,11 @@ import numpy as np
 
 from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
-from sfm.judgement.calibrated_cameras import InteriorParameter, families, interior_parameters
+from sfm.judgement.calibrated_cameras import InteriorParameter, interior_parameters
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, free_network
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.camera import Camera, camera_families, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import level_of_single
 from sfm.model.errors import GeometryError
@@ -208,11 +208,12 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
 
 
 def _first_of_families(adjustment: Adjustment) -> tuple[int, ...]:
-    """Return the first camera of each family of cameras with common parameters."""
-    cameras = adjustment.estimate.cameras
-    return tuple(
-        next(k for k, camera in enumerate(cameras) if camera is first) for _, first in families(adjustment)
-    )
+    """Return the first camera with image points of each family of cameras with common parameters."""
+    network = adjustment.network
+    names, family = camera_families(adjustment.estimate.cameras, network.camera)
+    measured = np.unique(network.camera[network.image_points.image[~adjustment.rejected]])
+    members = (measured[family[measured] == number] for number in range(len(names)))
+    return tuple(int(of_family[0]) for of_family in members if len(of_family))
 
 
 def _camera_of(adjustment: Adjustment, k: int, demanded: Sequence[tuple[str, str]]) -> CameraCalibration:

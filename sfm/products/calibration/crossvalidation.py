@@ -117,7 +117,7 @@ def cross_validate(adjustment: Adjustment) -> CrossValidation:
             untested.append((division, str(error)))
             continue
         for k, camera in enumerate(adjustment.estimate.cameras):
-            if camera.free.any():
+            if camera.free.any() and all((half.network.camera == k).any() for half in halves):
                 try:
                     differences.append(_difference(adjustment, k, division, halves))
                 except GeometryError as error:
@@ -175,9 +175,10 @@ def _adjust_half(adjustment: Adjustment, half: BoolArray) -> Adjustment:
         network, estimate, used, min_points=MIN_IMAGE_POINTS, min_rays=np.where(known, 1, 2)
     )
     images &= half
+    measured = set(network.camera[network.image_points.image[~adjustment.rejected]].tolist())
     for k, camera in enumerate(estimate.cameras):
         taken = int((network.camera[images] == k).sum())
-        if camera.free.any() and taken < MIN_HALF and (network.camera == k).any():
+        if camera.free.any() and taken < MIN_HALF and k in measured:
             raise GeometryError(
                 f"camera {camera.name}: half of its photographs are {taken}, needed {MIN_HALF}"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -496,6 +497,7 @@ def _next(calibration: Calibration, folder: str) -> Iterator[Part]:
         )
     if verdict_of(calibration).level == "bad":
         return
+    folder = shlex.quote(folder)
     yield Heading("Use it")
     yield facts(
         [

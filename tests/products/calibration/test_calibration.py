@@ -13,7 +13,8 @@ import sfm
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.errors import GeometryError
 from sfm.model.remarks.remark import kinds_of, of_kind
-from sfm.products.calibration.calibration import Calibration, calibrate
+from sfm.products.calibration.calibration import Calibration, _first_of_families, calibrate
+from sfm.products.calibration.crossvalidation import cross_validate
 from sfm.products.calibration.page import page, verdict_of
 from sfm.report.pages import html, text
 from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board, zoomed
@@ -146,6 +147,25 @@ def test_a_held_camera_is_no_calibration(tmp_path: Path) -> None:
     result = surveyed(tmp_path, simulated_board(seed_of("held")), free="free = []")
     with pytest.raises(GeometryError, match="no camera was adjusted, so that nothing is calibrated"):
         calibrate(result)
+
+
+def test_a_camera_whose_photographs_show_nothing_has_no_calibration(sound: Calibration) -> None:
+    a = sound.result.adjustment
+    blind = replace(a.estimate.cameras[0], name="blind")
+    network = replace(a.network, images=(*a.network.images, "blind0"), camera=np.append(a.network.camera, 1))
+    estimate = replace(
+        a.estimate,
+        cameras=(*a.estimate.cameras, blind),
+        position=np.vstack([a.estimate.position, np.full(3, np.nan)]),
+        rotation=np.concatenate([a.estimate.rotation, np.full((1, 3, 3), np.nan)]),
+    )
+    further = replace(a, network=network, estimate=estimate)
+    assert _first_of_families(further) == (0,)
+    assert len(cross_validate(further).of_camera("cam")) == 4  # the blind one does not hinder the other
+
+
+def test_commands_on_the_page_can_be_pasted(sound: Calibration) -> None:
+    assert "kolinear convert 'my results/board' OUT" in text(page(sound, folder="my results/board"))
 
 
 def test_distances_are_positive(sound: Calibration) -> None:
