@@ -470,6 +470,7 @@ def test_summary_of_a_written_result_is_read_back(result: SurveyResult, result_f
 
 NOT_IN_THE_TABLE = {
     "allow_outside",
+    "photographs",
     "source",
     "copied",
     "other_moments",

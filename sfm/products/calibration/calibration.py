@@ -251,9 +251,9 @@ def _remarks(
     told = {"distortion_not_described", "held_parameter"} & set(kinds_of(result.remarks))
     for camera in cameras:
         halves = validation.clearest(camera.name)
-        if halves is None:
+        if halves is None and camera.photographs > 1:  # else photographs have parameters of their own
             yield remark("halves_missing", camera=camera.name, photographs=camera.photographs)
-        elif halves.probability < level:
+        elif halves is not None and halves.probability < level:
             yield remark(
                 "halves_differ",
                 camera=camera.name,
