@@ -286,8 +286,7 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     if group.placed.renamed:
         yield remark("given_renamed", of=of, given=[group.names[k] for k in group.placed.renamed])
     if judgement.wrong:
-        mistake = next(iter(_mistakes_of_single(task, group)), None)
-        yield _left_out(group, task.settings.unit, mistake)
+        yield _left_out(task, group)
     if judgement.doubtful:
         yield _doubtful(task, group)
     if group.scatter:
@@ -311,7 +310,7 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
         yield remark("given_sigmas", of=of, factor=judgement.factor, used=used_factor)
 
 
-def _left_out(group: Group, unit: str, mistake: str | None = None) -> Remark:
+def _left_out(task: Task, group: Group) -> Remark:
     model, out = group.placed.model, group.out
     others = (model.kept(tuple(j for j in out if j != k)).difference(k) for k in out)
     d, covariance = max(others, key=lambda difference: float(np.linalg.norm(difference[0])))
@@ -320,9 +319,9 @@ def _left_out(group: Group, unit: str, mistake: str | None = None) -> Remark:
         "given_left_out",
         of=group.of,
         given=[group.names[k] for k in out],
-        distance=(distance, unit),
+        distance=(distance, task.settings.unit),
         sigmas=distance**2 / float(np.sqrt(d @ covariance @ d)),
-        mistake=mistake,
+        mistake=next(iter(_mistakes_of_single(task, group)), None),
     )
 
 
