@@ -365,8 +365,8 @@ def test_strained_points_name_the_axis() -> None:
 
 def test_points_that_are_left_out_state_their_distance_from_the_others() -> None:
     """Of each without the other ones that are left out; the farthest counts."""
-    _, group = judged_group("left out", wrong=(1, 4))
-    said = given._left_out(group, "mm")
+    task, group = judged_group("left out", wrong=(1, 4))
+    said = given._left_out(task, group)
     model = group.placed.model
     pairs = [(model.kept((b,)).difference(a)) for a, b in ((1, 4), (4, 1))]
     d, covariance = max(pairs, key=lambda pair: float(np.linalg.norm(pair[0])))
