@@ -100,7 +100,7 @@ def test_doctor_calls_the_core_sound(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_a_camera_that_was_not_looked_up_is_reported() -> None:
     unknown: list[Remark] = []
-    assert sfm.products.public_functions.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
+    assert sfm.library.surveys.sensor_widths(unknown.append)("OLYMPUS", "C4040Z") is None
     (one,) = unknown
     assert one.kind == "camera_assumed" and one.names("cameras") == ("OLYMPUS C4040Z",)
     assert one.names("reason") == (INSTALL_PYCOLMAP,)

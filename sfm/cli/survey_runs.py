@@ -154,8 +154,9 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.cli.console import print_result, print_unfinished
         from sfm.files.globs import nearest_name
         from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.library.results import read_result
+        from sfm.library.surveys import colmap_writer, programs_of
         from sfm.pipeline import run_survey
-        from sfm.products.public_functions import colmap_writer, one_blas_thread, programs_of, read_result
         from sfm.report.figures.plot_process import plot_process
         from sfm.report.findings import findings_of
         from sfm.report.output import (
@@ -167,7 +168,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             write_unfinished,
         )
         from sfm.runtime.progress_bar import drawn_progress
-        from sfm.runtime.threads import cores
+        from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.calibration import Calibration, read_calibrations
         from sfm.survey.inputs.measurements import find_photographs
         from sfm.survey.inputs.named_folders import named_folder
@@ -400,10 +401,11 @@ def draft_folder(photographs: Path, file: Path, pitch: float | None = None, name
         name: name of the survey; None for that of the folder.
     """
     with loading():
+        from sfm.library.surveys import sensor_widths
         from sfm.products.drafting.draft import draft_survey
-        from sfm.products.public_functions import one_blas_thread, sensor_widths
         from sfm.report.output import path_from
         from sfm.runtime.progress_bar import drawn_progress
+        from sfm.runtime.threads import one_blas_thread
         from sfm.survey.measuring.measured_store import MeasuredStore
 
     compile_first()

@@ -16,11 +16,18 @@ from contextvars import ContextVar
 from functools import cache
 from typing import TypeVar
 
-from threadpoolctl import LibController, ThreadpoolController
+from threadpoolctl import LibController, ThreadpoolController, threadpool_limits
 
 S = TypeVar("S")
 T = TypeVar("T")
 _second: ContextVar[ThreadPoolExecutor | None] = ContextVar("second", default=None)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit BLAS to one thread: photographs are processed in parallel, and BLAS pools would compete."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 @contextmanager

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from sfm.library.surveys import write_result
 from sfm.model.camera import project
 from sfm.model.errors import SurveyFileError
 from sfm.model.remarks.remark import of_kind
 from sfm.photographs.exif import LocalSystem
 from sfm.pipeline import run_survey
-from sfm.products.public_functions import write_result
 from sfm.survey.inputs.survey import read_survey
 from tests.surveys import SIZE_PX, camera, code_centres, stations, write_photograph_survey
 from tests.synthetic import seed_of

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 
 from sfm.judgement.survey_result import SurveyResult
+from sfm.library.results import read_result
+from sfm.library.surveys import write_result
 from sfm.model.camera import project
 from sfm.model.conventions import AnyArray
 from sfm.model.network import ImagePoints, Source
 from sfm.model.similarity import fit_similarity
 from sfm.photographs import reading
 from sfm.pipeline import run_survey
-from sfm.products.public_functions import read_result, write_result
 from sfm.products.rendering.render import render_photographs
 from sfm.products.rendering.scene import Optics, join_marks, rectangles
 from sfm.runtime.progress import SILENT, StageClock

@@ -350,7 +350,7 @@ def test_what_photographs_say_of_themselves_is_no_line_of_a_drafted_survey(
         return replace(real(path), make=evil, model=evil, focal_mm=24.0)
 
     monkeypatch.setattr("sfm.products.drafting.draft.read_metadata", metadata)
-    monkeypatch.setattr("sfm.products.public_functions.sensor_widths", lambda *_: lambda *_: 36.0)
+    monkeypatch.setattr("sfm.library.surveys.sensor_widths", lambda *_: lambda *_: 36.0)
     assert kolinear("init", given) == 0
     told = capsys.readouterr()
     assert "\x1b" not in told.err and "left out: 2.png: a link out of the folder" in told.err

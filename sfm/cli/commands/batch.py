@@ -85,6 +85,7 @@ def batch(
     with loading():
         from rich.console import Console
 
+        from sfm.library.surveys import colmap_writer
         from sfm.products.batch.job import Comparers
         from sfm.products.batch.run import calls_of, find_surveys, run_batch
         from sfm.products.batch.table import (
@@ -93,7 +94,6 @@ def batch(
             refuse_foreign_pages,
             stopping_at_terminate,
         )
-        from sfm.products.public_functions import colmap_writer
 
     refuse_foreign_pages(out)  # before anything is drafted there
     without_draft: dict[Path, Exception] = {}
@@ -135,7 +135,7 @@ def batch(
 
 def _programs_of_worker(survey: Survey) -> OtherPrograms:
     """Return the programs to compare a survey with, on one thread each, as every core has a worker."""
-    from sfm.products.public_functions import programs_of
+    from sfm.library.surveys import programs_of
 
     return programs_of(survey.compare.backend, survey.compare.baseline, threads=1)
 

@@ -82,7 +82,7 @@ def _check_adjustment() -> str:
 def _check_colmap() -> str:
     """Adjust the same network with COLMAP and compare."""
     from sfm.comparison.two_adjusters.adjusters import compare_adjusters
-    from sfm.products.public_functions import programs_of
+    from sfm.library.surveys import programs_of
 
     adjuster = programs_of("colmap", "none").adjuster
     assert adjuster is not None

@@ -143,9 +143,9 @@ def _project(
     from adapters.formats.result_tables import read_result
     from sfm.cli.survey_runs import SURVEY_FILE
     from sfm.files.globs import nearest_name
+    from sfm.library.surveys import sensor_widths
     from sfm.products.drafting.draft import names_of_folder
     from sfm.products.marking.project import project_of_folder, project_of_survey
-    from sfm.products.public_functions import sensor_widths
     from sfm.report.output import folder_name, read_origin
     from sfm.survey.inputs.named_folders import named_folder
     from sfm.survey.inputs.survey import survey_of_file

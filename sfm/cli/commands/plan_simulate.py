@@ -36,8 +36,8 @@ def plan_simulate(
     with loading():
         from sfm.files.open_folders import locked, refuse_foreign_folder
         from sfm.files.whole_files import remove_leftovers, whole_folder
+        from sfm.library.surveys import run_survey
         from sfm.products.inspection.planned_survey import compare_with_plan, read_plan, write_simulation
-        from sfm.products.public_functions import run_survey
 
     refuse_foreign_folder(out)
     with working_on(str(folder)):
