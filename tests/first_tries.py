@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from sfm.cli.app import app
 from sfm.model.errors import KolinearError
 from sfm.model.network import ImagePoints
-from tests.surveys import OBSERVED, write_observed_survey, write_photograph_survey
+from tests.surveys import observed_text, write_observed_survey, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
 CAMERA = ("--c-mm", "24", "--sensor-width-mm", "36", "--width-px", "6000")
@@ -75,7 +75,7 @@ def _image_points(
         for i, j, (x, y) in zip(seen.image, seen.point, seen.xy.tolist(), strict=True)
     ]
     (folder / "image_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    text = OBSERVED.format(name="s", backend="none").replace('free = ["c"]', f"free = {free}")
+    text = observed_text("s", "m").replace('free = ["c"]', f"free = {free}")
     (folder / "survey.toml").write_text(text + fixed, encoding="utf-8")
     return "adjust", str(folder / "survey.toml"), "--out", str(folder.parent / "out")
 

@@ -46,19 +46,29 @@ codes = "ring14"
 backend = "{backend}"
 """
 
-OBSERVED = """\
-[survey]
-name = "{name}"
-unit = "m"
-[[camera]]
+CAMERA = """\
 name = "synthetic"
 size_px = [2000, 1500]
 pixel_mm = [0.005, 0.005]
 c_mm = 10.0
 free = ["c"]
-fixed = {{x0 = 0.03, y0 = -0.02, K1 = 8e-4, K2 = -4e-6, P1 = 3e-5, P2 = -2e-5, b1 = 2e-4}}
+fixed = {x0 = 0.03, y0 = -0.02, K1 = 8e-4, K2 = -4e-6, P1 = 3e-5, P2 = -2e-5, b1 = 2e-4}
+"""
+
+
+def observed_text(
+    name: str, unit: str, camera: str = CAMERA, *, further: str = "", backend: str = "none"
+) -> str:
+    """Return the text of a survey of image points; `camera` has the keys of its only camera."""
+    return f"""\
+[survey]
+name = "{name}"
+unit = "{unit}"
+[[camera]]
+{camera}
 [observations]
 file = "image_points.csv"
+{further}
 [compare]
 backend = "{backend}"
 """
@@ -94,7 +104,7 @@ def write_observed_survey(
     ]
     (folder / "image_points.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     path = folder / "survey.toml"
-    path.write_text(OBSERVED.format(name=name, backend=backend), encoding="utf-8")
+    path.write_text(observed_text(name, "m", backend=backend), encoding="utf-8")
     return path
 
 

@@ -14,6 +14,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -54,6 +55,17 @@ from sfm.model.solution import Solution
 
 Reader = Callable[[Path], tuple[Network, Estimate]]
 Writer = Callable[[Path, Network, Estimate], None]
+
+
+class NamedRow(Protocol):
+    """What a table of formats has a row of."""
+
+    @property
+    def name(self) -> str:
+        """As for --from and --to."""
+
+
+Row = TypeVar("Row", bound=NamedRow)
 
 
 @dataclass(frozen=True)
@@ -240,10 +252,24 @@ def format_named(name: str) -> FileFormat:
     Raises:
         SurveyFileError: no format has that name.
     """
-    form = next((form for form in FORMATS if form.name == name), None)
-    if form is None:
-        raise SurveyFileError(f"format '{name}', expected one of {', '.join(form.name for form in FORMATS)}")
-    return form
+    return row_named(name, FORMATS, "format")
+
+
+def row_named(name: str, rows: tuple[Row, ...], what: str) -> Row:
+    """Return the row of a table of formats by its name.
+
+    Args:
+        name: of the row.
+        rows: the table.
+        what: is in a row of it, for people.
+
+    Raises:
+        SurveyFileError: no row has that name.
+    """
+    named = {row.name: row for row in rows}
+    if name not in named:
+        raise SurveyFileError(f"{what} '{name}', expected one of {', '.join(named)}")
+    return named[name]
 
 
 def format_of(path: Path) -> FileFormat:

@@ -29,7 +29,7 @@ from sfm.survey.inputs.exterior_table import read_observed_exterior
 from sfm.survey.inputs.survey import read_survey
 from tests.findings import findings_of
 from tests.rigs import make_rig
-from tests.surveys import OBSERVED, remarks_on_given, stations, write_photograph_survey
+from tests.surveys import observed_text, remarks_on_given, stations, write_photograph_survey
 from tests.synthetic import make_network, seed_of
 
 IMAGES = 8
@@ -67,7 +67,7 @@ def written(
         )
     (folder / "exterior.csv").write_text(exterior, encoding="utf-8")
     (folder / "control.csv").write_text("id,X,Y,Z,sX,sY,sZ\n1,0,0,0,100,100,100\n", encoding="utf-8")
-    text = OBSERVED.format(name=name, backend="none") + f'[datum]\nkind = "{datum}"\n'
+    text = observed_text(name, "m") + f'[datum]\nkind = "{datum}"\n'
     text += '[exterior]\nfile = "exterior.csv"\n'
     text += '[control]\nfile = "control.csv"\n' if control else ""
     (folder / "survey.toml").write_text(text, encoding="utf-8")

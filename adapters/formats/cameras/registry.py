@@ -28,7 +28,7 @@ from adapters.formats.cameras.mrcal import STEREOGRAPHIC, read_mrcal, write_mrca
 from adapters.formats.cameras.nerfstudio import read_nerfstudio, write_nerfstudio
 from adapters.formats.cameras.opencv import is_pair, read_opencv, write_opencv
 from adapters.formats.cameras.ros import read_ros, write_ros
-from adapters.formats.registry import FORMATS, format_of, read_content
+from adapters.formats.registry import FORMATS, format_of, read_content, row_named
 from adapters.reading.trees import head_of
 from sfm.files.open_folders import refuse_links_out
 from sfm.files.whole_files import refuse_existing, whole_file
@@ -189,10 +189,7 @@ def camera_format(name: str) -> CameraFormat:
     Raises:
         SurveyFileError: no format has that name.
     """
-    form = next((form for form in CAMERA_FORMATS if form.name == name), None)
-    if form is None:
-        raise SurveyFileError(f"camera format '{name}', expected one of {', '.join(NAMES)}")
-    return form
+    return row_named(name, CAMERA_FORMATS, "camera format")
 
 
 def camera_format_of(path: Path) -> CameraFormat | None:

@@ -13,8 +13,6 @@ from sfm.model.display import counted
 from sfm.runtime.faults import working_on
 
 if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
     from sfm.products.inspection.measurement import Measurement
 
 MAX_PRINTED = 40  # distances, angles and heights on the terminal; quantities.csv lists all

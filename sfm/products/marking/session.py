@@ -232,11 +232,7 @@ class MarkingSession:
 
         An image point that was measured automatically is refused too, by its photograph and point.
 
-        Args:
-            image: number of the photograph; None for all.
-            point: name of the point; None for all.
-            seen: version of the state that the page shows; what is proposed since then stays proposed.
-            page: the page that asks.
+        Args: as of `accept`.
 
         Returns:
             The number of refused places, and the state.

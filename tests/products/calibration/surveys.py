@@ -5,26 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.products.calibration.boards import SimulatedBoard, board_points
+from tests.surveys import observed_text
 from tests.synthetic import seed_of
 
-TEXT = """\
-[survey]
-name = "{name}"
-unit = "mm"
-[[camera]]
+CAMERA = """\
 name = "cam"
 size_px = [1200, 900]
 pixel_mm = [0.005, 0.005]
 c_mm = 6.0
-{free}
-[observations]
-file = "image_points.csv"
+"""
+GIVEN = """\
 [control]
 file = "control.csv"
 [datum]
 kind = "control"
-[compare]
-backend = "none"
 """
 ALL = 'free = ["c", "x0", "y0", "K1", "K2", "P1", "P2"]'
 
@@ -44,5 +38,5 @@ def write_board_survey(folder: Path, board: SimulatedBoard, *, name: str = "boar
     given += [f"p{j},{x!r},{y!r},{z!r}" for j, (x, y, z) in enumerate(board_points().tolist())]
     (folder / "control.csv").write_text("\n".join(given) + "\n", encoding="utf-8")
     path = folder / "survey.toml"
-    path.write_text(TEXT.format(name=name, free=free), encoding="utf-8")
+    path.write_text(observed_text(name, "mm", CAMERA + free, further=GIVEN), encoding="utf-8")
     return path

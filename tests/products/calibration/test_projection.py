@@ -13,8 +13,8 @@ from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.products.calibration.projection import projection_uncertainty
-from tests.products.calibration.boards import CAMERA, SimulatedBoard, simulated_board
+from sfm.products.calibration.projection import ProjectionUncertainty, projection_uncertainty
+from tests.products.calibration.boards import CAMERA, simulated_board
 from tests.synthetic import seed_of
 
 PIXELS = np.array(
@@ -42,23 +42,25 @@ def projected(truth: Estimate, estimate: Estimate, xy: FloatArray, distance: flo
     return pixel_from_tangents(estimate.cameras[0], -mean[:, :2] / mean[:, 2:])
 
 
-def scatter(
-    board: SimulatedBoard, datum: str, simulations: int, rng: np.random.Generator
-) -> dict[float, FloatArray]:
+def predicted_and_scatter(
+    *, fixed: bool, simulations: int
+) -> tuple[ProjectionUncertainty, dict[float, FloatArray]]:
+    """Return the predicted uncertainty and the shifts of simulated calibrations, px, by distance."""
+    board, rng = simulated_board(seed_of("projection"), fixed=fixed), seed_of("scatter")
+    datum = "control" if fixed else "free"
     shifts: dict[float, list[FloatArray]] = {distance: [] for distance in DISTANCES}
     for _ in range(simulations):
         a = sfm.adjust(board.noisy(rng), board.truth, datum=datum, reject="none", covariance=False)
         for distance in DISTANCES:
             shifts[distance].append(projected(board.truth, a.estimate, PIXELS, distance) - PIXELS)
-    return {distance: np.array(of_distance) for distance, of_distance in shifts.items()}
+    predicted = projection_uncertainty(predict(board.network, board.truth, datum=datum))
+    return predicted, {distance: np.array(of_distance) for distance, of_distance in shifts.items()}
 
 
 @pytest.mark.parametrize("fixed", [True, False], ids=["fixed board", "free board"])
 def test_predicted_scatter_is_that_of_a_hundred_calibrations(fixed: bool) -> None:
-    board = simulated_board(seed_of("projection"), fixed=fixed)
-    datum = "control" if fixed else "free"
-    predicted = projection_uncertainty(predict(board.network, board.truth, datum=datum))
-    for distance, shifts in scatter(board, datum, 100, seed_of("scatter")).items():
+    predicted, simulated = predicted_and_scatter(fixed=fixed, simulations=100)
+    for distance, shifts in simulated.items():
         ratio = predicted.sigma_at(PIXELS, distance) / np.sqrt((shifts**2).mean(axis=(0, 2)))
         assert ((ratio > 0.85) & (ratio < 1.15)).all(), (distance, ratio)
 
@@ -66,10 +68,8 @@ def test_predicted_scatter_is_that_of_a_hundred_calibrations(fixed: bool) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("fixed", [True, False], ids=["fixed board", "free board"])
 def test_predicted_scatter_is_that_of_many_calibrations(fixed: bool) -> None:
-    board = simulated_board(seed_of("projection"), fixed=fixed)
-    datum = "control" if fixed else "free"
-    predicted = projection_uncertainty(predict(board.network, board.truth, datum=datum))
-    for distance, shifts in scatter(board, datum, 3000, seed_of("scatter")).items():
+    predicted, simulated = predicted_and_scatter(fixed=fixed, simulations=3000)
+    for distance, shifts in simulated.items():
         ratio = predicted.sigma_at(PIXELS, distance) / np.sqrt((shifts**2).mean(axis=(0, 2)))
         assert ((ratio > 0.95) & (ratio < 1.05)).all(), (distance, ratio)
         covariance = np.einsum("sni,snj->nij", shifts, shifts) / len(shifts)
