@@ -23,7 +23,7 @@ from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.model.camera import pixel_from_tangents, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_sf
 from sfm.model.errors import GeometryError
@@ -221,13 +221,20 @@ def _difference(
         raise GeometryError(
             f"camera {camera.name}: both halves of its photographs cover no part of the format"
         )
-    turn, by_parameters = _effects(camera, xy[known])
+    # effects of small rotations, (2n, 3), and of the free parameters, (2n, f), on pixels
+    free: IntArray = np.flatnonzero(camera.free)
+    by_unknown = ProjectionUncertainty(camera, free, np.zeros((0, 0))).derivatives(xy[known], np.inf)
+    turn, by_parameters = by_unknown[:, :, 3:6].reshape(-1, 3), by_unknown[:, :, 6:].reshape(-1, len(free))
     shift = (first - second)[known].ravel()
     both = np.column_stack([shift, by_parameters])
     rest = both - turn @ np.linalg.lstsq(turn, both, rcond=None)[0]
     difference, J = rest[:, 0], rest[:, 1:]
     covariance = sum(covariances, np.zeros_like(covariances[0]))
-    values, vectors = np.linalg.eigh(_scaled(covariance))
+    # of correlations, with 0 for parameters without variance
+    sigma = np.sqrt(np.diagonal(covariance))
+    sigma = np.where(sigma > 0, sigma, 1.0)
+    correlations = covariance / np.outer(sigma, sigma)
+    values, vectors = np.linalg.eigh(correlations)
     root = np.sqrt(np.diagonal(covariance))[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     modes, sizes, _ = np.linalg.svd(J @ root, full_matrices=False)
     clear = sizes > SMALLEST_MODE * sizes[0]
@@ -245,17 +252,3 @@ def _difference(
         dof,
         float(chi2_sf(chi2, dof)),
     )
-
-
-def _scaled(covariance: FloatArray) -> FloatArray:
-    """Return the correlations of a covariance; 0 for parameters without variance."""
-    sigma = np.sqrt(np.diagonal(covariance))
-    sigma = np.where(sigma > 0, sigma, 1.0)
-    return np.asarray(covariance / np.outer(sigma, sigma))
-
-
-def _effects(camera: Camera, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the effects of small rotations, (2n, 3), and of the free parameters, (2n, f), on pixels."""
-    free: IntArray = np.flatnonzero(camera.free)
-    J = ProjectionUncertainty(camera, free, np.zeros((0, 0))).derivatives(xy, np.inf)
-    return J[:, :, 3:6].reshape(-1, 3), J[:, :, 6:].reshape(-1, len(free))

@@ -148,7 +148,11 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
     middle = points.mean(axis=0)
     away = estimate.position[images] - middle
     distances = np.quantile(np.linalg.norm(away, axis=1), (0.0, 0.5, 1.0))
-    facing = _facing(points - middle, away, estimate.rotation[images])
+    # R of a camera before the object, upright as in most photographs, along the normal of its plane
+    _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
+    normal = axes[2] * (np.sign((away @ axes[2]).sum()) or 1.0)
+    along = axes[0] * (np.sign((estimate.rotation[images][:, :, 0] @ axes[0]).sum()) or 1.0)
+    facing = np.column_stack([along, np.cross(normal, along), normal])
     neighbour = cKDTree(points).query(points, k=2)[1][:, 1] if len(points) > 1 else np.zeros(1, dtype=int)
     measured = seen.xy[of_camera]
     least_px = float(np.minimum(measured, np.array(lens.size_px) - 1 - measured).min())
@@ -162,31 +166,16 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
                 continue
             position = middle - rotation @ (distance * np.array([*tangent, -1.0]))
             xy = np.full((len(network.points), 2), np.nan)
-            all_xy = _projected(lens, position, rotation, points)
+            # NaN behind the camera and beyond its last ray
+            UVW = (points - position) @ rotation
+            depth = np.where(UVW[:, 2] < 0, UVW[:, 2], np.nan)[:, None]
+            all_xy = pixel_from_tangents(lens, -UVW[:, :2] / depth)
             apart = np.linalg.norm(all_xy - all_xy[neighbour], axis=1) / 2
             border = np.minimum(all_xy, np.array(lens.size_px) - 1 - all_xy).min(axis=1)
             inside = border >= np.minimum(apart, least_px)
             xy[shown[inside]] = all_xy[inside]
             if np.isfinite(xy[:, 0]).sum() >= least:
                 yield Pose(position, rotation, (a, b), roll, place, float(distance), xy)
-
-
-def _projected(camera: Camera, position: FloatArray, rotation: FloatArray, points: FloatArray) -> FloatArray:
-    """Return the image points, px, NaN behind the camera and beyond its last ray, (n, 2)."""
-    UVW = (points - position) @ rotation
-    depth = np.where(UVW[:, 2] < 0, UVW[:, 2], np.nan)[:, None]
-    return pixel_from_tangents(camera, -UVW[:, :2] / depth)
-
-
-def _facing(points: FloatArray, away: FloatArray, rotations: FloatArray) -> FloatArray:
-    """Return R of a camera before the object, along the normal of its plane and its longer side, (3, 3).
-
-    The object is upright as in most photographs.
-    """
-    _, _, axes = np.linalg.svd(points, full_matrices=False)
-    z = axes[2] * (np.sign((away @ axes[2]).sum()) or 1.0)
-    x = axes[0] * (np.sign((rotations[:, :, 0] @ axes[0]).sum()) or 1.0)
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 def _turned(a: float, b: float, roll: float) -> FloatArray:
@@ -262,7 +251,9 @@ def _chosen(
     for _ in range(min(count, len(views))):
         scores = [_worst(effect, Q, A, f) for A in rows]
         best = int(np.argmin(scores))
-        Q = _updated(Q, rows.pop(best))
+        observed = rows.pop(best)
+        AQ = observed @ Q
+        Q = Q - AQ.T @ np.linalg.solve(np.eye(len(observed)) + AQ @ observed.T, AQ)
         taken.append(views.pop(best))
     return taken
 
@@ -310,12 +301,6 @@ def _information(
     basis, _ = np.linalg.qr(pose)
     share = np.isfinite(view.xy[:, 0]).sum() / max(len(seen), 1)
     return np.asarray(np.sqrt(share) * (A - basis @ (basis.T @ A)))
-
-
-def _updated(Q: FloatArray, A: FloatArray) -> FloatArray:
-    """Return the covariance with further observations of whitened derivatives A."""
-    AQ = A @ Q
-    return np.asarray(Q - AQ.T @ np.linalg.solve(np.eye(len(A)) + AQ @ A.T, AQ))
 
 
 def _worst(effect: FloatArray, Q: FloatArray, A: FloatArray, f: int) -> float:

@@ -147,7 +147,11 @@ def projection_uncertainty(adjustment: Adjustment, camera: str | int = 0) -> Pro
         unknowns, place = np.unique(
             np.concatenate([columns.ravel(), layout.interior_column[k]]), return_inverse=True
         )
-        points = _weighted_points(adjustment)
+        # measured points that are given; none if some of them have no standard deviation
+        control, seen = adjustment.network.control.complete, adjustment.network.image_points
+        measured = control.point[np.isin(control.point, seen.point[~adjustment.rejected])]
+        held = not (np.diagonal(control.covariance, axis1=1, axis2=2) > 0).all()
+        points = measured[:0] if adjustment.datum != "control" or held or len(measured) < 3 else measured
         joint = marginal.joint(unknowns, points)
     motion = np.zeros((len(images), 6, 6))
     motion[:, :3, :3] = -np.swapaxes(adjustment.estimate.rotation[images], 1, 2)
@@ -160,14 +164,6 @@ def projection_uncertainty(adjustment: Adjustment, camera: str | int = 0) -> Pro
     A[:6, len(unknowns) :] = -_motion_with_object(adjustment, images, points)
     adjusted = np.asarray(layout.interior_free[k])
     return ProjectionUncertainty(cameras[k], adjusted, A @ joint @ A.T)
-
-
-def _weighted_points(adjustment: Adjustment) -> IntArray:
-    """Return the measured points that are given, (p,); none if some of them have no standard deviation."""
-    given, seen = adjustment.network.control.complete, adjustment.network.image_points
-    points = given.point[np.isin(given.point, seen.point[~adjustment.rejected])]
-    held = not (np.diagonal(given.covariance, axis1=1, axis2=2) > 0).all()
-    return points[:0] if adjustment.datum != "control" or held or len(points) < 3 else points
 
 
 def _motion_with_object(adjustment: Adjustment, images: IntArray, points: IntArray) -> FloatArray:

@@ -325,7 +325,19 @@ def write_simulation(
     lines = ["[survey]", 'name = "simulation"', f'unit = "{plan.unit}"']
     for a, camera in enumerate(plan.cameras):
         images_of = [name for name, of in zip(network.images, network.camera, strict=True) if of == a]
-        lines += _camera_section(camera, images_of)
+        free = [parameter for parameter, is_free in zip(camera.names, camera.free, strict=True) if is_free]
+        values = zip(camera.names, camera.parameters.tolist(), strict=True)
+        held = [
+            f"{parameter} = {value!r}"
+            for parameter, value in values
+            if parameter not in free and parameter != "c"
+        ]
+        globs = [name.replace("[", "[[]").replace("*", "[*]").replace("?", "[?]") for name in images_of]
+        section = ["[[camera]]", f"name = {json.dumps(camera.name)}", f"images = {json.dumps(globs)}"]
+        section += [f"size_px = {list(camera.size_px)}", f"pixel_mm = {camera.pixel_mm.tolist()}"]
+        section += [f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!r}", f'model = "{camera.model}"']
+        section += [f"free = {json.dumps(free)}"]
+        lines += [*section, f"fixed = {{ {', '.join(held)} }}"] if held else section
     lines += [*_rig_section(folder, network, truth), *targets]
     bars = network.scale_bars
     for start, end, length, sigma in zip(bars.start, bars.end, bars.length, bars.sigma, strict=True):
@@ -384,19 +396,6 @@ def _write_photographs(plan: PlannedSurvey, folder: Path, xyz: FloatArray, codes
             optics=optics,
             seed=seed + a,
         )
-
-
-def _camera_section(camera: Camera, images: list[str]) -> list[str]:
-    """Return the lines of a camera; its free parameters start at 0."""
-    free = [name for name, is_free in zip(camera.names, camera.free, strict=True) if is_free]
-    values = zip(camera.names, camera.parameters.tolist(), strict=True)
-    held = [f"{name} = {value!r}" for name, value in values if name not in free and name != "c"]
-    globs = [name.replace("[", "[[]").replace("*", "[*]").replace("?", "[?]") for name in images]
-    lines = ["[[camera]]", f"name = {json.dumps(camera.name)}", f"images = {json.dumps(globs)}"]
-    lines += [f"size_px = {list(camera.size_px)}", f"pixel_mm = {camera.pixel_mm.tolist()}"]
-    lines += [f"c_mm = {camera.c_px * float(np.mean(camera.pixel_mm))!r}", f'model = "{camera.model}"']
-    lines += [f"free = {json.dumps(free)}"]
-    return [*lines, f"fixed = {{ {', '.join(held)} }}"] if held else lines
 
 
 def _rig_section(folder: Path, network: Network, truth: Estimate) -> list[str]:

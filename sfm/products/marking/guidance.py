@@ -113,7 +113,10 @@ class Guide:
                 G, N = through
                 C = joint.of_new(by + by_X @ G) + by_X @ N @ by_X.T * self.marks.variance_factor
             else:
-                C = joint.of_new(by) + by_X @ self._given_covariance(point) @ by_X.T
+                control = self.network.control
+                row = np.flatnonzero(control.point == point)
+                given = control.covariance[row[0]] if len(row) else np.zeros((3, 3))
+                C = joint.of_new(by) + by_X @ np.where(np.isfinite(given), given, 0.0) @ by_X.T
             predicted.append(Predicted(i, xy, C))
         return predicted
 
@@ -137,12 +140,6 @@ class Guide:
         except np.linalg.LinAlgError:
             return None
         return -Q @ right, np.asarray(Q, dtype=float)
-
-    def _given_covariance(self, point: int) -> FloatArray:
-        control = self.network.control
-        k = np.flatnonzero(control.point == point)
-        C = control.covariance[k[0]] if len(k) else np.zeros((3, 3))
-        return np.where(np.isfinite(C), C, 0.0)
 
     def _is_inside(self, i: int, xy: FloatArray) -> bool:
         return bool((xy > BORDER_PX).all() and (xy < self._sizes[i] - 1 - BORDER_PX).all())
@@ -176,7 +173,16 @@ class Guide:
         oriented = self.estimate.oriented
         if not oriented[image]:
             return []
-        nearest, farthest = self._depths(image)
+        # depths between which the object is, seen from the photograph
+        away = (self.estimate.points - self.estimate.position[image]) @ self.estimate.rotation[image]
+        depth = -away[:, 2]
+        depth = depth[np.isfinite(depth) & (depth > 0)]
+        if not len(depth):
+            base = np.linalg.norm(self.estimate.position - self.estimate.position[image], axis=1)
+            depth = base[np.isfinite(base) & (base > 0)]
+        if not len(depth):
+            depth = np.ones(1)
+        nearest, farthest = NEAREST * float(depth.min()), FARTHEST * float(depth.max())
         lines = []
         for j in np.flatnonzero(oriented).tolist():
             if j == image:
@@ -195,18 +201,6 @@ class Guide:
             if len(path) > 1:
                 lines.append((j, path))
         return lines
-
-    def _depths(self, image: int) -> tuple[float, float]:
-        """Return the depths between which the object is, seen from a photograph."""
-        away = (self.estimate.points - self.estimate.position[image]) @ self.estimate.rotation[image]
-        depth = -away[:, 2]
-        depth = depth[np.isfinite(depth) & (depth > 0)]
-        if not len(depth):
-            base = np.linalg.norm(self.estimate.position - self.estimate.position[image], axis=1)
-            depth = base[np.isfinite(base) & (base > 0)]
-        if not len(depth):
-            depth = np.ones(1)
-        return NEAREST * float(depth.min()), FARTHEST * float(depth.max())
 
 
 def is_same_place(before: Predicted, after: Predicted) -> bool:

@@ -110,7 +110,15 @@ def project_of_survey(
     )
     given = _given_image_points(survey, files, cameras)
     if solution is not None:
-        cameras, files = _cameras_of(solution, files, cameras)
+        # those of the result, then those of the survey for photographs that are not in it
+        network = solution.network
+        index = {name: int(network.camera[i]) for i, name in enumerate(network.images)}
+        solved = solution.estimate.cameras
+        owner = [
+            index.get(name, len(solved) + int(k)) for name, k in zip(files.names, files.camera, strict=True)
+        ]
+        cameras = (*solved, *cameras)
+        files = PhotographList(files.names, files.paths, np.array(owner, dtype=np.int64), files.folder)
     sizes = tuple(data.size_px for data in metadata)
     return MarkedProject(survey, files, sizes, cameras, solution, survey_file, given)
 
@@ -130,19 +138,6 @@ def _given_image_points(
             for image, point, (x, y), covariance in zip(here.image, here.point, xy, C, strict=True)
         ]
     return tuple(given)
-
-
-def _cameras_of(
-    solution: Solution, files: PhotographList, cameras: tuple[Camera, ...]
-) -> tuple[tuple[Camera, ...], PhotographList]:
-    """Return the cameras of a result, then those of the survey for photographs that are not in it."""
-    network = solution.network
-    index = {name: int(network.camera[i]) for i, name in enumerate(network.images)}
-    solved = solution.estimate.cameras
-    owner = [index.get(name, len(solved) + int(k)) for name, k in zip(files.names, files.camera, strict=True)]
-    return (*solved, *cameras), PhotographList(
-        files.names, files.paths, np.array(owner, dtype=np.int64), files.folder
-    )
 
 
 def refuse_other_survey(marks: str, survey: str, path: Path) -> None:

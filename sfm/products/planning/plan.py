@@ -266,10 +266,19 @@ def further_photographs(
     planned = _with_mean_normals(network, estimate, rows)
     camera = int(np.bincount(network.camera[oriented]).argmax())
     seeing = Seeing(sigma_px=sigma_px, max_incidence_deg=max_incidence_deg)
+    # the room of the survey's stations, slightly enlarged
+    position = estimate.position[oriented]
+    nearest = np.linalg.norm(planned.xyz[None] - position[:, None], axis=2).min(axis=1)
+    low, high = position.min(axis=0), position.max(axis=0)
+    margin = ROOM * float(np.linalg.norm(high - low)) + 1e-6 * planned.size
+    limits = StationLimits(
+        (DISTANCES[0] * float(nearest.min()), DISTANCES[1] * float(nearest.max())),
+        np.stack([low - margin, high + margin]),
+    )
     room = candidates(
         planned,
         estimate.cameras[camera],
-        _room(planned, estimate.position[oriented]),
+        limits,
         seeing,
         count=candidate_count,
     )
@@ -328,17 +337,6 @@ def _with_mean_normals(network: Network, estimate: Estimate, rows: IntArray) -> 
     length = np.linalg.norm(total[rows], axis=1, keepdims=True)
     normals = np.where(length > 1e-9, total[rows] / np.maximum(length, 1e-9), np.nan)
     return PlannedObject(tuple(network.points[j] for j in rows), estimate.points[rows], normals)
-
-
-def _room(planned: PlannedObject, position: FloatArray) -> StationLimits:
-    """Return the limits of the survey's stations, slightly enlarged."""
-    nearest = np.linalg.norm(planned.xyz[None] - position[:, None], axis=2).min(axis=1)
-    low, high = position.min(axis=0), position.max(axis=0)
-    margin = ROOM * float(np.linalg.norm(high - low)) + 1e-6 * planned.size
-    return StationLimits(
-        (DISTANCES[0] * float(nearest.min()), DISTANCES[1] * float(nearest.max())),
-        np.stack([low - margin, high + margin]),
-    )
 
 
 def _chosen(

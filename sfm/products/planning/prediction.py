@@ -206,7 +206,16 @@ def predict_network(
     """
     cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
     if sight is None:
-        sight = _sight(planned, cameras, stations, seeing)
+        # in all photographs, each with its camera
+        of_camera = rows_of(stations.camera, len(cameras))
+        parts = [
+            sight_of(planned, lens, stations.position[taken], stations.rotation[taken], seeing)
+            for lens, taken in zip(cameras, of_camera, strict=True)
+        ]
+        order = np.argsort(np.concatenate(of_camera))
+        each = ([getattr(part, field.name) for part in parts] for field in fields(Sight))
+        joined = (np.concatenate(column)[order] for column in each)
+        sight = Sight(*joined)
     photographs, points = select_usable(sight.seen, stations.taken_at)
     if len(photographs) < 2 or not len(points):
         raise GeometryError(
@@ -268,18 +277,6 @@ def _refuse_contradictions(network: Network, estimate: Estimate) -> None:
                 f"the object, with sigma {kind.sigma.ravel()[worst]:.4g}; needed points on it, within "
                 f"{MAX_OFF_SIGMAS:g} sigma"
             )
-
-
-def _sight(planned: PlannedObject, cameras: Sequence[Camera], stations: Stations, seeing: Seeing) -> Sight:
-    """Return the visibility in all photographs, each with its camera."""
-    rows = rows_of(stations.camera, len(cameras))
-    parts = [
-        sight_of(planned, camera, stations.position[of_camera], stations.rotation[of_camera], seeing)
-        for camera, of_camera in zip(cameras, rows, strict=True)
-    ]
-    order = np.argsort(np.concatenate(rows))
-    joined = (np.concatenate([getattr(part, field.name) for part in parts])[order] for field in fields(Sight))
-    return Sight(*joined)
 
 
 def select_usable(seen: BoolArray, moment: IntArray | None = None) -> tuple[IntArray, IntArray]:

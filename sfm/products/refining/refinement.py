@@ -309,7 +309,12 @@ def refine_model(
     model, further = whole_model(network, estimate, final.estimate, windows, images, points, tolerance_px)
     taken = np.zeros(len(seen), dtype=bool)
     taken[adjusted], taken[further] = ~final.rejected[: len(adjusted)], True
-    rejected = ~taken & (_residual_px(network, model, windows) > tolerance_px)
+    # the larger residual of each new image point, NaN if its point has few rays
+    known = np.isfinite(windows.xy).all(axis=1)
+    rays = np.bincount(seen.point[known], minlength=len(network.points))
+    v = project_points(model, network.camera, seen.image, model.points[seen.point]) - windows.xy
+    residual_px = np.where(rays[seen.point] >= MIN_RAYS, np.abs(v).max(axis=1), np.nan)
+    rejected = ~taken & (residual_px > tolerance_px)
     rejected[adjusted] = final.rejected[: len(adjusted)]
     left = int((np.isfinite(windows.xy).all(axis=1) & ~taken & ~rejected).sum())
     return Refinement(
@@ -330,15 +335,6 @@ def refine_model(
         targets,
         remarks if targets is None else (*targets.remarks, *remarks),
     )
-
-
-def _residual_px(network: Network, model: Estimate, windows: Windows) -> FloatArray:
-    """Return the larger residual of each new image point, px, NaN if its point has few rays, (k,)."""
-    seen = network.image_points
-    measured = np.isfinite(windows.xy).all(axis=1)
-    rays = np.bincount(seen.point[measured], minlength=len(network.points))
-    v = project_points(model, network.camera, seen.image, model.points[seen.point]) - windows.xy
-    return np.where(rays[seen.point] >= MIN_RAYS, np.abs(v).max(axis=1), np.nan)
 
 
 def refinement_text(result: Refinement) -> str:

@@ -169,7 +169,13 @@ class _View(NamedTuple):
 def _paint_face(fine: AnyArray, scene: Scene, face: int, view: _View, n: int, scratch: AnyArray) -> None:
     """Paint one face with its marks and its light over the existing image, n cells along a pixel."""
     faces, marks = scene.faces, scene.marks
-    H = _plane_from_ray(scene, face, view.position, view.rotation)
+    # H (u, v, -1) is (a w, b w, w) with plane coordinates a, b; w < 0 in front
+    away = view.position - faces.centre[face]
+    normal = faces.normals()[face]
+    by_ray = normal @ view.rotation
+    height = normal @ away
+    a, b = (axis @ away * by_ray - height * (axis @ view.rotation) for axis in faces.axes[face])
+    H = np.stack([a, b, by_ray])
 
     def windows(centre: FloatArray, half: FloatArray) -> IntArray:
         """Return first and last row and column of the cells around squares, in whole pixels, (k, 4)."""
@@ -225,20 +231,6 @@ def _lamp(scene: Scene, face: int) -> Lamp:
     a, b = scene.faces.axes[face] @ away
     height = scene.faces.normals()[face] @ away
     return Lamp(float(a), float(b), float(height), float(scene.light.reach) ** 2, float(scene.light.ambient))
-
-
-def _plane_from_ray(scene: Scene, face: int, position: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return H, (3, 3): H (u, v, -1) is (a w, b w, w) with plane coordinates a, b; w < 0 in front.
-
-    The point on the ray X0 + t R q has t = n (O - X0) / (n R q) on the plane through O with normal n.
-    """
-    faces = scene.faces
-    away = position - faces.centre[face]
-    normal = faces.normals()[face]
-    n = normal @ rotation
-    height = normal @ away
-    a, b = (axis @ away * n - height * (axis @ rotation) for axis in faces.axes[face])
-    return np.stack([a, b, n])
 
 
 def write_photographs(staging: Staging, folder: Path) -> None:

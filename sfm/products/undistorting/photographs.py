@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -75,7 +74,12 @@ class UndistortedPhotographs:
         self.count += 1
         drawn = cv2.remap(pixels, x, y, INTERPOLATION, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         if drawn.dtype == np.uint8:
-            colours = drawn if drawn.ndim == 2 else np.ascontiguousarray(drawn[:, :, _in_rgb(drawn)])
+            # in the order of others, red, green, blue and alpha
+            colours = (
+                drawn
+                if drawn.ndim == 2
+                else np.ascontiguousarray(drawn[:, :, (2, 1, 0, 3)[: drawn.shape[2]]])
+            )
             options: dict[str, object] = {"exif": exif} if exif else {}
             options |= {"icc_profile": icc} if icc else {}
             if kind in ("JPEG", "MPO", "WEBP"):
@@ -117,8 +121,3 @@ def _exif(header: Image.Image) -> bytes:
     if ExifTags.Base.Orientation in kept:
         kept[ExifTags.Base.Orientation] = 1
     return kept.tobytes() if len(kept) else b""
-
-
-def _in_rgb(image: AnyArray) -> Sequence[int]:
-    """Return the order of OpenCV's channels blue, green, red and alpha as others have them."""
-    return (2, 1, 0, 3)[: image.shape[2]]
