@@ -216,7 +216,17 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, HEADER_BYTES))
             database.execute("PRAGMA trusted_schema = OFF")
             database.execute("PRAGMA ignore_check_constraints = ON")
-            _refuse_other_tables(path, database)
+            # no file without COLMAP's tables, or with views or virtual tables in their place
+            kinds = dict(database.execute("SELECT name, type = 'table' AND rootpage > 0 FROM sqlite_master"))
+            for name in TABLES:
+                if name not in kinds:
+                    raise SurveyFileError(
+                        f"{path}: an SQLite file without the table {name}; a COLMAP database has "
+                        f"{', '.join(TABLES)}"
+                    )
+                columns = database.execute(f"PRAGMA table_xinfo({name})").fetchall()
+                if not kinds[name] or any(hidden for *_, hidden in columns):
+                    raise SurveyFileError(f"{path}: {name} is computed, needed a table that contains it")
             damage = database.execute("PRAGMA quick_check(1)").fetchone()[0]
             if damage != "ok":
                 raise SurveyFileError(f"{path}: the database is damaged, {_one_line(damage)}")
@@ -253,19 +263,6 @@ def _refuse_other_files(path: Path) -> int:
             f"{path}: the file is cut off, it has {size} of the {stated} bytes stated in its header"
         )
     return size
-
-
-def _refuse_other_tables(path: Path, database: sqlite3.Connection) -> None:
-    """Refuse a file without COLMAP's tables, or with views or virtual tables in their place."""
-    kinds = dict(database.execute("SELECT name, type = 'table' AND rootpage > 0 FROM sqlite_master"))
-    for name in TABLES:
-        if name not in kinds:
-            raise SurveyFileError(
-                f"{path}: an SQLite file without the table {name}; a COLMAP database has {', '.join(TABLES)}"
-            )
-        columns = database.execute(f"PRAGMA table_xinfo({name})").fetchall()
-        if not kinds[name] or any(hidden for *_, hidden in columns):
-            raise SurveyFileError(f"{path}: {name} is computed, needed a table that contains it")
 
 
 class _Reader:

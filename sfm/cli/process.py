@@ -14,10 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
-
-if TYPE_CHECKING:
-    pass
+from typing import Any, TextIO
 
 READER_GONE = 141  # exit code 128 + SIGPIPE, as a shell reports it for other programs
 FAILED = 1  # exit code if a result is not dependable or a check fails

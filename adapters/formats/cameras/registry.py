@@ -222,7 +222,11 @@ def read_cameras(path: Path, name: str | None = None) -> CameraFile:
         form = camera_format(name)
     if form is not None:
         file = form.read(path)
-        _refuse_duplicates(path, file)
+        for called, count in Counter(camera.name for camera in file.cameras).items():
+            if count > 1:
+                raise SurveyFileError(
+                    f"{path}: {counted(count, 'camera')} of the name '{called}', needed one"
+                )
         return replace(file, name=str(path))
     if name is None and not path.is_dir():
         try:
@@ -273,9 +277,3 @@ def write_cameras(path: Path, name: str, file: CameraFile) -> None:
     content = form.write(path, replace(file, cameras=tuple(stored)))
     with whole_file(path) as part:
         part.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
-
-
-def _refuse_duplicates(path: Path, file: CameraFile) -> None:
-    for name, count in Counter(camera.name for camera in file.cameras).items():
-        if count > 1:
-            raise SurveyFileError(f"{path}: {counted(count, 'camera')} of the name '{name}', needed one")

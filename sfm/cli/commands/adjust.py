@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
 from sfm.cli.survey_runs import (
     AllowOutside,
     Calibration,

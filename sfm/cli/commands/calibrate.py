@@ -70,7 +70,10 @@ def calibrate(
         if not value > 0:
             raise KolinearError(f"--distance {value:g}, expected more than 0")
     if model is not None:
-        _refuse_unknown(model)
+        from sfm.model.distortion.models import MODELS
+
+        if model not in MODELS:
+            raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
     survey_file, images = photographs, None
     product = _Product(distances)
     if photographs.is_dir() and (photographs / SURVEY_FILE).is_file():
@@ -104,13 +107,6 @@ def calibrate(
             product=product,
         ),
     )
-
-
-def _refuse_unknown(model: str) -> None:
-    from sfm.model.distortion.models import MODELS
-
-    if model not in MODELS:
-        raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
 
 
 def _for_calibration(text: str, model: str | None) -> str:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sfm.cli.process import loading
 from sfm.model.errors import GeometryError
 from sfm.runtime.faults import working_on
-
-if TYPE_CHECKING:
-    pass
 
 
 def plan_more(

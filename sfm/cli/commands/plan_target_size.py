@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sfm.cli.process import loading
 from sfm.model.errors import SurveyFileError
 from sfm.products.planning import MIN_PIXELS
-
-if TYPE_CHECKING:
-    pass
 
 
 def plan_target_size(

@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 from sfm.textbook.resection import METHODS
-
-if TYPE_CHECKING:
-    pass
 
 
 def resect(

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from sfm.model.errors import KolinearError
-
-if TYPE_CHECKING:
-    pass
 from sfm.cli.survey_runs import (
     SURVEY_FILE,
     AllowOutside,
@@ -29,6 +25,7 @@ from sfm.cli.survey_runs import (
     refuse_pitch,
     run_survey_file,
 )
+from sfm.model.errors import KolinearError
 
 
 def run(

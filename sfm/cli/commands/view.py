@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,12 +12,6 @@ from sfm.cli.process import loading
 from sfm.model.display import counted
 from sfm.model.errors import OutputError
 from sfm.runtime.faults import working_on
-
-if TYPE_CHECKING:
-    from sfm.model.conventions import BoolArray, FloatArray
-    from sfm.model.solution import Solution
-if TYPE_CHECKING:
-    pass
 
 PICTURES = "pictures"  # folder of photographs in a result folder
 
@@ -78,7 +72,12 @@ def view(
         stored = read_comparable(source, from_format)
         rejected = w = seen = None
         if (from_format or format_of(source).name) == "tables":
-            stored, rejected, w = _read_rejected(source, stored)
+            from dataclasses import replace
+
+            from adapters.formats.result_tables import read_image_points
+
+            measured, rejected, w = read_image_points(source, stored.network)
+            stored = replace(stored, network=replace(stored.network, image_points=measured))
             seen = read_targets(source, stored.network)
         scene = scene_of_stored(stored, w=w, rejected=rejected, seen_targets=seen)
     if images is not None:
@@ -107,13 +106,3 @@ def view(
     print(f"Page: {page}")
     if browser and not webbrowser.open(page.resolve().as_uri()):
         print("No browser could be opened; open the page yourself.")
-
-
-def _read_rejected(folder: Path, stored: Solution) -> tuple[Solution, BoolArray, FloatArray]:
-    """Return a result with its rejected image points, the mask of these, and w of all image points."""
-    from dataclasses import replace
-
-    from adapters.formats.result_tables import read_image_points
-
-    seen, rejected, w = read_image_points(folder, stored.network)
-    return replace(stored, network=replace(stored.network, image_points=seen)), rejected, w
