@@ -203,7 +203,11 @@ def compare_cameras(
         sigmas.append(_moved_by_sigma(b, moved, covariance[1]))
     if any(columns.shape[2] for columns in sigmas):
         both = np.concatenate(sigmas, axis=2)
-        free = both - _absorbed(_lever(b, moved, points, shifts), both, known)
+        # without what a rotation and shift, fitted where the difference is known, take up
+        lever = _lever(b, moved, points, shifts)
+        sound = known & np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(both).all(axis=(1, 2))
+        A, by_sigma = lever[sound].reshape(-1, lever.shape[2]), both[sound].reshape(-1, both.shape[2])
+        free = both - lever @ np.linalg.lstsq(A, by_sigma, rcond=None)[0]
         C = free @ np.swapaxes(free, 1, 2)
         known = np.asarray(known & np.isfinite(free).all(axis=(1, 2)))  # not at the end of a model's range
         p_value = _probability(float((difference[known] ** 2).sum()), free[known])
@@ -328,13 +332,6 @@ def _moved_by_sigma(camera: Camera, uv: FloatArray, Q: FloatArray) -> FloatArray
     values, vectors = np.linalg.eigh(Q[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
     root = sigma[free][:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(parameter_jacobian(camera, uv)[:, :, free] @ root)
-
-
-def _absorbed(lever: FloatArray, moved: FloatArray, known: BoolArray) -> FloatArray:
-    """Return the part of movements (k, 2, n) that a rotation and shift, fitted where known, take up."""
-    sound = known & np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(moved).all(axis=(1, 2))
-    A, columns = lever[sound].reshape(-1, lever.shape[2]), moved[sound].reshape(-1, moved.shape[2])
-    return np.asarray(lever @ np.linalg.lstsq(A, columns, rcond=None)[0])
 
 
 def _probability(square_sum: float, moved: FloatArray) -> float:

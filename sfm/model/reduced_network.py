@@ -15,7 +15,7 @@ from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
-from sfm.model.network import Network, ObjectPoints
+from sfm.model.network import Network
 from sfm.model.observations.kind import Kind
 
 CORRELATION_LIMIT = 0.999999  # above it a covariance matrix is singular in floating point
@@ -196,7 +196,10 @@ def check_network(network: Network, estimate: Estimate) -> None:
         raise GeometryError(
             f"{of_row(wrong)}: image coordinates {_in_text(seen.xy[wrong])} px, expected numbers"
         )
-    wrong = _first(~_positive_definite(seen.covariance))
+    a, b, c = seen.covariance[:, 0, 0], seen.covariance[:, 0, 1], seen.covariance[:, 1, 1]
+    symmetric = np.abs(b - seen.covariance[:, 1, 0]) <= 1e-9 * np.sqrt(np.abs(a * c))
+    possible = np.isfinite(seen.covariance).all(axis=(1, 2)) & symmetric & (a > 0) & (a * c > b * b)
+    wrong = _first(~possible)
     if wrong is not None:
         raise GeometryError(
             f"{of_row(wrong)}: covariance {_in_text(seen.covariance[wrong])} px^2, expected a symmetric "
@@ -204,7 +207,18 @@ def check_network(network: Network, estimate: Estimate) -> None:
         )
     control, bars = network.control, network.scale_bars
     if len(control):
-        _check_control(control, network.points)
+        wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~possible_covariances(control.covariance))
+        if wrong is not None:
+            raise GeometryError(
+                f"control point {network.points[control.point[wrong]]}: expected finite coordinates and a "
+                "symmetric positive definite covariance, of which variances may be 0 (fixed) or infinite "
+                "(not known)"
+            )
+        twice = np.flatnonzero(np.bincount(control.point, minlength=len(network.points)) > 1)
+        if len(twice):
+            raise GeometryError(
+                f"control point {network.points[twice[0]]}: duplicate, expected each point once"
+            )
     good = np.isfinite(bars.length) & (bars.length > 0) & np.isfinite(bars.sigma) & (bars.sigma > 0)
     wrong = _first(~good | (bars.start == bars.end))
     if wrong is not None:
@@ -212,19 +226,6 @@ def check_network(network: Network, estimate: Estimate) -> None:
             f"scale bar {network.points[bars.start[wrong]]} - {network.points[bars.end[wrong]]}: length "
             f"{bars.length[wrong]:g}, sigma {bars.sigma[wrong]:g}, expected two points and positive numbers"
         )
-
-
-def _check_control(control: ObjectPoints, points: tuple[str, ...]) -> None:
-    """Refuse control points that cannot be adjusted; `points` are the names of all object points."""
-    wrong = _first(~np.isfinite(control.xyz).all(axis=1) | ~possible_covariances(control.covariance))
-    if wrong is not None:
-        raise GeometryError(
-            f"control point {points[control.point[wrong]]}: expected finite coordinates and a symmetric "
-            "positive definite covariance, of which variances may be 0 (fixed) or infinite (not known)"
-        )
-    twice = np.flatnonzero(np.bincount(control.point, minlength=len(points)) > 1)
-    if len(twice):
-        raise GeometryError(f"control point {points[twice[0]]}: duplicate, expected each point once")
 
 
 def check_number(what: str, value: float, low: float, high: float = np.inf) -> None:
@@ -251,13 +252,6 @@ def _first(wrong: BoolArray) -> int | None:
 
 def _in_text(values: FloatArray) -> str:
     return " ".join(f"{value:g}" for value in np.ravel(values))
-
-
-def _positive_definite(covariance: FloatArray) -> BoolArray:
-    """Return which covariances (k, 2, 2) are symmetric and positive definite."""
-    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    symmetric = np.abs(b - covariance[:, 1, 0]) <= 1e-9 * np.sqrt(np.abs(a * c))
-    return np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & symmetric & (a > 0) & (a * c > b * b))
 
 
 def possible_covariances(covariance: FloatArray) -> BoolArray:

@@ -169,7 +169,9 @@ def fit_motions(source: FloatArray, target: FloatArray, motions: FloatArray) -> 
     centre, size = source.mean(axis=0), float(np.ptp(source, axis=0).max())
     along = motions_along(source, motions, centre=centre, size=size)
     overall = fit_similarity(source, target)
-    axes = _space(along[3:6])
+    # an orthonormal basis of the space that the turns span
+    U, sizes, _ = np.linalg.svd(along[3:6])
+    axes = U[:, : int((sizes > OPEN).sum())]
     turn = Rotation.from_matrix(overall.rotation)
     if axes.shape[1] == 1:
         *v, q = turn.as_quat()
@@ -195,12 +197,6 @@ def _finite_motion(motion: FloatArray, centre: FloatArray, size: float) -> Float
     generator[:3, :3] = (skew(motion[3:6]) + motion[6] * np.eye(3)) / size
     generator[:3, 3] = motion[:3] - generator[:3, :3] @ centre
     return np.asarray(expm(generator))
-
-
-def _space(directions: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the space that directions span, (k, rank)."""
-    U, d, _ = np.linalg.svd(directions)
-    return U[:, : int((d > OPEN).sum())]
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -162,7 +162,11 @@ def draw_photograph(
     colour_of_target = [UNUSED if row < 0 else colour[row] for row in owner]
     crowded = len(photograph.xy) > MAX_NAMED_POINTS
     if crowded:
-        _dots(picture, photograph.xy, colour_of_target, scale)
+        # lines of zero length and the thickness of a dot, all of one colour at once
+        at = np.repeat(_drawn(photograph.xy, scale)[:, None], 2, axis=1)
+        for shade in dict.fromkeys(colour_of_target):
+            dots = at[[c == shade for c in colour_of_target]]
+            cv2.polylines(picture, list(dots), False, shade, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
     else:
         _outlines(picture, photograph, colour_of_target, scale)
     _crosses(picture, photograph.rejected_xy, photograph.rejected_flag, scale)
@@ -227,14 +231,6 @@ def _remarks(photograph: PhotographTargets) -> IntArray:
 def _drawn(xy: FloatArray, scale: float) -> AnyArray:
     """Return positions with SHIFT fractional bits, as OpenCV takes them, scaled about the pixel corner."""
     return np.round(((xy + 0.5) * scale - 0.5) * (1 << SHIFT)).clip(-(2**28), 2**28).astype(np.int32)
-
-
-def _dots(picture: AnyArray, xy: FloatArray, colour: list[tuple[int, int, int]], scale: float) -> None:
-    """Draw dots as lines of zero length and the thickness of a dot, all dots of one colour at once."""
-    at = np.repeat(_drawn(xy, scale)[:, None], 2, axis=1)
-    for shade in dict.fromkeys(colour):
-        dots = at[[c == shade for c in colour]]
-        cv2.polylines(picture, list(dots), False, shade, 2 * DOT_PX, cv2.LINE_AA, SHIFT)
 
 
 def _outlines(

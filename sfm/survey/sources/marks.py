@@ -102,7 +102,13 @@ def match_marks(
     """
     survey, whole, part = oriented.survey, oriented.measured.network, measured.network
     points = tuple(dict.fromkeys(mark.name for mark in survey.marks))
-    _refuse_names_of_others(survey, whole, points)
+    measuring = np.array([source not in (MARKS, GIVEN) for source in whole.sources])
+    taken = {whole.points[j] for j in whole.image_points.point[measuring[whole.source]].tolist()}
+    for name in points:
+        if name in taken:
+            raise SurveyFileError(
+                f"{survey.source}: point '{name}' has the name of a target or tie point, needed another name"
+            )
     scene = _scene_of(oriented)
     index = {name: i for i, name in enumerate(whole.images)}
     image = np.array([index[name] for name in part.images], dtype=np.int64)
@@ -220,17 +226,6 @@ def _with_pointing(
         if name in by_tables:
             noise[j] += pointing[name] ** 2
     return replace(matched, covariance=matched.covariance + noise[matched.point][:, None, None] * np.eye(2))
-
-
-def _refuse_names_of_others(survey: Survey, network: Network, points: Sequence[str]) -> None:
-    """Raise SurveyFileError if a named point has the name of a point that another source measured."""
-    measuring = np.array([source not in (MARKS, GIVEN) for source in network.sources])
-    measured = {network.points[j] for j in network.image_points.point[measuring[network.source]].tolist()}
-    for name in points:
-        if name in measured:
-            raise SurveyFileError(
-                f"{survey.source}: point '{name}' has the name of a target or tie point, needed another name"
-            )
 
 
 def _match_all(
