@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from sfm.cli.process import FAILED
-from sfm.judgement.survey_result import SurveyResult
 from sfm.model.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.model.remarks.row import Severity
 from sfm.model.remarks.verdict import Line, Verdict
@@ -64,7 +63,13 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
     for line in _failures(findings):
         console.print(Text(f"  {line}"), soft_wrap=True)
     if verbose:
-        console.print(_photograph_table(result))
+        photographs = Table(box=None, padding=(0, 2, 0, 0))
+        for name in ("photograph", "targets", "rejected candidates"):
+            photographs.add_column(name, justify="left" if name != "targets" else "right")
+        for photograph in result.photographs:
+            reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
+            photographs.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
+        console.print(photographs)
         for camera in a.estimate.cameras:
             values = ", ".join(
                 f"{name} {significant(value, 6)} {unit}"
@@ -230,14 +235,3 @@ def _details(findings: Findings) -> tuple[tuple[str, str], ...]:
     if result.no_circles:
         rows.append(("no circles", f"{len(result.no_circles)} left out: {', '.join(result.no_circles)}"))
     return tuple(rows)
-
-
-def _photograph_table(result: SurveyResult) -> Table:
-    """Return the table of measured targets and rejected candidates of each photograph."""
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    for name in ("photograph", "targets", "rejected candidates"):
-        table.add_column(name, justify="left" if name != "targets" else "right")
-    for photograph in result.photographs:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in photograph.reasons())
-        table.add_row(Text(photograph.image), str(len(photograph.xy)), Text(reasons))
-    return table

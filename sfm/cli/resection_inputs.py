@@ -47,7 +47,17 @@ def read_tasks(
     columns = ("X", "Y", "Z", "x_mm", "y_mm")
     table = read_table(points_file, ("point",), columns, aliases=units, ignored=None)
     names, points, xy = table.texts[0], table.values[:, :3], table.values[:, 3:]
-    values = _read_camera(camera_file) if camera_file is not None else {}
+    values: dict[str, float] = {}
+    if camera_file is not None:
+        camera_table = read_table(camera_file, ("parameter",), ("value",), ignored=None)
+        parameters = camera_table.keys("parameter")
+        for line, name in zip(camera_table.line, parameters, strict=True):
+            if name not in _CAMERA:
+                raise SurveyFileError(
+                    f"{camera_file}, line {line}: unknown parameter '{name}', expected one of "
+                    f"{', '.join(_CAMERA)}"
+                )
+        values = dict(zip(parameters, camera_table.values[:, 0].tolist(), strict=True))
     if c_mm is not None:
         values["c"] = c_mm
     if "c" not in values:
@@ -66,17 +76,6 @@ def read_tasks(
         return Task(names, xy, tangents, points, c, begin, tolerance_mm)
 
     return task(values), task(opposite)
-
-
-def _read_camera(path: Path) -> dict[str, float]:
-    table = read_table(path, ("parameter",), ("value",), ignored=None)
-    parameters = table.keys("parameter")
-    for line, name in zip(table.line, parameters, strict=True):
-        if name not in _CAMERA:
-            raise SurveyFileError(
-                f"{path}, line {line}: unknown parameter '{name}', expected one of {', '.join(_CAMERA)}"
-            )
-    return dict(zip(parameters, table.values[:, 0].tolist(), strict=True))
 
 
 def _parse_start(text: str | None) -> FloatArray | None:

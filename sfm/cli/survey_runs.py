@@ -290,6 +290,39 @@ def _lock_folder(folder: Path) -> Iterator[None]:
         yield
 
 
+def stated_or_drafted(
+    place: Path,
+    out: Path | None,
+    pitch: float | None,
+    *,
+    overwrite: bool = False,
+    edit: Callable[[str], str] | None = None,
+) -> tuple[Path, Path | None, Path | None]:
+    """Return the survey file of what a command is given, a survey file or a folder of photographs.
+
+    Args:
+        place: survey file, or a folder, whose survey.toml is taken, or else a draft beside the result.
+        out: see `drafted_beside`.
+        pitch: see `drafted_beside`.
+        overwrite: see `drafted_beside`.
+        edit: see `drafted_beside`.
+
+    Returns:
+        The survey file, the result folder, and the folder of the photographs of a draft, else None.
+
+    Raises:
+        KolinearError: a pitch is given though the survey file exists, or see `drafted_beside`.
+    """
+    if place.is_dir() and not (place / SURVEY_FILE).is_file():
+        return *drafted_beside(place, out, pitch, overwrite=overwrite, edit=edit), place
+    if place.is_dir():
+        place = place / SURVEY_FILE
+        print(f"Running {place}", file=sys.stderr)
+    if place.is_file():
+        refuse_pitch(pitch, place)
+    return place, out, None
+
+
 def drafted_beside(
     photographs: Path,
     out: Path | None,

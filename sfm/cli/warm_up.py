@@ -105,13 +105,8 @@ def compile_adjustment() -> None:
     )
     reprojection(part, compared.estimate)
     every = np.ones((SINGLE_IMAGES, POINTS), dtype=bool)
-    # each photograph shares points with its neighbours only, or a few points with any other
-    first = np.arange(MANY_POINTS) * (MANY_IMAGES - RAYS) // (MANY_POINTS - 1)
-    i = np.arange(MANY_IMAGES)[:, None]
-    strip = (first <= i) & (i < first + RAYS)
-    scattered = np.random.default_rng(3).random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN
     # normal matrices of three forms: factored by fronts, summed ray by ray, and a product in single precision
-    for sees in (strip, scattered, every):
+    for sees in (_strip(), _scattered(), every):
         adjust(*made_up_network(sees), datum=Datum("free"), reject="none")
 
 
@@ -217,6 +212,19 @@ def made_up_network(sees: AnyArray | None = None) -> tuple[Network, Estimate]:
         ImagePoints(image, point, xy[image, point], np.tile(np.eye(2) * NOISE_PX**2, (len(image), 1, 1))),
     )
     return network, Estimate((camera,), position, rotation, points)
+
+
+def _strip() -> AnyArray:
+    """Return which points each photograph sees if it shares points with its neighbours only."""
+    first = np.arange(MANY_POINTS) * (MANY_IMAGES - RAYS) // (MANY_POINTS - 1)
+    i = np.arange(MANY_IMAGES)[:, None]
+    return np.asarray((first <= i) & (i < first + RAYS))
+
+
+def _scattered() -> AnyArray:
+    """Return which points each photograph sees if it shares a few points with any other."""
+    rng = np.random.default_rng(3)
+    return np.asarray(rng.random((MANY_IMAGES, MANY_POINTS)).argsort(axis=1) < SEEN)
 
 
 def drawn_photograph(bright: bool) -> AnyArray:

@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm.cli.survey_runs import (
-    SURVEY_FILE,
     Jobs,
     Out,
     Overwrite,
     Pitch,
     RunOptions,
     SurveyOrPhotographs,
-    drafted_beside,
-    refuse_pitch,
     run_survey_file,
+    stated_or_drafted,
 )
 from sfm.model.errors import KolinearError
 
@@ -74,27 +72,19 @@ def calibrate(
 
         if model not in MODELS:
             raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
-    survey_file, images = photographs, None
     product = _Product(distances)
-    if photographs.is_dir() and (photographs / SURVEY_FILE).is_file():
-        survey_file = photographs / SURVEY_FILE
-        print(f"Running {survey_file}", file=sys.stderr)
-    elif photographs.is_dir():
-        images = photographs
 
-        def edit(text: str) -> str:
-            product.drafted = True
-            return _for_calibration(text, model)
+    def edit(text: str) -> str:
+        product.drafted = True
+        return _for_calibration(text, model)
 
-        survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite, edit=edit)
-        pitch = None
-    if survey_file.is_file():
-        refuse_pitch(pitch, survey_file)
-        if model is not None and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
-            raise KolinearError(
-                f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
-                "model in it, or remove it"
-            )
+    survey_file, out, images = stated_or_drafted(photographs, out, pitch, overwrite=overwrite, edit=edit)
+    asked = model is not None and survey_file.is_file()
+    if asked and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
+        raise KolinearError(
+            f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
+            "model in it, or remove it"
+        )
     run_survey_file(
         survey_file,
         RunOptions(

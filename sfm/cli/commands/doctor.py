@@ -118,7 +118,10 @@ def doctor() -> None:
     for name in LIBRARIES:
         table.add_row(name, _version(name))
     table.add_row("cores", str(cores()))
-    table.add_row("memory", _memory())
+    memory = "unknown"
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"
+    table.add_row("memory", memory)
     table.add_row(
         "browser", next((name for name in BROWSERS if shutil.which(name)), "none found by its name")
     )
@@ -154,9 +157,3 @@ def _version(name: str) -> str:
         return version(name)
     except PackageNotFoundError:
         return "not installed"
-
-
-def _memory() -> str:
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return "unknown"
-    return f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB"

@@ -82,7 +82,10 @@ def epochs(
     if len(results) < 2:
         raise SurveyFileError(f"epochs: {len(results)} given, expected 2 or more")
     groups: dict[str, list[str]] = {}
-    for name, points in map(_parse_group, group or ()):
+    for text in group or ():
+        name, equals, points = (part.strip() for part in text.partition("="))
+        if not (name and equals and points):
+            raise SurveyFileError(f"--group {text}: expected a name and its points, such as pier=P*,17")
         if name in groups:
             raise SurveyFileError(f"--group {name} is given twice")
         groups[name] = _split_names(points)
@@ -126,13 +129,6 @@ def _read_epoch(path: Path) -> Epoch:
         given = read_given(folder, result.network)
     name = folder.resolve().name
     return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0, given.sigma0_px)
-
-
-def _parse_group(text: str) -> tuple[str, str]:
-    name, equals, points = text.partition("=")
-    if not (name.strip() and equals and points.strip()):
-        raise SurveyFileError(f"--group {text}: expected a name and its points, such as pier=P*,17")
-    return name.strip(), points
 
 
 def _split_names(text: str) -> list[str]:

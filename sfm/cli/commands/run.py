@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from sfm.cli.survey_runs import (
-    SURVEY_FILE,
     AllowOutside,
     Calibration,
     Jobs,
@@ -21,9 +19,8 @@ from sfm.cli.survey_runs import (
     SurveyOrPhotographs,
     Verbose,
     Weighted,
-    drafted_beside,
-    refuse_pitch,
     run_survey_file,
+    stated_or_drafted,
 )
 from sfm.model.errors import KolinearError
 
@@ -56,20 +53,11 @@ def run(
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
     reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
     """
-    if survey_file.is_dir():
-        if images is not None:
-            raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
-        if (survey_file / SURVEY_FILE).is_file():
-            survey_file = survey_file / SURVEY_FILE
-            print(f"Running {survey_file}", file=sys.stderr)
-        else:
-            images = survey_file
-            survey_file, out = drafted_beside(images, out, pitch, overwrite=overwrite)
-            pitch = None
-    if survey_file.is_file():
-        refuse_pitch(pitch, survey_file)
+    if survey_file.is_dir() and images is not None:
+        raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
+    survey_file, out, photographs = stated_or_drafted(survey_file, out, pitch, overwrite=overwrite)
     options = RunOptions(
-        images=images,
+        images=photographs or images,
         out=out,
         jobs=jobs,
         allow_outside=allow_outside,

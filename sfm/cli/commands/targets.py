@@ -66,7 +66,13 @@ def targets(
     with loading():
         from sfm.products.printing.sheet import lay_out_sheet, write_sheet
 
-    radii = None if ring_radii is None else _parse_two_numbers(ring_radii)
+    radii = None
+    if ring_radii is not None:
+        try:
+            inner, outer = (float(part) for part in ring_radii.split(","))
+        except ValueError as error:
+            raise SurveyFileError(f"--ring-radii {ring_radii}: expected two numbers such as 2,3") from error
+        radii = inner, outer
     sheet = lay_out_sheet(
         family,
         None if ids is None else _parse_ids(ids),
@@ -77,15 +83,6 @@ def targets(
     )
     for path in write_sheet(sheet, out):
         print(path)
-
-
-def _parse_two_numbers(text: str) -> tuple[float, float]:
-    """Return the two numbers in a text such as `2,3`."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise SurveyFileError(f"--ring-radii {text}: expected two numbers such as 2,3") from error
-    return first, second
 
 
 def _parse_ids(text: str) -> IntArray:
