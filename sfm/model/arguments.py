@@ -76,7 +76,12 @@ def checked_arguments(**shapes: str) -> Callable[[Callable[P, R]], Callable[P, R
             if name in axes and isinstance(value, np.ndarray):
                 before = dict(lengths)
                 if not _has_shape(value.shape, axes[name], lengths):
-                    raise _wrong_shape(f"{called}: {name}", value.shape, axes[name], before)
+                    expected = f"({', '.join(axes[name])}{',' if len(axes[name]) == 1 else ''})"
+                    known = ", ".join(f"{axis} = {before[axis]}" for axis in axes[name] if axis in before)
+                    raise GeometryError(
+                        f"{called}: {name} is an array of shape {value.shape}, expected shape {expected}"
+                        f"{' with ' if known else ''}{known}"
+                    )
             return value
 
         @wraps(function)
@@ -217,16 +222,6 @@ def _has_shape(shape: tuple[int, ...], axes: list[str], lengths: dict[str, int])
         if length != (int(axis) if axis in DIGITS else lengths.setdefault(axis, length)):
             return False
     return True
-
-
-def _wrong_shape(
-    where: str, shape: tuple[int, ...], axes: list[str], lengths: dict[str, int]
-) -> GeometryError:
-    expected = f"({', '.join(axes)}{',' if len(axes) == 1 else ''})"
-    known = ", ".join(f"{axis} = {lengths[axis]}" for axis in axes if axis in lengths)
-    return GeometryError(
-        f"{where} is an array of shape {shape}, expected shape {expected}{' with ' if known else ''}{known}"
-    )
 
 
 def _describe_value(value: object) -> str:

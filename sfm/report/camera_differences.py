@@ -100,9 +100,13 @@ def verdict_of_difference(difference: CameraDifference) -> Banner:
 
 def describe_difference(difference: CameraDifference) -> str:
     """Return the difference of two cameras in a sentence."""
+    row, column = difference.largest
+    xy = np.array([difference.x[column], difference.y[row]])
+    middle = (np.array(difference.size_px) - 1) / 2
+    edge = float(np.linalg.norm(xy - middle) / np.linalg.norm(middle)) > EDGE
     words = (
         f"They differ by {significant(difference.rms_px)} px RMS, {significant(difference.largest_px)} px at "
-        f"most ({_place(difference)})"
+        f"most ({'at the edge, ' if edge else ''}x {xy[0]:.0f}, y {xy[1]:.0f})"
     )
     if np.isnan(difference.p_value):
         return f"{words}; standard deviations are not known."
@@ -110,15 +114,6 @@ def describe_difference(difference: CameraDifference) -> str:
         return f"{words}, {significant(difference.over_sigma)} standard deviations of separate calibrations."
     what = "more than chance" if difference.significant else "no more than chance"
     return f"{words}, {significant(difference.over_sigma)} standard deviations: {what}."
-
-
-def _place(difference: CameraDifference) -> str:
-    """Return in words where the difference is largest."""
-    row, column = difference.largest
-    xy = np.array([difference.x[column], difference.y[row]])
-    middle = (np.array(difference.size_px) - 1) / 2
-    edge = float(np.linalg.norm(xy - middle) / np.linalg.norm(middle)) > EDGE
-    return f"{'at the edge, ' if edge else ''}x {xy[0]:.0f}, y {xy[1]:.0f}"
 
 
 def _figures(difference: CameraDifference) -> Table:

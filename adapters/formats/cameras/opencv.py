@@ -193,17 +193,13 @@ def _yaml_lines(content: dict[str, Entry], remarks: tuple[str, ...]) -> Iterator
     yield from ("%YAML:1.0", "---", *(f"# {remark}" for remark in remarks))
     for name, value in content.items():
         if isinstance(value, np.ndarray):
-            yield from _matrix_lines(name, value)
+            yield f"{name}: !!opencv-matrix"
+            yield from (f"   rows: {value.shape[0]}", f"   cols: {value.shape[1]}", "   dt: d")
+            yield f"   data: [ {numbers_text(value)} ]"
         elif isinstance(value, float):
             yield f"{name}: {numbers_text([value])}"
         else:
             yield f"{name}: {json.dumps(value, ensure_ascii=False)}"
-
-
-def _matrix_lines(name: str, M: FloatArray) -> Iterator[str]:
-    yield f"{name}: !!opencv-matrix"
-    yield from (f"   rows: {M.shape[0]}", f"   cols: {M.shape[1]}", "   dt: d")
-    yield f"   data: [ {numbers_text(M)} ]"
 
 
 def _as_json(M: FloatArray) -> dict[str, object]:

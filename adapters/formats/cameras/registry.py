@@ -75,10 +75,6 @@ class CameraFormat:
         return None
 
 
-def _is_stereographic(camera: Camera) -> bool:
-    return camera.model != "eucm" or tuple(camera.parameters[-2:]) == STEREOGRAPHIC
-
-
 _OPENCV = (LensForm("opencv"), LensForm("full_opencv", LEAN), LensForm("full_opencv"))
 _FISHEYE = LensForm("opencv_fisheye")
 CAMERA_FORMATS = (
@@ -90,7 +86,7 @@ CAMERA_FORMATS = (
         lambda path, head: path.suffix == ".cameramodel" or "'lensmodel'" in head or '"lensmodel"' in head,
         read_mrcal,
         write_mrcal,
-        exact=_is_stereographic,
+        exact=lambda camera: camera.model != "eucm" or tuple(camera.parameters[-2:]) == STEREOGRAPHIC,
     ),
     CameraFormat(
         "metashape-camera",

@@ -158,9 +158,10 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
                 " ± ".join(with_exponent(value, sigma)) + " px" if np.isfinite(sigma) else "not determined"
             )
             rows.append((f"{name}, focal length", stated))
-        c_mm = camera.camera.c_px * float(np.mean(camera.camera.pixel_mm))
+        pixel_mm = float(np.mean(camera.camera.pixel_mm))
+        c_mm = camera.camera.c_px * pixel_mm
         rows += [
-            ("c, principal distance", f"{c_mm:.5g} mm with pixels of {_pixels(camera)}"),
+            ("c, principal distance", f"{c_mm:.5g} mm with pixels of {1000 * pixel_mm:.4g} µm"),
             ("angle of view", f"{degrees[0]} x {degrees[1]} deg, diagonal {degrees[2]} deg"),
             ("principal point", f"{x:.2f}, {y:.2f} px from the upper left corner"),
             ("image points", f"sigma0 {a.sigma0_px:.3f} px, RMS residual {a.rms_px:.3f} px"),
@@ -199,10 +200,6 @@ def _projection(camera: CameraCalibration, distance: float) -> str:
 
 def _free(camera: CameraCalibration) -> list[str]:
     return [name for name, free in zip(camera.camera.names, camera.camera.free, strict=True) if free]
-
-
-def _pixels(camera: CameraCalibration) -> str:
-    return f"{1000 * float(np.mean(camera.camera.pixel_mm)):.4g} µm"
 
 
 def _where(calibration: Calibration) -> Iterator[Part]:
@@ -484,8 +481,9 @@ def _next(calibration: Calibration, folder: str) -> Iterator[Part]:
         heads = columns("photograph", "object at", "tilt", "camera turned", ">distance", ">worst corner then")
         rows = [
             (
-                *(str(k + 1), _place(pose), _tilt(pose), _roll(pose)),
-                *(length_of(pose.distance, unit), f"{significant(after)} px"),
+                *(str(k + 1), _place(pose), _tilt(pose)),
+                *(f"{pose.roll_deg:.0f} deg" if pose.roll_deg else "no", length_of(pose.distance, unit)),
+                f"{significant(after)} px",
             )
             for k, (pose, after) in enumerate(zip(further.poses, further.after, strict=True))
         ]
@@ -523,10 +521,6 @@ def _tilt(pose: Pose) -> str:
     if b:
         parts.append(f"{abs(b):.0f} deg from the {'right' if b > 0 else 'left'}")
     return ", ".join(parts) or "frontal"
-
-
-def _roll(pose: Pose) -> str:
-    return f"{pose.roll_deg:.0f} deg" if pose.roll_deg else "no"
 
 
 def _pose_plot(camera: CameraCalibration, further: NextPoses, number: int) -> Plot:

@@ -20,12 +20,10 @@ def _entries(kind: str) -> Any:
     return Field(strict=False, max_length=MAX_ENTRIES, alias=kind)
 
 
-def _listed(value: Any) -> Any:
-    return (value,) if isinstance(value, str) else value
-
-
 Patterns = Annotated[
-    tuple[Name, ...], Field(strict=False, min_length=1, max_length=MAX_ENTRIES), BeforeValidator(_listed)
+    tuple[Name, ...],
+    Field(strict=False, min_length=1, max_length=MAX_ENTRIES),
+    BeforeValidator(lambda value: (value,) if isinstance(value, str) else value),
 ]
 Numbers = Annotated[tuple[Value, ...], Field(strict=False, min_length=3, max_length=3)]
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]

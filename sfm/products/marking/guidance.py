@@ -104,9 +104,11 @@ class Guide:
         predicted = []
         for i in np.flatnonzero(self.marks.images).tolist():
             terms = None if i in marked else joint.of_unknowns(i, int(self.network.camera[i]), X)
-            if terms is None or not self._is_inside(i, terms[0]):
+            if terms is None:
                 continue
             xy, by, by_X = terms
+            if not ((xy > BORDER_PX) & (xy < self._sizes[i] - 1 - BORDER_PX)).all():
+                continue
             if adjusted:
                 C = joint.of_adjusted(point, by, by_X)
             elif through is not None:
@@ -140,9 +142,6 @@ class Guide:
         except np.linalg.LinAlgError:
             return None
         return -Q @ right, np.asarray(Q, dtype=float)
-
-    def _is_inside(self, i: int, xy: FloatArray) -> bool:
-        return bool((xy > BORDER_PX).all() and (xy < self._sizes[i] - 1 - BORDER_PX).all())
 
     def with_rays(self, point: int) -> FloatArray:
         """Return the coordinates of a point from its present rays, NaN if they do not determine it, (3,)."""

@@ -29,7 +29,6 @@ from sfm.judgement.checks import rms_of_groups
 from sfm.judgement.survey_result import sort_likeliest_first
 from sfm.model.camera import project
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
-from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, ScaleBars
 from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
 from sfm.orientation.image_rays import ray_angles
@@ -240,7 +239,14 @@ def scene_of_stored(
     used = ~rejected[kept]
     ellipse, marks = np.full((len(kept), 3), np.nan), Marks.none()
     if seen_targets is not None:
-        ellipse, marks = joined_targets(_in_oriented(seen_targets, estimate), photo, seen.xy[kept])
+        rows = np.flatnonzero(estimate.oriented[seen_targets.image])
+        of_oriented = SeenTargets(  # photographs, numbered without the others
+            np.searchsorted(np.flatnonzero(estimate.oriented), seen_targets.image[rows]),
+            seen_targets.xy[rows],
+            seen_targets.ellipse[rows],
+            tuple(seen_targets.reason[k] for k in rows),
+        )
+        ellipse, marks = joined_targets(of_oriented, photo, seen.xy[kept])
     rays = Rays(point, photo, seen.xy[kept], v, w[kept], ~used, ellipse)
     use = np.zeros(len(seen), dtype=bool)
     use[kept[used]] = True
@@ -287,17 +293,6 @@ def scene_of_stored(
         None if joint is None else distance_sigmas(xyz, joint),
         float(np.sqrt(np.nanmean(v[used] ** 2))) if used.any() else np.nan,
         tuple(notes),
-    )
-
-
-def _in_oriented(seen: SeenTargets, estimate: Estimate) -> SeenTargets:
-    """Return the targets in photographs with an orientation, which are numbered without the others."""
-    rows = np.flatnonzero(estimate.oriented[seen.image])
-    return SeenTargets(
-        np.searchsorted(np.flatnonzero(estimate.oriented), seen.image[rows]),
-        seen.xy[rows],
-        seen.ellipse[rows],
-        tuple(seen.reason[k] for k in rows),
     )
 
 

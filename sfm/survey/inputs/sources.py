@@ -74,18 +74,14 @@ ROWS = (  # in the order of their points in a network; the first is that of a su
 )
 
 
-def declared(survey: object) -> tuple[Declared, ...]:
+def declared(survey: Any) -> tuple[Declared, ...]:
     """Return the sources of the image points of a survey or its file."""
     stated = tuple(row for row in ROWS if row.is_stated(getattr(survey, row.table)))
     alone = tuple(row for row in stated if row.is_alone(getattr(survey, row.table)))
-    if not stated or (not any(row.stage for row in stated) and not alone and _names_photographs(survey)):
+    without_photographs = not alone and not any(row.stage for row in stated)
+    if not stated or (without_photographs and all(camera.images for camera in survey.cameras)):
         stated = (ROWS[0], *stated)  # image points beside photographs orient them for targets without codes
     return alone[:1] or stated
-
-
-def _names_photographs(survey: Any) -> bool:
-    """Return whether each camera of a survey or its file names its photographs."""
-    return all(camera.images for camera in survey.cameras)
 
 
 def tables_of(given: Any) -> tuple[Any, ...]:
