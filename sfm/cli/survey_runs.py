@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
-
-import typer
+from typing import TYPE_CHECKING, Protocol
 
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.model.errors import KolinearError, OutputError
@@ -22,90 +20,8 @@ if TYPE_CHECKING:
     from sfm.model.remarks.remark import Remark
     from sfm.products.drafting.draft import Draft
 
-Pitch = Annotated[
-    float | None,
-    typer.Option(
-        "--pitch",
-        metavar="MM",
-        min=1e-6,
-        help="Side of the squares of a board, or distance between the dots of a plate, mm, for a drafted "
-        "survey file.  [default: assumed]",
-    ),
-]
 RINGS_PICTURE = "-rings.png"  # after the name of a drafted survey file
 SURVEY_FILE = "survey.toml"  # name in a folder of photographs
-SurveyFile = Annotated[
-    Path, typer.Argument(metavar="SURVEY.toml", help="Survey file; its paths are relative to its folder.")
-]
-SurveyOrPhotographs = Annotated[
-    Path,
-    typer.Argument(
-        metavar="SURVEY.toml|PHOTOS",
-        help="Survey file, whose paths are relative to its folder, or a folder of photographs, for which a "
-        "survey file is drafted.",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        metavar="DIR",
-        help="Folder of the result, written completely or not at all; an earlier result of the same survey "
-        "is replaced.  [default: out/NAME OF THE SURVEY]",
-    ),
-]
-Overwrite = Annotated[
-    bool,
-    typer.Option(
-        "--overwrite",
-        help="Replace a result folder of another survey file or of other photographs; survey files are never "
-        "replaced.",
-    ),
-]
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        "--jobs",
-        metavar="N",
-        min=1,
-        help="Number of photographs processed at a time.  [default: one per core]",
-    ),
-]
-PicturesMb = Annotated[
-    float,
-    typer.Option(
-        "--pictures-mb",
-        metavar="MB",
-        min=0.0,
-        help="Largest total size of photographs and crops inside report.html; the others are in pictures/.",
-    ),
-]
-Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Also print every photograph and every warning.")
-]
-AllowOutside = Annotated[
-    bool,
-    typer.Option(
-        "--allow-outside",
-        help="Let the survey file refer to files outside its folder; only for survey files that you trust.",
-    ),
-]
-Calibration = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera",
-        metavar="RESULT",
-        help="Hold the interior orientation fixed at that of an earlier result; cameras are matched by name.",
-    ),
-]
-Weighted = Annotated[
-    bool,
-    typer.Option(
-        "--camera-weighted",
-        help="Do not hold the parameters fixed that were adjusted in the result of --camera: adjust them "
-        "again, observed with their full covariance.",
-    ),
-]
 
 
 def run_file(survey_file: Path) -> Path:

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import ResultFolder
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 
 
 def accept(
-    source: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
+    source: ResultFolder,
     lengths: Annotated[
         Path, typer.Argument(metavar="LENGTHS.csv", help="Calibrated lengths: line,from,to,length[,sigma].")
     ],

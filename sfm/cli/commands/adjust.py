@@ -2,17 +2,8 @@
 
 from __future__ import annotations
 
-from sfm.cli.survey_runs import (
-    AllowOutside,
-    Calibration,
-    Out,
-    Overwrite,
-    RunOptions,
-    SurveyFile,
-    Verbose,
-    Weighted,
-    run_survey_file,
-)
+from sfm.cli.options import AllowOutside, Calibration, Out, Overwrite, SurveyFile, Verbose, Weighted
+from sfm.cli.survey_runs import RunOptions, run_survey_file
 
 
 def adjust(

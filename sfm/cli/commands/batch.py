@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from threadpoolctl import threadpool_limits
 
+from sfm.cli.options import AllowOutside, PicturesMb, Verbose
 from sfm.cli.process import FAILED, compile_first, loading
-from sfm.cli.survey_runs import AllowOutside, PicturesMb, Verbose, drafted_beside
+from sfm.cli.survey_runs import drafted_beside
 from sfm.model.errors import (
     GeometryError,
     KolinearError,

@@ -10,16 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sfm.cli.survey_runs import (
-    Jobs,
-    Out,
-    Overwrite,
-    Pitch,
-    RunOptions,
-    SurveyOrPhotographs,
-    run_survey_file,
-    stated_or_drafted,
-)
+from sfm.cli.options import Jobs, Out, Overwrite, Pitch, SurveyOrPhotographs
+from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
 from sfm.model.errors import KolinearError
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.survey_runs import SURVEY_FILE, Pitch, draft_folder, write_draft
+from sfm.cli.options import Pitch
+from sfm.cli.survey_runs import SURVEY_FILE, draft_folder, write_draft
 
 
 def init(

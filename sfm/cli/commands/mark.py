@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.options import AllowOutside, OpenPage
 from sfm.cli.process import compile_first, loading
 from sfm.model.display import counted
 from sfm.model.errors import KolinearError, MissingLibraryError
@@ -66,15 +67,8 @@ def mark(
             "--port", metavar="N", min=0, max=65535, help="Port of the page.  [default: a free one]"
         ),
     ] = 0,
-    browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
-    allow_outside: Annotated[
-        bool,
-        typer.Option(
-            "--allow-outside",
-            help="Let the survey file refer to files outside its folder; only for survey files that you "
-            "trust.",
-        ),
-    ] = False,
+    browser: OpenPage = True,
+    allow_outside: AllowOutside = False,
 ) -> None:
     """Measure points by hand, in the browser.
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import AsJson
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 
@@ -69,7 +70,7 @@ def match(
             "around them, or rotated by up to 30 degrees and scaled by up to 1.3.",
         ),
     ] = True,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: AsJson = False,
     out: Annotated[
         Path | None,
         typer.Option(

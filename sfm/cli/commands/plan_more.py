@@ -8,13 +8,14 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import PlanOut, ResultFolder
 from sfm.cli.process import loading
 from sfm.model.errors import GeometryError
 from sfm.runtime.faults import working_on
 
 
 def plan_more(
-    result: Annotated[Path, typer.Argument(metavar="RESULT", help="Result folder of a survey.")],
+    result: ResultFolder,
     count: Annotated[
         int, typer.Option("--photographs", metavar="N", min=1, max=50, help="Number of new photographs.")
     ] = 3,
@@ -26,9 +27,7 @@ def plan_more(
             help="Largest angle between a new ray and the mean ray of a point, degrees.",
         ),
     ] = 60.0,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")
-    ] = Path("out/more"),
+    out: PlanOut = Path("out/more"),
 ) -> None:
     """Propose further photographs that improve the weakest points.
 

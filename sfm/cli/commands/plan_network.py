@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.options import PlanOut
 from sfm.cli.planning_inputs import (
     PlannedSetup,
     bars_of,
@@ -165,9 +166,7 @@ def plan_network(
             help="Scale bar between two points and its sigma; may be given several times.",
         ),
     ] = None,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")
-    ] = Path("out/plan"),
+    out: PlanOut = Path("out/plan"),
 ) -> None:
     """Predict the precision of a network, or design a network.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import AsJson
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
 from sfm.textbook.resection import METHODS
@@ -48,7 +49,7 @@ def resect(
             help="Distortion of the camera file is subtracted from measured coordinates, not added.",
         ),
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Orient one photograph from known points (space resection).
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.survey_runs import (
+from sfm.cli.options import (
     AllowOutside,
     Calibration,
     Jobs,
@@ -15,13 +15,11 @@ from sfm.cli.survey_runs import (
     Overwrite,
     PicturesMb,
     Pitch,
-    RunOptions,
     SurveyOrPhotographs,
     Verbose,
     Weighted,
-    run_survey_file,
-    stated_or_drafted,
 )
+from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
 from sfm.model.errors import KolinearError
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import OpenPage
 from sfm.cli.process import loading
 from sfm.model.display import counted
 from sfm.model.errors import OutputError
@@ -44,7 +45,7 @@ def view(
         float,
         typer.Option("--pictures-mb", metavar="MB", min=0.0, help="Largest total size of the pictures."),
     ] = 15.0,
-    browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+    browser: OpenPage = True,
 ) -> None:
     """Write a result as one page to explore, and open it.
 

@@ -117,6 +117,11 @@ class Control(Body):
     sigma: tuple[Sigma, Sigma, Sigma] = (0.0, 0.0, 0.0)
     remove: bool = False
 
+    @property
+    def stated(self) -> StatedPoint | None:
+        """The control point; None removes it."""
+        return None if self.remove else StatedPoint((self.X, self.Y, self.Z), self.sigma)
+
 
 class Bar(Body):
     """Stated distance of two points, object unit."""
@@ -126,6 +131,11 @@ class Bar(Body):
     length: Positive = 1.0
     sigma: Positive = 1.0
     remove: bool = False
+
+    @property
+    def stated(self) -> ScaleBar | None:
+        """The scale bar; None removes it."""
+        return None if self.remove else ScaleBar(self.start, self.end, self.length, self.sigma)
 
 
 class Step(Body):
@@ -139,28 +149,19 @@ class Nothing(Body):
     """A request without content."""
 
 
-def _click(session: MarkingSession, b: Click) -> dict[str, Any]:
-    return session.click(b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px, page=b.page)
-
-
-def _control(session: MarkingSession, b: Control) -> dict[str, Any]:
-    stated = None if b.remove else StatedPoint((b.X, b.Y, b.Z), b.sigma)
-    return session.set_control(b.point, stated, page=b.page)
-
-
-def _bar(session: MarkingSession, b: Bar) -> dict[str, Any]:
-    bar = None if b.remove else ScaleBar(b.start, b.end, b.length, b.sigma)
-    return session.set_bar(b.start, b.end, bar, page=b.page)
-
-
 CHANGES: dict[str, tuple[type[Body], Callable[[MarkingSession, Any], dict[str, Any]]]] = {
-    "click": (Click, _click),
+    "click": (
+        Click,
+        lambda session, b: session.click(
+            b.image, b.x, b.y, point=b.point, kind=b.kind, sigma_px=b.sigma_px, page=b.page
+        ),
+    ),
     "accept": (Chosen, lambda session, b: session.accept(b.image, b.point, seen=b.version, page=b.page)),
     "refuse": (Chosen, lambda session, b: session.refuse(b.image, b.point, seen=b.version, page=b.page)),
     "delete": (Deleted, lambda session, b: session.delete(b.point, b.image, page=b.page)),
     "rename": (Renamed, lambda session, b: session.rename(b.point, b.name, page=b.page)),
-    "control": (Control, _control),
-    "bar": (Bar, _bar),
+    "control": (Control, lambda session, b: session.set_control(b.point, b.stated, page=b.page)),
+    "bar": (Bar, lambda session, b: session.set_bar(b.start, b.end, b.stated, page=b.page)),
     "automatic": (Nothing, lambda session, b: session.automatic()),
     "undo": (Step, lambda session, b: session.undo(b.number, page=b.page, anyway=b.anyway)),
     "redo": (Step, lambda session, b: session.redo(b.number, page=b.page, anyway=b.anyway)),
