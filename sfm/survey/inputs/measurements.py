@@ -194,8 +194,11 @@ def find_photographs(survey: Survey | SurveyFile, *, images_dir: Path | None = N
                 f"{survey.source}: camera {camera}: images = '{glob}' is not a glob relative to {folder}"
             ) from error
         if not files:
+            others = sorted(path.name for path in folder.iterdir() if path.is_file())
+            has = f"{counted(len(others), 'file')} such as '{others[0]}'" if others else "no files"
             raise SurveyFileError(
-                f"no photographs found: camera {camera} needs '{glob}' in {folder}, {_describe_files(folder)}"
+                f"no photographs found: camera {camera} needs '{glob}' in {folder}, which has {has} "
+                "(--images names another folder)"
             )
         return files
 
@@ -294,14 +297,6 @@ def readable_photographs(photographs: PhotographList) -> tuple[IntArray, tuple[M
         with suppress(PhotographError, OSError):  # the others are reported when they are measured
             metadata[k] = read_metadata(path)
     return np.array(list(metadata), dtype=np.int64), tuple(metadata.values())
-
-
-def _describe_files(folder: Path) -> str:
-    """Return a short description of the files in a folder."""
-    files = sorted(path.name for path in folder.iterdir() if path.is_file())
-    if not files:
-        return "which has no files (--images names another folder)"
-    return f"which has {counted(len(files), 'file')} such as '{files[0]}' (--images names another folder)"
 
 
 def refuse_incomplete_cameras(
