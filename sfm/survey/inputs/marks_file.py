@@ -17,9 +17,11 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import UTC, datetime
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, get_args
@@ -238,8 +240,9 @@ def write_marks(path: Path, marking: Marking) -> None:
         OutputError: the file cannot be written.
         SurveyFileError: a mark is not one that `read_marks` reads.
     """
-    for mark in (*marking.marks.values(), *marking.refused.values()):
-        finite = np.isfinite([mark.x, mark.y, mark.sxx, mark.sxy, mark.syy]).all()
+    marks = (*marking.marks.values(), *marking.refused.values())
+    for mark in marks:
+        finite = all(map(math.isfinite, (mark.x, mark.y, mark.sxx, mark.sxy, mark.syy)))
         if not (finite and mark.sxx > 0 and mark.syy > 0 and mark.sxy**2 < mark.sxx * mark.syy):
             raise SurveyFileError(f"mark of '{mark.point}' in '{mark.photograph}': no place with a precision")
     text = io.StringIO()
@@ -258,9 +261,7 @@ def write_marks(path: Path, marking: Marking) -> None:
         comment("control", name, *stated.xyz, *stated.sigma)
     for bar in marking.bars.values():
         comment("scale bar", bar.start, bar.end, bar.length, bar.sigma)
-    table = csv_text(
-        COLUMNS, [astuple(mark) for mark in (*marking.marks.values(), *marking.refused.values())]
-    )
+    table = csv_text(COLUMNS, map(attrgetter(*(attribute.name for attribute in fields(Mark))), marks))
     with whole_file(path, "the marks file", replaces=True) as part:
         part.write_text(text.getvalue() + table, encoding="utf-8", newline="")
 

@@ -22,6 +22,8 @@ from scipy.special import digamma, fdtri, ndtri, polygamma
 
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import FAMILY
+from sfm.runtime.compiling import compiled
+from sfm.runtime.small_algebra import solve_symmetric
 from sfm.targets.edge_rays import RAYS
 from sfm.targets.fits.goodness import SHAPES
 
@@ -195,8 +197,7 @@ def harmonics(first: int, last: int) -> FloatArray:
     return np.column_stack([f(k * _PHI) for k in range(first, last + 1) for f in (np.cos, np.sin)])
 
 
-_ELLIPSE = np.column_stack([np.ones(RAYS), harmonics(1, 2)])
-_PRODUCTS = (_ELLIPSE[:, :, None] * _ELLIPSE[:, None, :]).reshape(-1, 25)  # products of these, (RAYS, 25)
+_ELLIPSE = np.column_stack([np.ones(RAYS), harmonics(1, 2)])  # that ellipses follow, (RAYS, 5)
 
 
 def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: FloatArray) -> BoolArray:
@@ -236,7 +237,7 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
         places = (hit & ~np.roll(hit, 1, axis=1) & ~np.roll(hit, 2, axis=1)).sum(axis=1)
         hit[places > MAX_PLACES] = False
     damaged = hit.copy()
-    for i in range(1, RAYS // 2):
+    for i in range(1, min(RAYS // 2, int(skirt[hit.any(axis=1)].max(initial=0)) + 1)):
         damaged |= (np.roll(hit, i, axis=1) | np.roll(hit, -i, axis=1)) & (i <= skirt[:, None])
     return damaged
 
@@ -273,28 +274,45 @@ def gap_shifts(common: FloatArray, weight: FloatArray, keep: BoolArray) -> Float
     return (_fit_harmonics(h, weight * keep) - _fit_harmonics(h, weight))[:, 1:3]
 
 
+@compiled
 def _fit_harmonics(h: FloatArray, weight: FloatArray) -> FloatArray:
     """Return harmonics 0 to 2 of outlines, which ellipses follow to first order, radii, shape (k, 5)."""
-    N = (weight @ _PRODUCTS).reshape(-1, 5, 5)
-    N += 1e-9 * (1 + np.trace(N, axis1=1, axis2=2))[:, None, None] * np.eye(5)
-    return np.asarray(np.linalg.solve(N, ((weight * h) @ _ELLIPSE)[..., None])[..., 0])
+    n = _ELLIPSE.shape[1]
+    fitted, N = np.empty((len(h), n)), np.empty((n, n))
+    for k in range(len(h)):
+        N[:], fitted[k] = 0.0, 0.0
+        for j in range(RAYS):
+            for a in range(n):
+                effect = weight[k, j] * _ELLIPSE[j, a]
+                fitted[k, a] += effect * h[k, j]
+                for b in range(a + 1):
+                    N[a, b] += effect * _ELLIPSE[j, b]
+        least = 1e-9 * (1 + np.trace(N))
+        for a in range(n):
+            N[a, a] += least
+        if not solve_symmetric(N, fitted[k]):
+            fitted[k] = np.nan
+    return fitted
 
 
+@compiled
 def _robust_residuals(h: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the residuals of ellipses through most sectors, in sigmas of the noise, shape (k, RAYS).
 
     Source: Huber and Ronchetti, Robust Statistics (2009): Tukey's biweight by iteratively reweighted least
     squares, from the fit of least absolute residuals.
     """
-    robust, root = weight, np.sqrt(weight)
-    z = h * root
-    for k in range(2 * ROUNDS):
-        z = (h - _fit_harmonics(h, robust) @ _ELLIPSE.T) * root
-        if k < ROUNDS:
-            robust = weight / np.maximum(np.abs(z), 0.1)
-        else:
-            scale = np.maximum(MAD * np.median(np.abs(z), axis=1), 1.0)[:, None]
-            robust = weight * np.maximum(1 - (z / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
+    z, robust = np.empty(h.shape), weight.copy()
+    for k in range(len(h)):
+        of_one, root = slice(k, k + 1), np.sqrt(weight[k])
+        for step in range(2 * ROUNDS):
+            z[k] = (h[k] - _ELLIPSE @ _fit_harmonics(h[of_one], robust[of_one])[0]) * root
+            size = np.abs(z[k])
+            if step < ROUNDS:
+                robust[k] = weight[k] / np.maximum(size, 0.1)
+            else:
+                scale = max(MAD * np.median(size), 1.0)
+                robust[k] = weight[k] * np.maximum(1 - (size / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
     return z
 
 

@@ -204,7 +204,8 @@ def _repaired(
         repaired = fit(begin, sign[again], keep[again], depth[again])
         for of_all, part in zip(fits, repaired, strict=True):
             of_all[again] = part
-    seen = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
+    else:  # the last fits have not been looked at
+        seen = _deviations(fits, keep, variance_of_noise + least_variance, least_variance)
     weight, sound, telling = seen.weight, seen.sound, seen.telling
     cut = ~keep.all(axis=1)
     small = _radii(fits.theta) < MIN_RADIUS_PX
