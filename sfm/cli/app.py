@@ -27,6 +27,10 @@ from sfm.cli.commands.init import init
 from sfm.cli.commands.mark import mark
 from sfm.cli.commands.match import match
 from sfm.cli.commands.measure import measure
+from sfm.cli.commands.orient_absolute import orient_absolute
+from sfm.cli.commands.orient_correct import orient_correct
+from sfm.cli.commands.orient_fiducials import orient_fiducials
+from sfm.cli.commands.orient_pair import orient_pair
 from sfm.cli.commands.plan_more import plan_more
 from sfm.cli.commands.plan_network import plan_network
 from sfm.cli.commands.plan_simulate import plan_simulate
@@ -60,6 +64,10 @@ COMMANDS = (
     Command("plan more", plan_more, "RESULT", "photographs to add to a survey"),
     Command("plan target-size", plan_target_size, "--distance D ...", "how large targets must be"),
     Command("resect", resect, "POINTS.csv --c MM", "one photograph on known points"),
+    Command("orient fiducials", orient_fiducials, "MARKS.csv", "measured -> photo coordinates"),
+    Command("orient correct", orient_correct, "POINTS.csv --c MM", "corrections of photo coordinates"),
+    Command("orient pair", orient_pair, "LEFT.csv RIGHT.csv --c MM", "relative orientation and model"),
+    Command("orient absolute", orient_absolute, "MODEL.csv CONTROL.csv", "a model onto control points"),
     Command("mark", mark, "PHOTOS|SURVEY|RESULT", "measure points by hand, in the browser"),
     Command("match", match, "LEFT RIGHT", "conjugate points of two photographs"),
     Command("compare", compare, "A B", "two results or cameras: differences and their significance"),
@@ -75,7 +83,10 @@ COMMANDS = (
     Command("doctor", doctor, "", "versions, folders, and whether this installation measures"),
 )
 PURPOSE = "Close-range photogrammetry: targets, orientation, bundle adjustment and comparison with COLMAP."
-GROUPS = {"plan": "Plan a survey before the photographs are taken."}
+GROUPS = {
+    "plan": "Plan a survey before the photographs are taken.",
+    "orient": "Orient one or two photographs step by step, from tables of coordinates.",
+}
 
 USAGE_ERROR: Any = (
     typer.BadParameter.__base__

@@ -1,4 +1,4 @@
-"""The input files of `kolinear resect`: points of one photograph, and its interior orientation."""
+"""The input files of `kolinear resect` and `kolinear orient`: photo coordinates, interior orientation."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sfm.textbook.resection.by_method import Task
 
 _DISTORTION = ("K1", "K2", "K3", "P1", "P2", "b1", "b2")
 _CAMERA = ("c", "x0", "y0", *_DISTORTION)
+METRES = tuple((f"{axis}_m", axis) for axis in "XYZ")  # columns of object coordinates in m
 _UNIT_PIXEL = np.array([1.0, 1.0])
 
 
@@ -43,39 +44,63 @@ def read_tasks(
         SurveyFileError: a file cannot be read, a column is missing, a value is not a number, or c is not
             given.
     """
-    units = tuple((f"{axis}_m", axis) for axis in "XYZ")
-    columns = ("X", "Y", "Z", "x_mm", "y_mm")
-    table = read_table(points_file, ("point",), columns, aliases=units, ignored=None)
+    table = read_table(points_file, ("point",), (*"XYZ", "x_mm", "y_mm"), aliases=METRES, ignored=None)
     names, points, xy = table.texts[0], table.values[:, :3], table.values[:, 3:]
-    values: dict[str, float] = {}
-    if camera_file is not None:
-        camera_table = read_table(camera_file, ("parameter",), ("value",), ignored=None)
-        parameters = camera_table.keys("parameter")
-        for line, name in zip(camera_table.line, parameters, strict=True):
-            if name not in _CAMERA:
-                raise SurveyFileError(
-                    f"{camera_file}, line {line}: unknown parameter '{name}', expected one of "
-                    f"{', '.join(_CAMERA)}"
-                )
-        values = dict(zip(parameters, camera_table.values[:, 0].tolist(), strict=True))
-    if c_mm is not None:
-        values["c"] = c_mm
-    if "c" not in values:
-        raise SurveyFileError("resect: the principal distance is missing, give --c or a camera file with c")
-    if not values["c"] > 0:
-        raise SurveyFileError(f"resect: the principal distance is {values['c']:g} mm, expected more than 0")
+    values = read_interior("resect", c_mm, camera_file)
     c, begin = values["c"], _parse_start(start)
     opposite = values | {name: -values[name] for name in _DISTORTION if name in values}
 
     def task(values: Mapping[str, float]) -> Task:
-        # a camera with pixels of 1 mm, so image coordinates in mm can be converted to its pixel coordinates
-        camera = camera_from_values(
-            "resect", "brown", (1, 1), (1.0, 1.0), c_mm=c, values=tuple(values.items())
-        )
-        tangents = tangents_from_pixel(camera, pixel_from_image(xy, (1, 1), _UNIT_PIXEL))
-        return Task(names, xy, tangents, points, c, begin, tolerance_mm)
+        return Task(names, xy, tangents_of_photo(xy, values), points, c, begin, tolerance_mm)
 
     return task(values), task(opposite)
+
+
+def read_interior(
+    command: str, c_mm: float | None, camera_file: Path | None, known: tuple[str, ...] = _CAMERA
+) -> dict[str, float]:
+    """Return the interior orientation of a camera file, model `brown`, mm, with its principal distance c.
+
+    Args:
+        command: what needs it, for error messages.
+        c_mm: principal distance, which replaces that of the file; None if the file has it.
+        camera_file: CSV with parameter,value[,...]; None for an ideal camera.
+        known: parameters that the file may have.
+
+    Raises:
+        SurveyFileError: the file cannot be read or has other parameters, or there is no positive c.
+    """
+    values: dict[str, float] = {}
+    if camera_file is not None:
+        table = read_table(camera_file, ("parameter",), ("value",), ignored=None)
+        parameters = table.keys("parameter")
+        for line, name in zip(table.line, parameters, strict=True):
+            if name not in known:
+                raise SurveyFileError(
+                    f"{camera_file}, line {line}: unknown parameter '{name}', expected one of "
+                    f"{', '.join(known)}"
+                )
+        values = dict(zip(parameters, table.values[:, 0].tolist(), strict=True))
+    if c_mm is not None:
+        values["c"] = c_mm
+    if "c" not in values:
+        raise SurveyFileError(
+            f"{command}: the principal distance is missing, give --c or a camera file with c"
+        )
+    if not values["c"] > 0:
+        raise SurveyFileError(
+            f"{command}: the principal distance is {values['c']:g} mm, expected more than 0"
+        )
+    return values
+
+
+def tangents_of_photo(xy_mm: FloatArray, interior: Mapping[str, float]) -> FloatArray:
+    """Return the tangents of measured photo coordinates, (n, 2), with `read_interior`."""
+    # a camera with pixels of 1 mm, so image coordinates in mm can be converted to its pixel coordinates
+    camera = camera_from_values(
+        "photograph", "brown", (1, 1), (1.0, 1.0), c_mm=interior["c"], values=tuple(interior.items())
+    )
+    return tangents_from_pixel(camera, pixel_from_image(xy_mm, (1, 1), _UNIT_PIXEL))
 
 
 def _parse_start(text: str | None) -> FloatArray | None:

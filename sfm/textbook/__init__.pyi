@@ -9,6 +9,7 @@ from sfm.textbook.matching import match_along_line as match_along_line
 from sfm.textbook.matching import match_pyramid as match_pyramid
 from sfm.textbook.pair import NormalImages as NormalImages
 from sfm.textbook.pair import PairOrientation as PairOrientation
+from sfm.textbook.pair import intersect_pair as intersect_pair
 from sfm.textbook.pair import make_normal_images as make_normal_images
 from sfm.textbook.pair import orient_dependent as orient_dependent
 from sfm.textbook.pair import orient_independent as orient_independent

@@ -27,6 +27,7 @@ from sfm.model.conventions import AnyArray, FloatArray, angles_from_rotation, ro
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
+from sfm.orientation.intersection import intersect
 from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
 from sfm.runtime.sampling import resample
 
@@ -137,6 +138,29 @@ def orient_independent(
     return PairOrientation(
         "independent", INDEPENDENT, values, covariance, positions, rotations, v, sigma0, len(v) - UNKNOWNS
     )
+
+
+def intersect_pair(orientation: PairOrientation, first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the model coordinates of the conjugate rays of an oriented pair, unit of its base, (n, 3).
+
+    Args:
+        orientation: of the pair.
+        first: tangents of rays of photograph 1, shape (n, 2).
+        second: tangents of the conjugate rays of photograph 2, shape (n, 2).
+
+    Returns:
+        Points with the smallest sum of squared image residuals; NaN where rays are parallel or meet behind a
+        photograph.
+    """
+    n = len(first)
+    return intersect(
+        np.concatenate([first, second]),
+        np.repeat([0, 1], n),
+        np.tile(np.arange(n), 2),
+        orientation.positions,
+        orientation.rotations,
+        n_points=n,
+    ).points
 
 
 def _base_frame(base: FloatArray) -> FloatArray:

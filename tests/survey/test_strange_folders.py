@@ -122,6 +122,16 @@ def lenses(folder: Path) -> tuple[Path, Path]:
     return folder / "1.cameramodel", folder / "2.cameramodel"
 
 
+def coordinates(folder: Path, *, moved: float = 0.0) -> Path:
+    """A table of points with measured, calibrated and object coordinates, seen from a place 10 away."""
+    path, lines = folder / f"points {moved:g}.csv", ["point,mark,x,y,x_mm,y_mm,X,Y,Z"]
+    for k, (X, Y, Z) in enumerate(seed_of("orient").uniform(-3, 3, (9, 3)).tolist()):
+        x, y = 50 * (X - moved) / (10 - Z), 50 * Y / (10 - Z)
+        lines.append(",".join(map(str, (k, k, x, y, x, y, X, Y, Z))))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
 def scene(folder: Path) -> Path:
     """A scene file of a single photograph, small and dark."""
     path = folder / "scene.toml"
@@ -199,6 +209,31 @@ COMMANDS: dict[str, Command] = {
             "new/a.png",
         ),
         ("new", "new/a.csv", "new/a.png"),
+    ),
+    "orient fiducials": (
+        lambda f: ("orient", "fiducials", coordinates(f), "--points", coordinates(f), "--out", "new/a.csv"),
+        ("new", "new/a.csv"),
+    ),
+    "orient correct": (
+        lambda f: ("orient", "correct", coordinates(f), "--c", 50, "--out", "new/a.csv"),
+        ("new", "new/a.csv"),
+    ),
+    "orient pair": (
+        lambda f: (
+            "orient",
+            "pair",
+            coordinates(f),
+            coordinates(f, moved=1.0),
+            "--c",
+            50,
+            "--out",
+            "new/a.csv",
+        ),
+        ("new", "new/a.csv"),
+    ),
+    "orient absolute": (
+        lambda f: ("orient", "absolute", coordinates(f), coordinates(f), "--out", "new/a.csv"),
+        ("new", "new/a.csv"),
     ),
     "compare": (
         lambda f: ("compare", model(f), f / "model"),

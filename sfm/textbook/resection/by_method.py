@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.display import listed
 from sfm.model.distributions import MARGIN
 from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import resect_fischler_bolles
@@ -23,7 +24,7 @@ from sfm.orientation.resection.least_squares import (
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import DirectLinearTransformation, resect_dlt
-from sfm.textbook.resection.p4p import resect_p4p
+from sfm.textbook.resection.p4p import MIN_POINTS, coplanar_points, resect_p4p
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise
 from sfm.textbook.resection.zeng_wang import resect_rampal, resect_zeng_wang
 
@@ -53,7 +54,7 @@ class ResectionResult:
     """The result of one method; None where the method gives no value. Object unit and rad."""
 
     method: str
-    points: int  # number of given points
+    points: int  # number of points that were used
     solutions: tuple[ResectionSolution, ...]  # best first
     sigma0_mm: float | None = None  # standard deviation of an image coordinate, mm; NaN without redundancy
     redundancy: int | None = None
@@ -64,7 +65,7 @@ class ResectionResult:
     rejected: tuple[str, ...] | None = None  # names of rejected points
     trials: int | None = None  # number of trials of the random sample consensus
     line_fit: tuple[LineFit, ...] = ()  # line fit of each solution, which identifies the true one
-    warning: str = ""  # three points that hardly determine the position, or signs of the distortion
+    warning: str = ""  # on points that hardly determine the position, those used, or signs of the distortion
 
 
 @checked_arguments()
@@ -92,8 +93,9 @@ def resect(task: Task, method: str) -> ResectionResult:
     lines: tuple[LineFit, ...] = ()
     if len(task.points) >= 4 and method in ON_A_LINE:
         lines = choose_by_line(solutions, task.tangents)[1]
-    warning = cylinder_warning(solutions[0].position, task.points[:3]) if method in ON_A_CYLINDER else ""
-    return replace(result, solutions=solutions, line_fit=lines, warning=warning)
+    if method in ON_A_CYLINDER:
+        result = replace(result, warning=cylinder_warning(solutions[0].position, task.points[:3]))
+    return replace(result, solutions=solutions, line_fit=lines)
 
 
 @checked_arguments()
@@ -125,6 +127,17 @@ def _closed_form(
     method: str, function: Callable[[FloatArray, FloatArray], tuple[ResectionSolution, ...]]
 ) -> Callable[[Task], ResectionResult]:
     return lambda task: ResectionResult(method, len(task.points), function(task.tangents, task.points))
+
+
+def _p4p(task: Task) -> ResectionResult:
+    """Return the result of the points in one plane; if others are given, those in one are named."""
+    rows = coplanar_points(task.points)
+    if len(rows) < MIN_POINTS:
+        rows = np.arange(len(task.points))  # refused with the reason
+    solutions = resect_p4p(task.tangents[rows], task.points[rows])
+    named = listed(task.names[k] for k in rows.tolist())
+    warning = "" if len(rows) == len(task.points) else f"only {named} were used, which are in one plane"
+    return ResectionResult("p4p", len(rows), solutions, warning=warning)
 
 
 def _church(task: Task) -> ResectionResult:
@@ -205,7 +218,7 @@ def _start(task: Task) -> tuple[FloatArray, FloatArray]:
 
 _FUNCTIONS: dict[str, Callable[[Task], ResectionResult]] = {
     "fischler-bolles": _closed_form("fischler-bolles", resect_fischler_bolles),
-    "p4p": _closed_form("p4p", resect_p4p),
+    "p4p": _p4p,
     "church": _church,
     "zeng-wang": _closed_form("zeng-wang", resect_zeng_wang),
     "rampal": _closed_form("rampal", resect_rampal),

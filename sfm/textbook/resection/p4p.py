@@ -5,10 +5,12 @@ A collineation maps the object plane to the image. Its two vanishing lines give 
 
 from __future__ import annotations
 
+from itertools import combinations, islice
+
 import numpy as np
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.conventions import FloatArray, skew
+from sfm.model.conventions import FloatArray, IntArray, skew
 from sfm.model.errors import GeometryError
 from sfm.orientation.resection.least_squares import (
     ResectionSolution,
@@ -23,6 +25,7 @@ MIN_POINTS = 4
 MAX_COPLANAR_THICKNESS = 0.01
 # |(a1, a2)| over |a3| of the vanishing line below which image and object plane are parallel.
 MAX_PARALLEL_RATIO = 1e-12
+MOST_PLANES = 20_000  # all planes of 50 points
 
 
 @checked_arguments(tangents="k 2", points="n 3")
@@ -63,6 +66,28 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
     position = origin + _position_over_plane(T) @ axes
     R = rotation_from_position(uv, xyz, position)
     return (solution_of(position, R, uv, xyz),)
+
+
+def coplanar_points(points: FloatArray) -> IntArray:
+    """Return the indices of the most points that are in one plane, (k,); of equally many, the thinnest.
+
+    Planes are those through three points each, of which at most MOST_PLANES are tried.
+
+    Args:
+        points: object points, shape (n, 3), object unit.
+    """
+    xyz = np.asarray(points, dtype=float)
+    best, rank = np.zeros(0, dtype=np.int64), (0, 0.0)
+    for chosen in islice(combinations(range(len(xyz)), 3), MOST_PLANES):
+        origin, p, q = xyz[list(chosen)]
+        normal = np.cross(p - origin, q - origin)
+        off = np.abs((xyz - origin) @ normal)
+        extent = np.linalg.norm(xyz - origin, axis=1).max() * np.linalg.norm(normal)
+        near = np.flatnonzero(off <= MAX_COPLANAR_THICKNESS / 2 * extent)
+        flatness = thickness(xyz[near])
+        if extent > 0 and flatness <= MAX_COPLANAR_THICKNESS and (len(near), -flatness) > rank:
+            best, rank = near, (len(near), -flatness)
+    return best
 
 
 def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:

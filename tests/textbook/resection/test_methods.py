@@ -7,10 +7,10 @@ from sfm.model.conventions import rotation_from_angles
 from sfm.model.errors import GeometryError
 from sfm.orientation.resection.fischler_bolles import rays_from_tangents, resect_fischler_bolles
 from sfm.orientation.resection.least_squares import checked_points, choose_by_line, solution_of
-from sfm.textbook.resection.by_method import cylinder_distance, cylinder_warning
+from sfm.textbook.resection.by_method import Task, cylinder_distance, cylinder_warning, resect
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import resect_dlt
-from sfm.textbook.resection.p4p import resect_p4p
+from sfm.textbook.resection.p4p import coplanar_points, resect_p4p
 from sfm.textbook.resection.zeng_wang import (
     distance_quartic,
     resect_rampal,
@@ -146,6 +146,26 @@ def test_p4p_with_parallel_planes(tilt, below):
     (only,) = resect_p4p(-UVW[:, :2] / UVW[:, 2:], points)
     np.testing.assert_allclose(only.position, X0, atol=1e-6)
     np.testing.assert_allclose(only.rotation, R, atol=1e-6)
+
+
+def test_p4p_takes_the_points_in_one_plane_and_names_them():
+    """Of points in space it is given the largest set in a plane, whose result is that of this set alone."""
+    rng, names = seed_of("p4p of a plane"), tuple("ABCDEFGHI")
+    plane = np.array([1, 3, 4, 6, 8])
+    position, rotation = np.array([0.3, -0.2, 0.0]), np.eye(3)
+    points = np.column_stack([rng.uniform(-1, 1, (9, 2)), rng.uniform(-6, -3, 9)])
+    points[plane, 2] = -4.0 + 0.3 * points[plane, 0]
+    ray = points - position
+    uv = -ray[:, :2] / ray[:, 2:]
+    assert coplanar_points(points).tolist() == plane.tolist()
+    result = resect(Task(names, 50 * uv, uv, points, 50.0, None), "p4p")
+    assert result.points == 5 and result.warning.startswith("only B, D, E, G, I were used")
+    assert np.allclose(result.solutions[0].position, position, rtol=0, atol=1e-9)
+    assert np.allclose(result.solutions[0].rotation, rotation, rtol=0, atol=1e-9)
+    whole = resect(Task(names[:5], 50 * uv[plane], uv[plane], points[plane], 50.0, None), "p4p")
+    assert not whole.warning
+    with pytest.raises(GeometryError, match="p4p: the points are not in one plane"):
+        resect(Task(names[:4], uv[[0, 2, 5, 7]], uv[[0, 2, 5, 7]], points[[0, 2, 5, 7]], 50.0, None), "p4p")
 
 
 def test_p4p_refusals():
