@@ -19,7 +19,7 @@ LAYERS = (
     (
         *("sfm.textbook", "sfm.comparison"),
         *("sfm.products.geometry", "sfm.products.epochs", "sfm.products.planning"),
-        *("sfm.products.rendering", "sfm.products.printing"),
+        *("sfm.products.rendering", "sfm.products.printing", "sfm.products.georeferencing"),
     ),
     ("sfm.judgement.survey_result",),
     ("sfm.judgement",),

@@ -23,6 +23,7 @@ from sfm.cli.commands.compare import compare
 from sfm.cli.commands.convert import convert
 from sfm.cli.commands.doctor import doctor
 from sfm.cli.commands.epochs import epochs
+from sfm.cli.commands.georeference import georeference
 from sfm.cli.commands.init import init
 from sfm.cli.commands.mark import mark
 from sfm.cli.commands.match import match
@@ -68,6 +69,12 @@ COMMANDS = (
     Command("orient correct", orient_correct, "POINTS.csv --c MM", "corrections of photo coordinates"),
     Command("orient pair", orient_pair, "LEFT.csv RIGHT.csv --c MM", "relative orientation and model"),
     Command("orient absolute", orient_absolute, "MODEL.csv CONTROL.csv", "a model onto control points"),
+    Command(
+        "georeference",
+        georeference,
+        "PHOTO CONTROL.csv",
+        "a flat object's photograph onto its control points",
+    ),
     Command("mark", mark, "PHOTOS|SURVEY|RESULT", "measure points by hand, in the browser"),
     Command("match", match, "LEFT RIGHT", "conjugate points of two photographs"),
     Command("compare", compare, "A B", "two results or cameras: differences and their significance"),

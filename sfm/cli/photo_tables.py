@@ -1,4 +1,4 @@
-"""Files of `kolinear orient`: tables of points, pairs of photographs, corrections."""
+"""Inputs of `kolinear orient` and `georeference`: tables of points, pairs of photographs, corrections."""
 
 from __future__ import annotations
 
@@ -147,3 +147,18 @@ def read_corrections(
         above,
     )
     return corrections, values["c"]
+
+
+def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
+    """Return X0, Y0, X1, Y1 of --extent; None without it.
+
+    Raises:
+        SurveyFileError: not four numbers.
+    """
+    if text is None:
+        return None
+    try:
+        x0, y0, x1, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        raise SurveyFileError(f"--extent '{text}': expected X0,Y0,X1,Y1") from None
+    return x0, y0, x1, y1

@@ -1,4 +1,4 @@
-"""Output of `kolinear orient`: text and JSON of each step from measured coordinates to the control."""
+"""Output of `kolinear orient` and `georeference`: text and JSON of each step from measurement to control."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ import numpy as np
 
 from sfm.model.conventions import FloatArray, angles_from_rotation
 from sfm.model.display import counted, listed
+from sfm.model.distributions import MARGIN
+from sfm.model.errors import GeometryError
 from sfm.model.similarity import AbsoluteOrientation, orient_absolute
+from sfm.products.georeferencing.resampled import MapGrid
+from sfm.products.georeferencing.transformation import MODELS, PlaneTransformation, fit_plane
 from sfm.report.page import Column, Table, plain
 from sfm.textbook.pair import PairOrientation
 from sfm.textbook.photo_coordinates import FiducialTransformation
@@ -202,6 +206,62 @@ def absolute_report(
         "moved": [dict(record) for record in placed.records],
     }
     return OrientationReport(lines, Table(columns, rows), values, tuple(after))
+
+
+def georeferencing_report(
+    transformation: PlaneTransformation,
+    names: Sequence[str],
+    xy: FloatArray,
+    places: FloatArray,
+    grid: MapGrid,
+) -> OrientationReport:
+    """Return how well a transformation fits, and how well each one that the points bear predicts them.
+
+    Args:
+        transformation: that is used.
+        names: of the control points, n.
+        xy: their coordinates in the plane, (n, 2).
+        places: their image points, px, (n, 2).
+        grid: squares of the new picture.
+    """
+    t = transformation
+    size = t.pixel_size(xy)
+    lines = [
+        f"{t.model} transformation, {counted(len(names), 'control point')}",
+        *_sigma0(t.sigma0, "px", t.redundancy),
+        f"picture of {grid.width} x {grid.height} pixels of {grid.pixel:.6g}; "
+        f"a pixel of the photograph covers {size.min():.4g} to {size.max():.4g} at the control",
+    ]
+    rms = {}
+    for name in MODELS:
+        try:
+            rms[name] = fit_plane(xy, places, model=name).predicted_rms
+        except GeometryError:
+            continue  # the points are too few for it
+    known = {name: value for name, value in rms.items() if np.isfinite(value)}
+    if known:
+        listing = ", ".join(f"{name} {value:.3g}" for name, value in known.items())
+        lines.append(f"each point predicted from the others, RMS of a coordinate, px: {listing}")
+    best = min(known, key=lambda name: known[name], default=t.model)
+    after = []
+    if t.model in known and 2 * t.redundancy * np.log(known[t.model] / known[best]) > MARGIN:
+        after.append(
+            f"{best} predicts the points {known[t.model] / known[best]:.2g} times better: --model {best}"
+        )
+    columns = (
+        Column("control", "point"),
+        Column("vx", "vx_px", "px", ".3f"),
+        Column("vy", "vy_px", "px", ".3f"),
+        Column("from the others", "predicted_px", "px", ".3f", unknown="-"),
+        Column("in the plane", "predicted", "", ".4g", unknown="-"),
+    )
+    off = np.linalg.norm(t.predicted, axis=1)
+    rows = [
+        (name, *v, d, d * s)
+        for name, v, d, s in zip(names, t.residuals.tolist(), off.tolist(), size.tolist(), strict=True)
+    ]
+    values = {"model": t.model, "sigma0_px": t.sigma0, "redundancy": t.redundancy, "predicted_rms_px": known}
+    return OrientationReport(tuple(lines), Table(columns, rows), values, tuple(after))
 
 
 def _photo_columns() -> tuple[Column, ...]:

@@ -132,6 +132,13 @@ def coordinates(folder: Path, *, moved: float = 0.0) -> Path:
     return path
 
 
+def flat(folder: Path) -> Path:
+    """Control points of a plane in a photograph."""
+    path = folder / "flat.csv"
+    path.write_text("point,x_px,y_px,X,Y\na,10,90,0,0\nb,90,90,8,0\nc,90,10,8,8\nd,10,10,0,8\n")
+    return path
+
+
 def scene(folder: Path) -> Path:
     """A scene file of a single photograph, small and dark."""
     path = folder / "scene.toml"
@@ -234,6 +241,10 @@ COMMANDS: dict[str, Command] = {
     "orient absolute": (
         lambda f: ("orient", "absolute", coordinates(f), coordinates(f), "--out", "new/a.csv"),
         ("new", "new/a.csv"),
+    ),
+    "georeference": (
+        lambda f: ("georeference", photographs(f)[0], flat(f), "--out", "new/a.png"),
+        ("new", "new/a.png", "new/a.pgw"),
     ),
     "compare": (
         lambda f: ("compare", model(f), f / "model"),

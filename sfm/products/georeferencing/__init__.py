@@ -1,0 +1,1 @@
+"""Georeferencing: one photograph of a flat object in the frame of its control points."""
