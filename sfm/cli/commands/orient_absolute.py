@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from sfm.cli.process import loading
 from sfm.runtime.faults import working_on
-
-if TYPE_CHECKING:
-    pass
 
 
 def orient_absolute(
