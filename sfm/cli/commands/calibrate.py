@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +14,12 @@ import typer
 
 from sfm.cli.options import Jobs, Out, Overwrite, Pitch, SurveyOrPhotographs
 from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
+from sfm.cli.watching import WatchedSurvey, watch
 from sfm.model.errors import KolinearError
 
 if TYPE_CHECKING:
     from sfm.judgement.survey_result import SurveyResult
+    from sfm.products.calibration.calibration import Calibration
     from sfm.report.page import Page
 
 SHOWN = ("trust", "next")  # sections of the page that are printed
@@ -43,6 +47,21 @@ def calibrate(
         ),
     ] = None,
     pitch: Pitch = None,
+    watched: Annotated[
+        bool,
+        typer.Option(
+            "--watch",
+            help="Calibrate again whenever photographs are added to the folder, and say which one is next.",
+        ),
+    ] = False,
+    until: Annotated[
+        float,
+        typer.Option(
+            "--until",
+            metavar="PX",
+            help="Uncertainty of the worst corner, far points, 1 sigma, at which --watch ends.",
+        ),
+    ] = 0.0,
     overwrite: Overwrite = False,
     jobs: Jobs = None,
 ) -> None:
@@ -51,6 +70,9 @@ def calibrate(
     The survey is run as by `kolinear run`. One more page in the folder of the result, calibration.html,
     states whether the cameras can be trusted, where, what is wrong, and which photographs would help most;
     calibration.json has the same for programs. Where a plate is not as given, its points are adjusted.
+
+    With --watch each photograph that is added to the folder is used at once: what it brought, how well the
+    camera is known so far, and how to take the next one.
 
     Exit code 0 with a dependable calibration, with or without remarks; 1 if it is not dependable, for the
     reasons on the page, or a stage cannot go on; 2 if the input must be corrected.
@@ -64,31 +86,47 @@ def calibrate(
 
         if model not in MODELS:
             raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
-    product = _Product(distances)
+    if until and not watched:
+        raise KolinearError(f"--until {until:g} is for --watch")
+    product = _Product(distances=distances, until=until, is_watched=watched)
 
     def edit(text: str) -> str:
         product.drafted = True
         return _for_calibration(text, model)
 
-    survey_file, out, images = stated_or_drafted(photographs, out, pitch, overwrite=overwrite, edit=edit)
+    def run_once() -> None:
+        stays, product.drafted = product.begin(), False
+        survey_file, folder, images = stated_or_drafted(
+            photographs, out, None if stays else pitch, overwrite=overwrite, edit=edit
+        )
+        if product.drafted:
+            product.own_draft = survey_file
+        _refuse_model(survey_file, model)
+        options = RunOptions(
+            images=images,
+            out=folder,
+            jobs=jobs,
+            from_photographs=None if images is None else True,
+            overwrite=overwrite,
+            pictures_mb=15.0,
+            product=product,
+        )
+        run_survey_file(survey_file, options)
+
+    if watched:
+        watch(photographs, run_once, product)
+    else:
+        run_once()
+
+
+def _refuse_model(survey_file: Path, model: str | None) -> None:
+    """Refuse a model other than that of a survey file that exists."""
     asked = model is not None and survey_file.is_file()
     if asked and f'model = "{model}"' not in survey_file.read_text(encoding="utf-8"):
         raise KolinearError(
             f"{survey_file}: --model {model} is for drafting a survey file, but this one exists; set "
             "model in it, or remove it"
         )
-    run_survey_file(
-        survey_file,
-        RunOptions(
-            images=images,
-            out=out,
-            jobs=jobs,
-            from_photographs=None if images is None else True,
-            overwrite=overwrite,
-            pictures_mb=15.0,
-            product=product,
-        ),
-    )
 
 
 def _for_calibration(text: str, model: str | None) -> str:
@@ -102,12 +140,13 @@ def _for_calibration(text: str, model: str | None) -> str:
 
 
 @dataclass
-class _Product:
+class _Product(WatchedSurvey):
     """The calibration of a survey."""
 
-    distances: tuple[float, ...]
+    distances: tuple[float, ...] = ()
     drafted: bool = False  # whether the survey file was drafted just now, and may be changed
-    page: Page | None = None  # once it is written
+    calibration: Calibration | None = None  # once it is written
+    page: Page | None = None
 
     def revise(self, survey_file: Path, result: SurveyResult) -> bool:
         """Free the points of a plate that is not as given, with the precision that the image points show."""
@@ -134,7 +173,8 @@ class _Product:
         from sfm.products.calibration.calibration import calibrate as calibrated
         from sfm.report.pages import page_of, texts_of
 
-        self.page = page_of(calibrated(result, self.distances), folder=str(folder))
+        self.result, self.calibration = result, calibrated(result, self.distances)
+        self.page = page_of(self.calibration, folder=str(folder))
         for name, content in texts_of(self.page).items():
             (part / name).write_text(content, encoding="utf-8", newline="")
 
@@ -147,6 +187,10 @@ class _Product:
         declared = self.page
         assert declared is not None
         print_verdict(declared.verdict)
+        self.is_dependable = declared.verdict.level != "bad"
+        if self.is_watched:
+            print(f"Calibration: {folder / declared.path}")
+            return self.is_dependable
         for part in (part for section in declared.sections if section.key in SHOWN for part in section.parts):
             if isinstance(part, Heading | Statement):
                 print(as_plain(part.text))
@@ -154,4 +198,23 @@ class _Product:
                 print("".join(f"  {line}\n" for line in part.text.splitlines()), end="")
         print(f"Report: {folder / 'report.html'}")
         print(f"Calibration: {folder / declared.path}")
-        return declared.verdict.level != "bad"
+        return self.is_dependable
+
+    def uncertainty(self) -> float:
+        """Return that of the worst corner of any camera, far points, px."""
+        cameras = self.calibration.cameras if self.calibration is not None else ()
+        return max((camera.next.before for camera in cameras), default=math.nan)
+
+    def so_far(self) -> Iterator[str]:
+        """Yield the uncertainty of each camera, and the view that lowers it most."""
+        from sfm.model.remarks.row import significant
+        from sfm.products.calibration.page import pose_words
+
+        if self.calibration is None or self.result is None:
+            return
+        for camera in self.calibration.cameras:
+            wanted = f", wanted {significant(self.until)} px" if self.until else ""
+            yield f"{camera.name}: worst corner {significant(camera.next.before)} px{wanted}"
+            for pose, after in zip(camera.next.poses[:1], camera.next.after, strict=False):
+                words = pose_words(pose, self.result.unit)
+                yield f"  next: {words}; worst corner then {significant(after)} px"

@@ -506,6 +506,14 @@ def _next(calibration: Calibration, folder: str) -> Iterator[Part]:
     )
 
 
+def pose_words(pose: Pose, unit: str) -> str:
+    """Return how to take a photograph, in words."""
+    turned = f", camera turned by {pose.roll_deg:.0f} deg" if pose.roll_deg else ""
+    return (
+        f"object at {_place(pose)}, tilted {_tilt(pose)}{turned}, distance {length_of(pose.distance, unit)}"
+    )
+
+
 def _place(pose: Pose) -> str:
     x, y = pose.place
     across = "left" if x < 0.4 else "right" if x > 0.6 else ""
