@@ -108,7 +108,8 @@ class Alternative:
     @property
     def kind(self) -> str:
         """Kind of its remark."""
-        return self.family.kind(self.pattern)
+        kinds = self.family.kinds
+        return kinds.get(self.pattern, kinds[""])
 
     def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
         """Return its columns for all image points of an adjustment, px, (k, 2, q).
@@ -137,10 +138,7 @@ class Family(ABC):
 
     name: str
     constant: ClassVar[str] = ""  # what it doubts, named where a change would stay unnoticed; "": nothing
-
-    @abstractmethod
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
+    kinds: ClassVar[dict[str, str]]  # kind of its remark by pattern; "": in all other patterns
 
     @abstractmethod
     def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
@@ -194,10 +192,7 @@ class CameraFamily(OfPhotographs):
 
     of_camera = True
     constant = "constant cameras"
-
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return {"linear": "camera_drift", "each": "camera_varies"}.get(pattern, "other_camera")
+    kinds: ClassVar[dict[str, str]] = {"": "other_camera", "linear": "camera_drift", "each": "camera_varies"}
 
     def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: photographs of a camera."""
@@ -246,22 +241,15 @@ class CameraFamily(OfPhotographs):
 
 
 @dataclass(frozen=True)
-class RowsFamily(CameraFamily):
+class RowsFamily(OfPhotographs):
     """Rows that are exposed one after the other while the camera moves, at another speed in each photograph.
 
     The image is sheared and stretched along its columns. With y along the columns, and s the speed,
     s_x y is b2, and s_y y is c together with an equal and opposite b1.
     """
 
-    constant = ""
-
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "rolling_shutter"
-
-    def cause(self, alternative: Alternative) -> tuple[object, ...]:
-        """Return a key for the cause: rows."""
-        return ("rows",)
+    of_camera = True
+    kinds: ClassVar[dict[str, str]] = {"": "rolling_shutter"}
 
     def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the photographs that are displaced most, half as much or more, and by how much."""
@@ -283,10 +271,7 @@ class ObjectFamily(OfPhotographs):
 
     of_camera = False
     constant = "constant object"
-
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "shape_of_control" if pattern == "all" else "object_deformed"
+    kinds: ClassVar[dict[str, str]] = {"": "object_deformed", "all": "shape_of_control"}
 
     def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
@@ -320,9 +305,7 @@ class ObjectFamily(OfPhotographs):
 class PointFamily(Family):
     """Object points that moved, or given ones that are not as given, each on its own."""
 
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "shape_of_control" if pattern == "all" else "points_moved"
+    kinds: ClassVar[dict[str, str]] = {"": "points_moved", "all": "shape_of_control"}
 
     def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: a pattern of the object."""
@@ -387,17 +370,10 @@ class BodyFamily(PointFamily):
 
 @dataclass(frozen=True)
 class InteriorFamily(Family):
-    """Interior parameters that are held fixed, or given with a standard deviation.
+    """Interior parameters that are held fixed."""
 
-    A given parameter is already free. Its additional column lets the image points deviate from the given
-    value. The adjusted value then equals the given one, and the gain is that of leaving the given value out.
-    """
-
-    of_given: bool = False
-
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "given_parameter" if self.of_given else "held_parameter"
+    kinds: ClassVar[dict[str, str]] = {"": "held_parameter"}
+    of_given: ClassVar[bool] = False
 
     def cause(self, alternative: Alternative) -> tuple[object, ...]:
         """Return a key for the cause: single parameters, or all of a camera."""
@@ -425,12 +401,22 @@ class InteriorFamily(Family):
 
 
 @dataclass(frozen=True)
+class GivenFamily(InteriorFamily):
+    """Interior parameters that are given with a standard deviation.
+
+    A given parameter is already free. Its additional column lets the image points deviate from the given
+    value. The adjusted value then equals the given one, and the gain is that of leaving the given value out.
+    """
+
+    kinds: ClassVar[dict[str, str]] = {"": "given_parameter"}
+    of_given = True
+
+
+@dataclass(frozen=True)
 class FormatFamily(Family):
     """A displacement of image points for each cell of the format."""
 
-    def kind(self, pattern: str) -> str:
-        """Return the kind of remark for an alternative of this family."""
-        return "distortion_not_described"
+    kinds: ClassVar[dict[str, str]] = {"": "distortion_not_described"}
 
     def columns(self, alternative: Alternative, a: Adjustment, columns: Columns) -> FloatArray:
         """Return the columns of an alternative for all image points, px, (k, 2, q).
@@ -476,5 +462,5 @@ OF_PHOTOGRAPHS: tuple[CameraFamily | ObjectFamily, ...] = (
     STRAIN,
     ObjectFamily("bending", BENDING_PLACES),
 )
-HELD, GIVEN = InteriorFamily("held"), InteriorFamily("given", of_given=True)
+HELD, GIVEN = InteriorFamily("held"), GivenFamily("given")
 FORMAT, MOVED, BODY = FormatFamily("format"), PointFamily("moved"), BodyFamily("body")
