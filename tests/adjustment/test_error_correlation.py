@@ -255,13 +255,13 @@ def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
         a = adjusted(network, truth, in_common(network, share, 300.0, rng))
         columns = columns_of(a)
         a = replace(a, sigma0=1.0, error_correlation=correlation)
-        reduced = reduce_adjustment(a, columns)
+        reduced = reduce_adjustment(a)
         D = reduced.whiten(columns.freedoms[:, :, [3]])  # K1
         gains.append(_gain(reduced, D))
         effect = reduced.design_effect(D)
     assert effect > 5
     assert np.mean(gains) == pytest.approx(effect, rel=4 * np.sqrt(2 / len(gains)))
-    alone = replace(reduced, correlation=None)
+    alone = replace(reduced, a=replace(a, error_correlation=None))
     assert alone.design_effect(D) == 1.0
 
 
@@ -276,9 +276,8 @@ def test_neighbours_with_one_error_show_it_many_times(scene: tuple[Network, Esti
     rng, gains = seed_of("neighbours"), []
     for _ in range(60):
         a = adjusted(network, truth, in_common(network, 0.95, 300.0, rng))
-        columns = columns_of(a)
-        reduced = reduce_adjustment(replace(a, sigma0=1.0, error_correlation=correlation), columns)
-        D = reduced.whiten(moved.columns(a, columns))
+        reduced = reduce_adjustment(replace(a, sigma0=1.0, error_correlation=correlation))
+        D = moved.whitened(reduced)
         gains.append(gain_of(*reduced.project(D)).value)
     effect = reduced.design_effect(D)
     assert effect > 1.4 * np.mean(gains) / D.shape[2]  # the mean alone says less

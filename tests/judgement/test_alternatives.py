@@ -127,7 +127,7 @@ def dense() -> Dense:
     out[[5, 30]] = True
     a = replace(a, rejected=out, redundancy=a.redundancy - 4)
     every = columns_of(a)
-    reduced = reduce_adjustment(a, every)
+    reduced = reduce_adjustment(a)
     k, m, n = len(reduced.used), 7, 20
     A = np.zeros((k, 2, 6 * m + 2 + 3 * n))
     rows = np.arange(k)
@@ -145,7 +145,7 @@ def dense() -> Dense:
     with pytest.MonkeyPatch.context() as patch:
         one_camera = np.zeros(7, dtype=np.int64)  # all photographs in every pattern
         patch.setattr(alternatives, "cameras_of_photographs", lambda a: one_camera)
-        found = alternatives_of(a, reduced, every)
+        found = alternatives_of(reduced)
     residual = (float(a.estimate.cameras[0].parameters[0]) - 10.0) / 2e-3 / a.sigma0
     return Dense(a, every, reduced, U[:, d > 1e-9 * d[0]], residual, found)
 
@@ -197,7 +197,7 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     units = [interior_columns(a, [(index, 0)])[2][0] for index in range(2)]  # of the first, mm for a column
     np.testing.assert_allclose(both[:, :, 0], found[:, :, 0] + units[0] / units[1] * found[:, :, 1])
     assert both.shape[2] == 1 and prior == pytest.approx(weight)
-    held = tuple(alternatives.interiors(a, dense.reduced, families.HELD))
+    held = tuple(alternatives.interiors(replace(dense.reduced, a=a), families.HELD))
     assert [len(one.parameters) for one in held] == [
         *[2] * (len(held) - 1),
         2 * len(a.estimate.cameras[0].names) - 2,
@@ -320,8 +320,8 @@ def test_a_camera_differs_in_photographs_of_its_own_only() -> None:
     a = adjust(network, truth, datum=Datum("free"), reject="none")
     assert alternatives.cameras_of_photographs(a).tolist() == [0, 1] * 5
     every_columns = columns_of(a)
-    reduced = reduce_adjustment(a, every_columns)
-    every = alternatives.alternatives_of(a, reduced, every_columns)
+    reduced = reduce_adjustment(a)
+    every = alternatives.alternatives_of(reduced)
     found = [one for one in every if isinstance(one.family, families.CameraFamily) and one.pattern != "each"]
     for one in found:
         assert len({int(network.camera[i]) for i in np.flatnonzero(one.factor)}) == 1
@@ -351,8 +351,7 @@ def test_alternatives_are_counted_by_cameras() -> None:
     rng = seed_of("many")
     network, truth = make_network(rng, images=40, points=40, cameras=8, free=("c",))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
-    columns = columns_of(a)
-    every = alternatives.alternatives_of(a, reduce_adjustment(a, columns), columns)
+    every = alternatives.alternatives_of(reduce_adjustment(a))
     count = alternatives.count_alternatives(a)
     held = sum(one.family.name == "held" for one in every)
     assert held == 8 * (9 + 1)  # each parameter of a camera, and all of them
@@ -424,8 +423,7 @@ def test_of_few_photographs_there_are_fewer_patterns(images: int, patterns: set[
     """Of two, neither differs from the other; of three, only one may."""
     network, truth = make_network(seed_of("few photographs"), images=images, points=14, free=())
     a = adjust(network, truth, datum=Datum("free"), reject="none")
-    every = columns_of(a)
-    found = alternatives_of(a, reduce_adjustment(a, every), every)
+    found = alternatives_of(reduce_adjustment(a))
     assert {one.pattern for one in found if one.family in families.CAMERA_FAMILIES} == patterns
     assert any(one.family is families.MOVED for one in found) == (images == 4)
 
@@ -540,7 +538,7 @@ def test_what_photographs_contribute_to_cameras_is_in_standard_deviations() -> N
             seed_of(f"contributions {seed}"), images=12, points=60, free=("c", "x0", "y0"), noise_px=0.1
         )
         a = adjust(network, truth, datum=Datum("free"), reject="none")
-        _, of_interior = reduce_adjustment(a, columns_of(a)).contributions()
+        _, of_interior = reduce_adjustment(a).contributions()
         assert of_interior.sum(axis=1) == pytest.approx(0.0, abs=0.01)
         total.append((of_interior**2).sum(axis=1))
     assert 0.3 < np.mean(total) < 3
@@ -554,11 +552,8 @@ def test_a_photograph_with_more_noise_has_a_spread_by_itself() -> None:
     xy = seen.xy + np.where(seen.image == 3, 0.28, 0.0)[:, None] * rng.standard_normal(seen.xy.shape)
     network = replace(network, image_points=replace(seen, xy=xy))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
-    every = columns_of(a)
     found = [
-        one
-        for one in alternatives_of(a, reduce_adjustment(a, every), every)
-        if one.pattern == "single" and one.factor[3] > 0
+        one for one in alternatives_of(reduce_adjustment(a)) if one.pattern == "single" and one.factor[3] > 0
     ]
     assert found
     for one in found:

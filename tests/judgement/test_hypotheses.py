@@ -106,7 +106,7 @@ def test_camera_columns_have_the_edge_of_the_photograph_as_unit(clean: Adjustmen
 def test_the_gain_is_what_freeing_a_parameter_takes_from_vPv() -> None:
     network, truth = make_network(seed_of("gain"), images=8, points=40, free=("c",))
     a = solved(network, truth, "none")
-    reduced = reduce_adjustment(a, columns_of(a))
+    reduced = reduce_adjustment(a)
     s = truth.cameras[0].names.index("K1")
     columns, _, (unit,) = interior_columns(a, [(0, s)])
     gain = gain_of(*reduced.project(reduced.whiten(columns)))
@@ -124,7 +124,7 @@ def test_the_motions_of_the_network_have_no_gain() -> None:
     network, truth = make_network(seed_of("motion"), images=5, points=20, free=())
     a = solved(network, truth, "none")
     columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     X = a.estimate.points
     fields = [np.tile(axis, (len(X), 1)) for axis in np.eye(3)]
     fields += [np.cross(axis, X) for axis in np.eye(3)] + [X]
@@ -269,8 +269,8 @@ def test_a_given_parameter_that_is_wrong_is_named_with_what_fits() -> None:
 
 def test_the_gain_of_a_given_value_is_the_square_of_its_normalized_residual() -> None:
     a = given_c(0.01)
-    reduced = reduce_adjustment(a, columns_of(a))
-    (one,) = interiors(a, reduced, GIVEN)
+    reduced = reduce_adjustment(a)
+    (one,) = interiors(reduced, GIVEN)
     off = float(a.estimate.cameras[0].parameters[0] - a.network.interior.value[0])
     sigma = float(a.interior_sigma(0)[0])
     expected = off**2 / ((2e-3 * a.sigma0) ** 2 - sigma**2)
@@ -396,8 +396,8 @@ def test_an_alternative_that_is_adjusted_ends_where_freeing_its_parameter_does()
     s = truth.cameras[0].names.index("K1")
     free[s] = True
     freed = solved(network, replace(a.estimate, cameras=(replace(a.estimate.cameras[0], free=free),)), "none")
-    reduced = reduce_adjustment(a, columns_of(a))
-    one = next(one for one in interiors(a, reduced, HELD) if [k for _, k in one.parameters] == [s])
+    reduced = reduce_adjustment(a)
+    one = next(one for one in interiors(reduced, HELD) if [k for _, k in one.parameters] == [s])
     half = replace(one, gain=replace(one.gain, beta=one.gain.beta / 2))  # further steps end at the optimum
     for start in (one, half):
         found = refitting.refit(a, start, a)
@@ -438,8 +438,8 @@ def test_a_step_is_whole_unless_its_half_is_asked_for(clean: Adjustment, below: 
 def test_rounds_end_when_the_gain_that_is_asked_for_is_out_of_reach(
     clean: Adjustment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reduced, calls = reduce_adjustment(clean, columns_of(clean)), []
-    alternative = next(iter(interiors(clean, reduced, HELD)))
+    reduced, calls = reduce_adjustment(clean), []
+    alternative = next(iter(interiors(reduced, HELD)))
     far = replace(alternative, gain=replace(alternative.gain, beta=alternative.gain.beta + 1.0))
     stepped = refitting._stepped
 
@@ -592,7 +592,7 @@ def test_what_given_points_say_of_freedoms_is_what_an_adjustment_with_them_finds
     a = adjust(network, truth, datum=Datum("control"), reject="none")
     columns = columns_of(a)
     first = (network.image_points.image == 0)[:, None, None]
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     gain = gain_of(*reduced.project(reduced.whiten(np.where(first, columns.freedoms[:, :, :1], 0.0))))
     camera = a.estimate.cameras[0]
     own = replace(camera, name="own", shared=("", *map(camera.owner_of, range(1, 10))))

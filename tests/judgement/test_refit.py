@@ -14,7 +14,6 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import families
 from sfm.judgement.hypotheses import refit as refitting
-from sfm.judgement.hypotheses.columns import columns_of
 from sfm.judgement.hypotheses.families import Alternative
 from sfm.judgement.hypotheses.refit import (
     Refit,
@@ -252,11 +251,10 @@ def moved_refit(name: str, *, scatter: float = 0.0) -> tuple[Refit, Alternative]
         there = observed_anew(network, replace(truth, points=X), 0.1, seed_of(f"{name} {i}"))
         xy[seen.image == i] = there.image_points.xy[seen.image == i]
     a = adjust(replace(network, image_points=replace(seen, xy=xy)), truth, datum=Datum("free"), reject="none")
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     points = np.arange(5)
     one = Alternative(families.MOVED, "split", (np.arange(12) >= 6).astype(float), points=points)
-    gain = refitting.gain_of(*reduced.project(reduced.whiten(one.columns(a, columns))))
+    gain = refitting.gain_of(*reduced.project(one.whitened(reduced)))
     one = replace(one, gain=gain)
     found = refit(a, one, a)
     assert found is not None
@@ -280,10 +278,9 @@ def test_what_other_causes_explain_is_no_spread_of_photographs() -> None:
     """The direction of an alternative is what is left of it beside the others."""
     found, one = moved_refit("movement 0.0 0")
     a = found.adjustment
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     others = replace(one, points=np.array([20, 21]))
-    effect, taken = (reduced.whiten(some.columns(a, columns)) for some in (one, others))
+    effect, taken = (some.whitened(reduced) for some in (one, others))
     both = np.concatenate([(effect @ found.beta)[:, :, None], taken], axis=2)
     left = reduced.absorb(both)[2].reshape(-1, 7)
     along = left[:, 0] - left[:, 1:] @ np.linalg.pinv(left[:, 1:]) @ left[:, 0]

@@ -16,11 +16,10 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import families, hypotheses
 from sfm.judgement.hypotheses.alternatives import alternatives_of, is_significant
-from sfm.judgement.hypotheses.columns import Columns, columns_of
 from sfm.judgement.hypotheses.families import Alternative
 from sfm.judgement.hypotheses.hypotheses import Cause, find_causes, free_network, judge_alternatives
 from sfm.judgement.hypotheses.refit import Refit
-from sfm.judgement.hypotheses.score import Gain, Reduced, log_likelihood_gain, reduce_adjustment
+from sfm.judgement.hypotheses.score import Gain, log_likelihood_gain, reduce_adjustment
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ScaleBars
 from sfm.model.remarks.remark import kinds_of
@@ -112,11 +111,6 @@ def tried_in(a: Adjustment, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Alter
     return tried, most[0]
 
 
-def reduced_of(a: Adjustment) -> tuple[Reduced, Columns]:
-    columns = columns_of(a)
-    return reduce_adjustment(a, columns), columns
-
-
 def test_two_alternatives_of_each_kind_are_adjusted(
     zoomed: Adjustment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,7 +135,7 @@ def test_only_what_is_clear_is_adjusted(monkeypatch: pytest.MonkeyPatch) -> None
     xy = np.where(seen.image[:, None] >= 4, there, seen.xy)
     network = replace(network, image_points=replace(seen, xy=xy))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
-    every, needed = alternatives_of(a, *reduced_of(a)), np.log(1 / a.levels.family)
+    every, needed = alternatives_of(reduce_adjustment(a)), np.log(1 / a.levels.family)
     tried, _ = tried_in(a, monkeypatch)
     assert tried and any(one.family.name == "held" for one in every)
     for one in tried:

@@ -16,7 +16,7 @@ from sfm.adjustment.result import ErrorCorrelation
 from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses.alternatives import Part, runs_of
-from sfm.judgement.hypotheses.columns import columns_of, rigid_motions
+from sfm.judgement.hypotheses.columns import rigid_motions
 from sfm.judgement.hypotheses.score import NONE, Gain, reduce_adjustment
 from sfm.model.conventions import BoolArray, FloatArray
 from sfm.survey.inputs.sources import TEXTURE
@@ -137,8 +137,8 @@ def test_patterns_need_photographs_on_each_side() -> None:
 
 def moves_of(
     d: FloatArray, name: str, *, sigma: float = 1.0, noise: bool = True
-) -> tuple[Any, Any, alternatives._Moves]:
-    """Return an adjustment, its normal equations and those of points that moved by d standard deviations."""
+) -> tuple[Any, alternatives._Moves]:
+    """Return a reduced adjustment and the normal equations of points that moved by d standard deviations."""
     n, rng = len(d), seed_of(name)
     alone = np.tile(np.eye(3) / sigma**2, (n, 1, 1))
     g = -d / sigma + (rng.standard_normal((n, 3)) / sigma if noise else 0.0)
@@ -147,17 +147,18 @@ def moves_of(
         np.array([0.0, 0, 1, 1]), np.arange(n), alone, np.zeros((n, 3, 1)), g, 2 * alone, alone
     )
     reduced = SimpleNamespace(
+        a=SimpleNamespace(estimate=SimpleNamespace(points=points)),
         t=np.zeros(1),
         Sinv=np.zeros((1, 1)),
         redundancy=5000,
         image=np.tile(np.repeat(np.arange(4), n), 50),
         point=np.tile(np.arange(n), 4 * 50),
     )
-    return SimpleNamespace(estimate=SimpleNamespace(points=points)), reduced, moves
+    return reduced, moves
 
 
 def test_the_number_of_sets_is_that_of_combinations() -> None:
-    _, _, moves = moves_of(np.zeros((9, 3)), "sets")
+    _, moves = moves_of(np.zeros((9, 3)), "sets")
     assert [moves.log_sets(k) for k in (0, 1, 4, 9)] == pytest.approx([log(comb(9, k)) for k in (0, 1, 4, 9)])
 
 
@@ -165,7 +166,7 @@ def test_the_number_of_sets_is_that_of_combinations() -> None:
 def test_points_that_moved_are_told_from_those_that_stayed(moved: int) -> None:
     d = np.zeros((20, 3))
     d[2 : 2 + moved] = 9.0
-    _, reduced, moves = moves_of(d, f"moved {moved}")
+    reduced, moves = moves_of(d, f"moved {moved}")
     (one,) = alternatives._each_by_itself(reduced, moves)
     assert sorted(one.points.tolist()) == list(range(2, 2 + moved))
     squares = (moves.g[2 : 2 + moved] ** 2).sum()
@@ -182,7 +183,7 @@ def test_many_points_that_moved_are_tested_together_and_half_of_them_at_most(
 ) -> None:
     monkeypatch.setattr(alternatives, "Spread", lambda *_: NONE)  # all moved, and do not differ by chance
     for n, least, most in ((300, 40, 90), (20, 10, 10), (1, 1, 1)):
-        _, reduced, moves = moves_of(np.full((n, 3), 4.0), f"all moved {n}", noise=False)
+        reduced, moves = moves_of(np.full((n, 3), 4.0), f"all moved {n}", noise=False)
         (one,) = alternatives._each_by_itself(reduced, moves)
         assert least <= len(one.points) <= most
 
@@ -191,7 +192,7 @@ def test_points_that_did_not_move_are_tried_a_little_farther() -> None:
     """The search ends where more than twice as many and four have less evidence."""
     d = np.zeros((60, 3))
     d[:2] = 12.0
-    _, reduced, moves = moves_of(d, "tried farther", noise=False)
+    reduced, moves = moves_of(d, "tried farther", noise=False)
     sizes: list[int] = []
     gain_of = alternatives.gain_of
 
@@ -214,16 +215,17 @@ def body_motion(points: FloatArray, members: BoolArray, beta: FloatArray) -> Flo
 @pytest.mark.parametrize("count", [3, 5, 8])
 def test_points_that_moved_as_a_body_are_found(count: int) -> None:
     """By a shift and a rotation, which are those of least squares; their residuals are the spread."""
-    a, _, still = moves_of(np.zeros((20, 3)), f"body {count}")
+    reduced, still = moves_of(np.zeros((20, 3)), f"body {count}")
+    points = reduced.a.estimate.points
     members = np.arange(20) < count
     beta = np.array([20.0, -15.0, 10.0, 4.0, -3.0, 5.0])
-    d = body_motion(a.estimate.points, members, beta)
-    _, reduced, moves = moves_of(d, f"body {count}")
+    d = body_motion(points, members, beta)
+    reduced, moves = moves_of(d, f"body {count}")
     np.testing.assert_allclose(moves.g, still.g - d)
-    found = list(alternatives._as_one_body(a, reduced, moves))
+    found = list(alternatives._as_one_body(reduced, moves))
     one = max(found, key=lambda each: each.gain.value)
     assert one.points.tolist() == list(range(count))
-    M = rigid_motions(a.estimate.points, members)[members].reshape(-1, 6)
+    M = rigid_motions(points, members)[members].reshape(-1, 6)
     best = np.linalg.lstsq(M, -moves.g[members].ravel(), rcond=None)[0]
     np.testing.assert_allclose(one.gain.beta, best, rtol=1e-6)
     left = moves.g.copy()
@@ -237,19 +239,19 @@ def test_points_that_moved_as_a_body_are_found(count: int) -> None:
 def test_two_points_are_no_body() -> None:
     d = np.zeros((12, 3))
     d[[3, 8]] = 40.0
-    a, reduced, moves = moves_of(d, "two points", noise=False)
-    assert list(alternatives._as_one_body(a, reduced, moves)) == []
+    reduced, moves = moves_of(d, "two points", noise=False)
+    assert list(alternatives._as_one_body(reduced, moves)) == []
     d[5] = 40.0
-    a, reduced, moves = moves_of(d, "two points", noise=False)
-    found = list(alternatives._as_one_body(a, reduced, moves))
+    reduced, moves = moves_of(d, "two points", noise=False)
+    found = list(alternatives._as_one_body(reduced, moves))
     assert found and all(one.points.tolist() == [3, 5, 8] for one in found)
 
 
 def test_a_body_is_grown_from_some_of_the_points() -> None:
     d = np.full((30, 3), 40.0)
     d[:16] = 0.0
-    a, reduced, moves = moves_of(d, "starts of a body", noise=False)
-    found = list(alternatives._as_one_body(a, reduced, moves))
+    reduced, moves = moves_of(d, "starts of a body", noise=False)
+    found = list(alternatives._as_one_body(reduced, moves))
     assert 4 < len(found) < 16
     assert all(one.points.tolist() == list(range(16, 30)) for one in found)
 
@@ -267,7 +269,7 @@ def splits_of(m: int, points: int, unknowns: int, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(alternatives, "_each_by_itself", lambda *_: ())
     monkeypatch.setattr(alternatives, "_as_one_body", lambda *_: ())
     reduced: Any = SimpleNamespace(photographs=m, L=np.zeros(points), t=np.zeros(unknowns))
-    assert list(alternatives.moved_points(SimpleNamespace(), reduced)) == []  # type: ignore[arg-type]
+    assert list(alternatives.moved_points(reduced)) == []
     return first
 
 
@@ -339,10 +341,9 @@ def test_errors_of_neighbours_count_for_what_would_be_significant() -> None:
     by = np.where(seen.image >= 5, 0.03, 0.0)[:, None] * (seen.xy - (999.5, 749.5))
     network = replace(network, image_points=replace(seen, xy=seen.xy + by), sources=(TEXTURE,))
     a = adjust(network, truth, datum=Datum("free"), reject="none")
-    columns = columns_of(a)
     correlation = ErrorCorrelation(alone=0.1, common=0.9, length_px=300.0)
-    reduced = replace(reduce_adjustment(a, columns), correlation=correlation)
-    found = alternatives.alternatives_of(a, reduced, columns)
+    reduced = reduce_adjustment(replace(a, error_correlation=correlation))
+    found = alternatives.alternatives_of(reduced)
     needed = np.log(1 / a.levels.family)
     for one in found:
         plain = replace(one, design_effect=1.0).evidence_beside_spread

@@ -15,7 +15,7 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement.hypotheses import alternatives, families
 from sfm.judgement.hypotheses import refit as unchecked
 from sfm.judgement.hypotheses.alternatives import count_alternatives, interiors, needed_gain
-from sfm.judgement.hypotheses.columns import columns_of, interior_columns
+from sfm.judgement.hypotheses.columns import interior_columns
 from sfm.judgement.hypotheses.refit import reach_of, unchecked_assumptions
 from sfm.judgement.hypotheses.score import reduce_adjustment
 from sfm.model.conventions import FloatArray
@@ -60,11 +60,10 @@ def shift_of(a: Adjustment, moved_px: FloatArray) -> tuple[float, float]:
 def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     """The found noncentrality is that of 80 %; the shift of one parameter is the reach itself."""
     a = adjusted()
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     s = a.estimate.cameras[0].names.index(name)
-    one = next(one for one in interiors(a, reduced, families.HELD) if one.parameters == ((0, s),))
-    reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
+    one = next(one for one in interiors(reduced, families.HELD) if one.parameters == ((0, s),))
+    reach = reach_of(one, reduced, rows=count_alternatives(a))
     D = interior_columns(a, [(0, s)])[0][:, :, 0]
     H = float(reduced.project(reduced.whiten(D[:, :, None]))[0][0, 0])
     needed = needed_gain(1, len(D), 0.0, count_alternatives(a), 0.01)
@@ -73,30 +72,29 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     assert gained == pytest.approx(least, rel=0.02)
     assert reach == pytest.approx(shift, rel=0.1)
     strict = replace(a, false_alarm=a.false_alarm / 1e6)
-    assert reach_of(one, strict, reduced, columns, rows=count_alternatives(a)) > 1.2 * reach
+    assert reach_of(one, replace(reduced, a=strict), rows=count_alternatives(a)) > 1.2 * reach
 
 
 def test_common_errors_let_a_held_parameter_reach_farther() -> None:
     """By the square root of the design effect, with which they multiply a gain by chance."""
     a = adjusted(points=100)
-    columns, correlation = columns_of(a), ErrorCorrelation(alone=0.1, common=0.9, length_px=300.0)
+    correlation = ErrorCorrelation(alone=0.1, common=0.9, length_px=300.0)
     textured = replace(a, network=replace(a.network, sources=(TEXTURE,)), error_correlation=correlation)
     one = families.Alternative(families.HELD, "all", np.ones(10), parameters=((0, 7),))  # b1
-    reduced, common = reduce_adjustment(a, columns), reduce_adjustment(textured, columns)
-    effect = common.design_effect(common.whiten(one.columns(a, columns)))
-    reach, farther = (reach_of(one, a, which, columns, rows=1) for which in (reduced, common))
+    reduced, common = reduce_adjustment(a), reduce_adjustment(textured)
+    effect = common.design_effect(one.whitened(common))
+    reach, farther = (reach_of(one, which, rows=1) for which in (reduced, common))
     assert effect > 2 and farther / reach == pytest.approx(np.sqrt(effect))
 
 
 def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
     """No direction of the family reaches farther at the same noncentrality, and one nearly as far."""
     a = adjusted()
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
-    one = next(one for one in unchecked._typical(a, reduced) if one.family is families.STRAIN)
+    reduced = reduce_adjustment(a)
+    one = next(one for one in unchecked._typical(a) if one.family is families.STRAIN)
     assert one.factor.tolist() == [0] * 5 + [1] * 5 and one.search == pytest.approx(np.log(7))
-    reach = reach_of(one, a, reduced, columns, rows=count_alternatives(a))
-    D = reduced.whiten(one.columns(a, columns))
+    reach = reach_of(one, reduced, rows=count_alternatives(a))
+    D = one.whitened(reduced)
     H = reduced.project(D)[0]
     needed = needed_gain(5, int((D != 0).any(axis=(1, 2)).sum()), one.search, count_alternatives(a), 0.01)
     least = next(x for x in np.linspace(needed / 2, 2 * needed, 3000) if stats.ncx2.sf(needed, 5, x) > 0.8)
@@ -113,11 +111,10 @@ def test_the_worst_strain_reaches_as_far_as_its_displacement() -> None:
 def test_what_a_photograph_alone_may_hide_is_priced_by_its_image_points() -> None:
     """Another c in the last of ten photographs moves a tenth of the image points."""
     a = adjusted()
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     factor = (np.arange(10) == 9).astype(float)
     one = families.Alternative(families.CAMERA_FAMILIES[0], "single", factor)
-    D = reduced.whiten(one.columns(a, columns))
+    D = one.whitened(reduced)
     H = float(reduced.project(D)[0][0, 0])
     count = int((a.network.image_points.image == 9).sum())
     needed = needed_gain(1, count, 0.0, 1, 0.01)
@@ -125,7 +122,7 @@ def test_what_a_photograph_alone_may_hide_is_priced_by_its_image_points() -> Non
     X, sigma = a.estimate.points, np.sqrt(np.diagonal(a.covariance.points, axis1=1, axis2=2))
     moved = without_motions(X, reduced.absorb(D)[0] * np.sqrt(least / H))
     expected = float((np.abs(moved[:, :, 0]) / sigma).max())
-    assert reach_of(one, a, reduced, columns, rows=1) == pytest.approx(expected, rel=2e-3)
+    assert reach_of(one, reduced, rows=1) == pytest.approx(expected, rel=2e-3)
 
 
 def test_weak_networks_say_what_they_cannot_test_and_strong_ones_nothing() -> None:
@@ -155,22 +152,21 @@ def test_distortion_bends_what_is_photographed_from_one_side() -> None:
 def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
     """Not without end: 1e-5 of the squares of its column is what rounding leaves."""
     a = adjusted()
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
-    one = next(unchecked._typical(a, reduced))
-    H = reduced.project(reduced.whiten(one.columns(a, columns)))[0]
+    reduced = reduce_adjustment(a)
+    one = next(unchecked._typical(a))
+    H = reduced.project(one.whitened(reduced))[0]
     blind = SimpleNamespace(
+        a=a,
+        columns=reduced.columns,
         whiten=reduced.whiten,
         absorb=reduced.absorb,
         design_effect=reduced.design_effect,
         project=lambda D: (1e-12 * H, np.zeros(1), reduced.project(D)[2]),
     )
     rows = count_alternatives(a)
-    far = reach_of(one, a, blind, columns, rows=rows)  # type: ignore[arg-type]
-    share = float(H[0, 0] / reduced.project(reduced.whiten(one.columns(a, columns)))[2][0])
-    assert far == pytest.approx(
-        reach_of(one, a, reduced, columns, rows=count_alternatives(a)) * np.sqrt(share / 1e-5)
-    )
+    far = reach_of(one, blind, rows=rows)  # type: ignore[arg-type]
+    share = float(H[0, 0] / reduced.project(one.whitened(reduced))[2][0])
+    assert far == pytest.approx(reach_of(one, reduced, rows=count_alternatives(a)) * np.sqrt(share / 1e-5))
 
 
 def test_cameras_of_few_photographs_are_checked_too() -> None:
@@ -179,10 +175,9 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
     for own, pattern in ((2, ""), (3, "single"), (1, "")):
         camera = (np.arange(8) >= 8 - own).astype(np.int64)
         a = adjust(replace(network, camera=camera), truth, datum=Datum("free"), reject="none")
-        reduced = reduce_adjustment(a, columns_of(a))
         found = [
             one
-            for one in unchecked._typical(a, reduced)
+            for one in unchecked._typical(a)
             if one.among is not None and one.among.sum() == own and one.family.of_camera
         ]
         assert {one.pattern for one in found} == ({pattern} if pattern else set())
@@ -190,7 +185,7 @@ def test_cameras_of_few_photographs_are_checked_too() -> None:
         assert all(one.search == pytest.approx(np.log(own)) for one in found)
         others = [
             one
-            for one in unchecked._typical(a, reduced)
+            for one in unchecked._typical(a)
             if one.among is not None and one.among.sum() == 8 - own and one.family.of_camera
         ]
         assert {one.pattern for one in others} == {"split"}
@@ -204,7 +199,7 @@ def test_cameras_too_many_to_test_are_not_taken_for_one(monkeypatch: pytest.Monk
     for cameras, untested in ((5, True), (4, False)):
         camera = np.minimum(np.arange(10) % 5, cameras - 1)
         a = adjust(replace(network, camera=camera), truth, datum=Datum("free"), reject="none")
-        every = alternatives.alternatives_of(a, reduce_adjustment(a, columns_of(a)), columns_of(a))
+        every = alternatives.alternatives_of(reduce_adjustment(a))
         of_camera = [one for one in every if isinstance(one.family, families.CameraFamily)]
         assert bool(of_camera) != untested
         said = of_kind(unchecked_assumptions(a), "cameras_untested")

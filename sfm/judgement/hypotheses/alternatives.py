@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from sfm.adjustment.result import Adjustment
-from sfm.judgement.hypotheses.columns import Columns, interior_columns, rigid_motions
+from sfm.judgement.hypotheses.columns import interior_columns, rigid_motions
 from sfm.judgement.hypotheses.families import (
     BODY,
     FORMAT,
@@ -63,33 +63,25 @@ STARTS = 8  # points or photographs from which a set is grown
 MIN_OF_BODY = 3  # points that determine the six motions of a body
 
 
-def alternatives_of(a: Adjustment, reduced: Reduced, columns: Columns) -> tuple[Alternative, ...]:
+def alternatives_of(reduced: Reduced) -> tuple[Alternative, ...]:
     """Return all alternatives, best evidence first.
 
     Args:
-        a: adjustment of the image points alone, or with control. With control, only changes of the camera and
-            of the object, and strained control, are tested.
-        reduced: its normal equations.
-        columns: its derivatives.
+        reduced: adjustment of the image points alone, or with control. With control, only changes of the
+            camera and of the object, and strained control, are tested.
     """
-    alternatives = list(_by_photographs(a, reduced, columns))
+    a, alternatives = reduced.a, list(_by_photographs(reduced))
     in_all = Alternative(STRAIN if a.datum == "control" else FORMAT, "all", np.ones(reduced.photographs))
-    alternatives += _in_all(reduced, in_all, reduced.whiten(in_all.columns(a, columns)))
+    alternatives += _in_all(reduced, in_all, in_all.whitened(reduced))
     if a.datum != "control":
-        alternatives += [
-            *interiors(a, reduced, HELD),
-            *interiors(a, reduced, GIVEN),
-            *moved_points(a, reduced),
-        ]
-
+        alternatives += [*interiors(reduced, HELD), *interiors(reduced, GIVEN), *moved_points(reduced)]
     needed = np.log(1 / a.levels.family)
 
     def tested(alternative: Alternative) -> Alternative:
         priced = alternative.priced(reduced)
-        if reduced.correlation is None or not priced.evidence_beside_spread > needed:
+        if a.error_correlation is None or not priced.evidence_beside_spread > needed:
             return priced  # not significant in any case
-        effect = reduced.design_effect(reduced.whiten(alternative.columns(a, columns)))
-        return replace(priced, design_effect=effect)
+        return replace(priced, design_effect=reduced.design_effect(alternative.whitened(reduced)))
 
     return tuple(sorted(map(tested, alternatives), key=lambda alternative: -alternative.evidence))
 
@@ -164,18 +156,12 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
     return [[tuple(places) for places in owner.values()] for owner in owners.values()]
 
 
-def interiors(a: Adjustment, reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
-    """Yield an alternative for each held or given interior parameter, and one for all of a camera.
-
-    Args:
-        a: adjustment.
-        reduced: its normal equations.
-        family: family of held or of given parameters.
-    """
+def interiors(reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
+    """Yield an alternative for each held or given interior parameter, and one for all of a camera."""
     everywhere = np.ones(reduced.photographs)
-    for sets in interior_parameters(a, family):
+    for sets in interior_parameters(reduced.a, family):
         of_camera = tuple(pair for places in sets for pair in places)
-        D = reduced.whiten(interior_columns(a, of_camera)[0])
+        D = reduced.whiten(interior_columns(reduced.a, of_camera)[0])
         every = gain_of(*reduced.project(D))
         tested = [(places, [k]) for k, places in enumerate(sets)]
         if len(sets) > 1:
@@ -211,17 +197,17 @@ def _spread_along(reduced: Reduced, direction: FloatArray, step: FloatArray, var
     return Spread(float(scores @ scores) / variance * m / (m - 1), m - 1, among=False) if m > 1 else NONE
 
 
-def _by_photographs(a: Adjustment, reduced: Reduced, columns: Columns) -> Iterator[Alternative]:
+def _by_photographs(reduced: Reduced) -> Iterator[Alternative]:
     """Yield the alternatives of cameras, strain and bending in some of the photographs.
 
     If there are more than MAX_RUNS photographs, neighbours in the sequence are combined. A camera changes in
     some of its photographs, an object in some of all photographs.
     """
-    camera = cameras_of_photographs(a)
+    camera = cameras_of_photographs(reduced.a)
     run = runs_of(camera)
-    every_run = Part(*reduced.project_by_run(reduced.whiten(columns.freedoms), run))
+    every_run = Part(*reduced.project_by_run(reduced.whiten(reduced.columns.freedoms), run))
     if len(every_run.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
-        yield from _of_each(reduced, every_run, run, a.levels.family)
+        yield from _of_each(reduced, every_run, run, reduced.a.levels.family)
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
@@ -403,13 +389,8 @@ def too_many_cameras(camera: IntArray) -> bool:
     return int(camera.max()) >= MAX_RUNS
 
 
-def moved_points(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
-    """Yield the best sets of points that moved, each by a vector or all as a body, at some photograph.
-
-    Args:
-        a: adjustment.
-        reduced: its normal equations.
-    """
+def moved_points(reduced: Reduced) -> Iterator[Alternative]:
+    """Yield the best sets of points that moved, each by a vector or all as a body, at some photograph."""
     m = reduced.photographs
     splits = np.arange(MIN_GROUP, m - MIN_GROUP + 1)
     products = 6 * len(reduced.L) * len(reduced.t) ** 2  # products of one split
@@ -418,7 +399,7 @@ def moved_points(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     best: dict[str, Alternative] = {}
     for k in splits:
         moves = _moves(reduced, (np.arange(m) >= k).astype(float))
-        for moved in (*_each_by_itself(reduced, moves), *_as_one_body(a, reduced, moves)):
+        for moved in (*_each_by_itself(reduced, moves), *_as_one_body(reduced, moves)):
             tested = replace(moved, search=moved.search + float(np.log(len(splits)))).priced(reduced)
             if moved.family.name not in best or tested.evidence > best[moved.family.name].evidence:
                 best[moved.family.name] = tested
@@ -488,12 +469,12 @@ def _each_by_itself(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
         yield best
 
 
-def _as_one_body(a: Adjustment, reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
+def _as_one_body(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
     """Yield sets of points that moved as a body: those that fit the motion of a point better than none.
 
     The motion is then that of the set, in turn with the set, until it stays the same.
     """
-    X, squares = a.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
+    X, squares = reduced.a.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
     single, _ = gains_of(moves.blocks, moves.g, squares)
     for first in np.argsort(-single)[:STARTS]:
         d = -np.linalg.lstsq(moves.blocks[first], moves.g[first], rcond=None)[0]

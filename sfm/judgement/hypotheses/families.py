@@ -120,6 +120,10 @@ class Alternative:
         """
         return self.family.columns(self, a, columns)
 
+    def whitened(self, reduced: Reduced) -> FloatArray:
+        """Return its whitened columns for the accepted image points, (k, 2, q)."""
+        return reduced.whiten(self.columns(reduced.a, reduced.columns))
+
     def deflated(self, gain: float, redundancy: int) -> float:
         """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect.
 

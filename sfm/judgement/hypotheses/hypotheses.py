@@ -284,9 +284,8 @@ def _best(
     """
     current = causes[-1].refit.adjustment if causes else plain
     before = [(cause.alternative, cause.refit.beta) for cause in causes]
-    columns = columns_of(current)
-    reduced = reduce_adjustment(current, columns)
-    every, level = alternatives_of(current, reduced, columns), plain.levels.family
+    reduced = reduce_adjustment(current)
+    every, level = alternatives_of(reduced), plain.levels.family
     to_try = _to_adjust(every, level)
     work = max(len(to_try), 1) * len(plain.network.images) ** 3
 
@@ -455,10 +454,10 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     if plain is None:
         return ()
     try:
-        reduced = reduce_adjustment(plain, columns_of(plain))
+        reduced = reduce_adjustment(plain)
     except np.linalg.LinAlgError:
         return ()
-    single = [interior for interior in interiors(plain, reduced, HELD) if len(interior.gain.beta) == 1]
+    single = [interior for interior in interiors(reduced, HELD) if len(interior.gain.beta) == 1]
     every, level = [interior.priced(reduced) for interior in single], plain.levels.family
     significant = [interior for interior in every if is_significant(interior, len(every), level)]
     contradicted = sorted(significant, key=lambda interior: -interior.gain.value)

@@ -112,12 +112,11 @@ def refit(
         current, beta, adjustments = stepped
         likelihoods.append(log_likelihood_of(current))
         taken += adjustments
-        columns = columns_of(current)
-        D = _side_by_side(every, current, columns)
         try:
-            reduced = reduce_adjustment(current, columns)
+            reduced = reduce_adjustment(current)
         except np.linalg.LinAlgError:
             return None
+        D = _side_by_side(every, current, reduced.columns)
         gain = gain_of(*reduced.project(reduced.whiten(D)), least_share(D.shape[2]))
         # even with the next step; the first one may be far off, with image points rejected that return
         out_of_reach = number > 0 and likelihoods[-1] + gain.value < before_all + least
@@ -260,13 +259,12 @@ def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Seq
 
     Source: White (1982), Econometrica 50, for a score test with dependent observations.
     """
-    a = refitted.adjustment
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
-    effect = reduced.whiten(alternative.columns(a, columns)) @ refitted.beta
+    reduced = reduce_adjustment(refitted.adjustment)
+    effect = alternative.whitened(reduced) @ refitted.beta
     left = reduced.absorb(effect[:, :, None])[2].ravel()
     if others:
-        taken = reduced.absorb(reduced.whiten(_side_by_side(others, a, columns)))[2]
+        taken = reduced.whiten(_side_by_side(others, reduced.a, reduced.columns))
+        taken = reduced.absorb(taken)[2]
         taken = taken.reshape(len(left), -1)
         left = left - taken @ np.linalg.lstsq(taken, left, rcond=None)[0]
     m = reduced.photographs
@@ -289,7 +287,7 @@ def precision_factor(a: Adjustment) -> float:
 
     Source: Liang and Zeger (1986), Biometrika 73 (covariance from the scatter of groups).
     """
-    reduced = reduce_adjustment(a, columns_of(a))
+    reduced = reduce_adjustment(a)
     of_points, of_interior = reduced.contributions()
     m = reduced.photographs
     if a.datum == "control":
@@ -314,16 +312,15 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
-    columns = columns_of(a)
-    reduced = reduce_adjustment(a, columns)
+    reduced = reduce_adjustment(a)
     number, rows = cameras_of_photographs(a), count_alternatives(a)
     untested: tuple[Remark, ...] = ()
     if too_many_cameras(number):
         untested = (remark("cameras_untested", cameras=int(number.max()) + 1),)
     constancy: dict[str, float] = {}
     held: dict[str, dict[str, float]] = defaultdict(dict)
-    for alternative in _typical(a, reduced):
-        reach = reach_of(alternative, a, reduced, columns, rows=rows)
+    for alternative in _typical(a):
+        reach = reach_of(alternative, reduced, rows=rows)
         if not reach > WRONG_SIGMAS:
             continue
         if isinstance(alternative.family, InteriorFamily):
@@ -351,7 +348,7 @@ def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Re
     return untested + of_held + of_constancy
 
 
-def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
+def _typical(a: Adjustment) -> Iterator[Alternative]:
     """Yield alternatives for each held parameter, and for a change of camera or a strain halfway through.
 
     If a camera has three photographs, the last one differs. Bending is left out, because the worst of
@@ -359,7 +356,7 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
     """
     for owner in interior_parameters(a, HELD):
         for parameters in owner:
-            yield Alternative(HELD, "all", np.ones(reduced.photographs), parameters=parameters)
+            yield Alternative(HELD, "all", np.ones(len(a.network.images)), parameters=parameters)
     camera = cameras_of_photographs(a)
     for family in (*CAMERA_FAMILIES, STRAIN):
         for among in photographs_among(family, camera):
@@ -373,19 +370,15 @@ def _typical(a: Adjustment, reduced: Reduced) -> Iterator[Alternative]:
                 yield Alternative(family, pattern, after, search=float(np.log(tried)), among=among)
 
 
-def reach_of(
-    alternative: Alternative, a: Adjustment, reduced: Reduced, columns: Columns, *, rows: int
-) -> float:
+def reach_of(alternative: Alternative, reduced: Reduced, *, rows: int) -> float:
     """Return the largest shift of coordinates before an alternative is detected, in standard deviations.
 
     Args:
         alternative: assumption that is violated.
-        a: the adjustment.
-        reduced: its normal equations.
-        columns: its derivatives.
+        reduced: the adjustment.
         rows: number of alternatives tested together, which share the level.
     """
-    D = reduced.whiten(alternative.columns(a, columns))
+    a, D = reduced.a, alternative.whitened(reduced)
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)

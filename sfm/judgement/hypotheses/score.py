@@ -24,8 +24,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from sfm.adjustment.engine.correlated import correlated_sum
-from sfm.adjustment.result import Adjustment, ErrorCorrelation
-from sfm.judgement.hypotheses.columns import Columns, interior_columns
+from sfm.adjustment.result import Adjustment
+from sfm.judgement.hypotheses.columns import Columns, columns_of, interior_columns
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distributions import f_sf
 from sfm.model.network import rows_of, sum_rows
@@ -44,6 +44,8 @@ class Reduced:
     factor.
     """
 
+    a: Adjustment
+    columns: Columns  # derivatives of all its image points
     used: IntArray  # accepted image points, (k,)
     F: FloatArray  # whitening of each image point, (k, 2, 2)
     v: FloatArray  # whitened residuals, (k, 2)
@@ -56,13 +58,17 @@ class Reduced:
     Sinv: FloatArray  # inverse of the reduced normal matrix with inner constraints, (a, a)
     y: FloatArray  # L B'v, (n, 3)
     t: FloatArray  # right-hand side of photographs and cameras, reduced by the points, (a,)
-    photographs: int
-    redundancy: int
-    xy: FloatArray  # measured position of each image point, px, (k, 2)
     share: FloatArray  # what each image point counts, see `Network.share`, (k,)
-    may_correlate: BoolArray  # image points that the correlation is about, (k,)
-    correlation: ErrorCorrelation | None  # correlation of the errors of neighbours
-    sigma0_px: float  # a posteriori standard deviation of a usual image coordinate, px
+
+    @property
+    def photographs(self) -> int:
+        """Number of photographs."""
+        return len(self.a.network.images)
+
+    @property
+    def redundancy(self) -> int:
+        """Redundancy of the adjustment."""
+        return self.a.redundancy
 
     @property
     def count(self) -> float:
@@ -107,16 +113,17 @@ class Reduced:
         Args:
             D: whitened columns, (k, 2, q).
         """
-        if self.correlation is None:
+        a, network = self.a, self.a.network
+        if a.error_correlation is None:
             return 1.0
         H, _, squares = self.project(D)
         correlated = correlated_sum(
             self.image,
-            self.xy,
-            self.sigma0_px * self.F,
+            network.image_points.xy[self.used],
+            a.sigma0_px * self.F,
             self.absorb(D)[2],
-            self.correlation,
-            self.may_correlate,
+            a.error_correlation,
+            network.may_correlate[self.used],
         )
         effects = determined_inverse(H, squares) @ (H + correlated)
         first = float(np.trace(effects))
@@ -208,18 +215,17 @@ def _sum_products(
                 total[j] += A[k, 0, c] * x[j] + A[k, 1, c] * y[j]
 
 
-def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
+def reduce_adjustment(a: Adjustment) -> Reduced:
     """Return the accepted image points of an adjustment with all its unknowns eliminated.
 
     Args:
         a: adjustment of image points, alone or with control, without scale bars or observed orientation.
-        columns: derivatives of its image points.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
     """
     network, m, n = a.network, len(a.network.images), len(a.network.points)
-    seen = network.image_points
+    seen, columns = network.image_points, columns_of(a)
     weight, slope_of_given, fixed = _given_points(a)
     usable = ~a.rejected & columns.usable & np.isfinite(a.residuals).all(axis=1)
     several = np.bincount(seen.point[usable], minlength=n) > 1
@@ -254,6 +260,8 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
     scale = 1 / np.sqrt(np.diagonal(S))
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
+        a=a,
+        columns=columns,
         used=used,
         F=F,
         v=v,
@@ -266,13 +274,7 @@ def reduce_adjustment(a: Adjustment, columns: Columns) -> Reduced:
         Sinv=inverse,
         y=y,
         t=t,
-        photographs=m,
-        redundancy=a.redundancy,
-        xy=seen.xy[used],
         share=share,
-        may_correlate=network.may_correlate[used],
-        correlation=a.error_correlation,
-        sigma0_px=a.sigma0_px,
     )
 
 
