@@ -21,10 +21,7 @@ import numpy as np
 from sfm.adjustment.engine.unknowns import NO_START
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
 from sfm.adjustment.quality.statistics import component_tests, more_than_chance, robust_test
-from sfm.adjustment.quality.variance_components import (
-    IMAGE_POINTS,
-    INTERIOR,
-)
+from sfm.adjustment.quality.variance_components import IMAGE_POINTS, INTERIOR
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import calibrated_cameras, interior_of
@@ -55,14 +52,9 @@ JUDGED_AS = {"control points": "control", "exterior orientation": "centres", "sc
 MIN_REDUNDANCY = 1e-3
 MAX_MAGNIFICATION = 1.0  # median image distance c over object distance; beyond it is macrophotography
 HEADLINES: Mapping[Level, str] = {
-    "good": "The survey worked: {found}.",
-    "fair": "The survey worked, with remarks: {found}.",
-    "bad": "The survey has no dependable result.",
-}
-ADJUSTMENT_HEADLINES: Mapping[Level, str] = {
-    "good": "The adjustment worked: {found}.",
-    "fair": "The adjustment worked, with remarks: {found}.",
-    "bad": "The adjustment has no dependable result.",
+    "good": "The {what} worked: {found}.",
+    "fair": "The {what} worked, with remarks: {found}.",
+    "bad": "The {what} has no dependable result.",
 }
 
 
@@ -96,7 +88,7 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
         *comparison_remarks(result),
     )
     photographs = f"{len(a.network.images)} of {result.images_total} photographs oriented"
-    return replace(result, verdict=judge(remarks, _headlines(HEADLINES, a, photographs)))
+    return replace(result, verdict=judge(remarks, _headlines("survey", a, photographs)))
 
 
 def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustment:
@@ -131,7 +123,7 @@ def _verdict_of_adjustment(a: Adjustment, *, rejects: bool) -> Verdict:
         *stated_precision_remarks(a),
     )
     photographs = f"{oriented} of {counted(total, 'photograph')}"
-    return judge(remarks, _headlines(ADJUSTMENT_HEADLINES, a, photographs))
+    return judge(remarks, _headlines("adjustment", a, photographs))
 
 
 def slight_as_tests(remarks: Sequence[Remark]) -> tuple[Remark, ...]:
@@ -154,10 +146,10 @@ def with_remark(result: SurveyResult, new: Remark) -> SurveyResult:
     return judge_survey(replace(result, stage_remarks=(*result.stage_remarks, new)))
 
 
-def _headlines(templates: Mapping[Level, str], a: Adjustment, photographs: str) -> dict[Level, str]:
+def _headlines(what: str, a: Adjustment, photographs: str) -> dict[Level, str]:
     """Return the headline of each level."""
     counts = f"{photographs}, {counted(int(a.estimate.determined.sum()), 'object point')}"
-    return {level: text.format(found=counts) for level, text in templates.items()}
+    return {level: text.format(what=what, found=counts) for level, text in HEADLINES.items()}
 
 
 def _took_part(a: Adjustment) -> BoolArray:

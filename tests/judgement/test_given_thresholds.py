@@ -332,7 +332,7 @@ def test_standard_deviations_are_enlarged_only_where_they_are_stated_and_wrong(
     stated = np.diag([0.0, 0.0, np.inf] if of["fixed"] else [1e-4, 4e-4, np.inf])[None]
     group: Any = SimpleNamespace(
         scatter=0.0,
-        found=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
+        judgement=SimpleNamespace(doubtful=of["doubtful"], factor=of["factor"]),
         placed=SimpleNamespace(model=SimpleNamespace(estimated=of["estimated"], factor=lambda: (3.0, 0.0))),
     )
     found = given_groups.Group._confirmed(group, stated, of["rescale"])

@@ -200,7 +200,7 @@ def test_points_that_take_part_are_those_that_fit_with_the_precision_that_they_h
     _, groups, given = two_groups(np.zeros(3), "take part")
     one, covariance = groups[0], np.tile(SIGMA**2 * np.eye(3), (6, 1, 1))
     kind = ObjectPoints(np.arange(6), given[:6], covariance)
-    assert len(one.taking_part(rescale=True).given) == 6 and one.dependable and one.out == ()
+    assert len(one.taking_part(rescale=True).given) == 6 and one.dependable and one.judgement.wrong == ()
     assert (one.test.what, one.test.dof) == ("control", 3 * 6 - 7)
     found = one.placed.judgement
     out = replace(one, placed=replace(one.placed, judgement=replace(found, wrong=(2,))))

@@ -10,15 +10,8 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.judgement.given.free_network import FreeNetwork, Reference
-from sfm.judgement.given.points import (
-    GivenPoints,
-    PlacedPoints,
-    excludes_mirror,
-)
-from sfm.judgement.given.values import (
-    GivenModel,
-    Judgement,
-)
+from sfm.judgement.given.points import GivenPoints, PlacedPoints, excludes_mirror
+from sfm.judgement.given.values import GivenModel, Judgement
 from sfm.judgement.survey_result import GivenTest
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.distributions import FALSE_ALARM, Levels
@@ -112,19 +105,14 @@ class Group:
     scatter: float = 0.0  # standard deviation of fixed coordinates from their scatter, object unit; 0: exact
 
     @property
-    def found(self) -> Judgement:
+    def judgement(self) -> Judgement:
         """The judgement of the group."""
         return self.placed.judgement
 
     @property
-    def out(self) -> tuple[int, ...]:
-        """Points that were left out."""
-        return self.found.wrong
-
-    @property
     def dependable(self) -> bool:
         """Whether the points may give a scale."""
-        return not (self.placed.mirrored or self.found.doubtful)
+        return not (self.placed.mirrored or self.judgement.doubtful)
 
     @property
     def checks_handedness(self) -> bool:
@@ -134,13 +122,13 @@ class Group:
     @property
     def test(self) -> GivenTest:
         """Test of all points."""
-        return GivenTest(self.of, self.found.statistic, self.found.dof, self.found.probability)
+        return GivenTest(self.of, self.judgement.statistic, self.judgement.dof, self.judgement.probability)
 
     def taking_part(self, *, rescale: bool) -> GivenPoints:
         """Return the points that take part, with their covariance in the adjustment."""
-        kept = np.setdiff1d(np.arange(len(self.names)), self.out)
+        kept = np.setdiff1d(np.arange(len(self.names)), self.judgement.wrong)
         points = self.placed.points.select(kept)
-        if self.found.doubtful and rescale and points.stated.any():
+        if self.judgement.doubtful and rescale and points.stated.any():
             points = points.with_stated(self.placed.model.factor()[0] ** 2 * points.stated)
         return points
 
@@ -155,7 +143,7 @@ class Group:
             used: whether the points are used.
         """
         keep = np.full(len(given), used)
-        keep[self.rows[list(self.out)]] = False
+        keep[self.rows[list(self.judgement.wrong)]] = False
         if self.placed.order:
             order = np.arange(len(given))
             order[self.rows] = self.rows[list(self.placed.order)]
@@ -170,10 +158,10 @@ class Group:
         if self.scatter and rescale:
             return np.where(known, self.placed.points.stated, covariance)
         fixed = not np.where(known, covariance, 0.0).any()
-        changes = bool(self.found.doubtful) or self.found.factor != 1.0
+        changes = bool(self.judgement.doubtful) or self.judgement.factor != 1.0
         if fixed or not rescale or not changes or self.placed.model.estimated:
             return covariance
-        factor = self.placed.model.factor()[0] if self.found.doubtful else self.found.factor
+        factor = self.placed.model.factor()[0] if self.judgement.doubtful else self.judgement.factor
         return np.where(known, factor**2 * covariance, covariance)
 
 

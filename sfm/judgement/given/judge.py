@@ -8,7 +8,7 @@ Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.6 (
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -129,7 +129,11 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     in_control = given.datum.kind == "control"
     in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.further)]
     tables = [Table(kind, k, parts) for k, parts, kind in in_free if len(kind)]
-    part = _in_free_network(task, given, tables)
+    right = network if in_control else network.with_given(ObjectPoints(), ExteriorObservations())
+    part = task.free.adjustment.network.with_given(
+        *(task.in_free(kind)[1] for kind in (right.control, right.exterior, right.scale_bars)),
+        further=tuple(table.kind for table in tables),
+    )
     kinds = [*confirmed(part), *part.further]
     reference = task.free.reference_of(kinds if mounts is None else [*kinds, mounts])
     if reference is None:
@@ -169,19 +173,6 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
         remarks=given.remarks + remarks,
         mounts=mounts,
         others_contradict=bool(remarks),
-    )
-
-
-def _in_free_network(task: Task, given: JudgedGiven, tables: Sequence[Table]) -> Network:
-    """Return the free network with the given values that take part, and the observations of the tables."""
-    network = given.network
-    if given.datum.kind != "control":
-        network = network.with_given(ObjectPoints(), ExteriorObservations())
-    return task.free.adjustment.network.with_given(
-        task.in_free(network.control)[1],
-        task.in_free(network.exterior)[1],
-        task.in_free(network.scale_bars)[1],
-        further=tuple(table.kind for table in tables),
     )
 
 
@@ -235,7 +226,7 @@ def _group(task: Task, of: str, kind: CoordinateKind) -> Group | None:
     group = Group(of, rows[there], tuple(names[k] for k in there.tolist()), placed)
     if fixed and in_datum and not (task.of_plate or placed.judgement.fits):
         group = _scattering(group, points, start, task)
-    judgement = group.found
+    judgement = group.judgement
     if judgement.factor == 1.0:
         return group
     stated = np.broadcast_to(np.eye(3), points.stated.shape) if fixed else points.stated
@@ -258,7 +249,7 @@ def _scattering(group: Group, points: GivenPoints, start: Similarity | None, tas
     again = judge_points(points, task.level, start=start)
     if again is None or again.judgement.doubtful or again.judgement.wrong != placed.judgement.wrong:
         return group
-    tested = group.found  # the test of the coordinates as they were given
+    tested = group.judgement  # the test of the coordinates as they were given
     judgement = replace(
         again.judgement,
         factor=1.0,
@@ -271,7 +262,7 @@ def _scattering(group: Group, points: GivenPoints, start: Similarity | None, tas
 
 def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
     """Yield the remarks on given points that do not fit, and on those that nothing checks."""
-    judgement, of = group.found, group.of
+    judgement, of = group.judgement, group.of
     exchanged = [group.names[k] for k in group.placed.exchangeable] or None
     if group.placed.mirrored:
         yield remark(
@@ -311,7 +302,15 @@ def _remarks_on(task: Task, group: Group) -> Iterator[Remark]:
 
 
 def _left_out(task: Task, group: Group) -> Remark:
-    model, out = group.placed.model, group.out
+    """Return the remark on points that were left out, with the mistake whose correction makes them fit."""
+    placed, model, out = group.placed, group.placed.model, group.judgement.wrong
+
+    def fit(mended: list[CoordinateKind]) -> bool:
+        points = replace(placed.points, kind=mended[0])
+        return points.model(placed.placing, estimated=model.estimated).fits(task.level)
+
+    kind = placed.points.kind
+    mistakes = explanations([kind], fit, [kind.mistakes_at(np.array(out))])
     others = (model.kept(tuple(j for j in out if j != k)).difference(k) for k in out)
     d, covariance = max(others, key=lambda difference: float(np.linalg.norm(difference[0])))
     distance = float(np.linalg.norm(d))
@@ -321,23 +320,12 @@ def _left_out(task: Task, group: Group) -> Remark:
         given=[group.names[k] for k in out],
         distance=(distance, task.settings.unit),
         sigmas=distance**2 / float(np.sqrt(d @ covariance @ d)),
-        mistake=next(iter(_mistakes_of_single(task, group)), None),
+        mistake=next(iter(mistakes), None),
     )
 
 
-def _mistakes_of_single(task: Task, group: Group) -> dict[str, bool]:
-    """Return the mistakes whose correction makes the points fit that were left out."""
-    placed = group.placed
-
-    def fit(mended: list[CoordinateKind]) -> bool:
-        points = replace(placed.points, kind=mended[0])
-        return points.model(placed.placing, estimated=placed.model.estimated).fits(task.level)
-
-    return explanations([placed.points.kind], fit, [placed.points.kind.mistakes_at(np.array(group.out))])
-
-
 def _doubtful(task: Task, group: Group) -> Remark:
-    judgement, model, strain = group.found, group.placed.model, group.placed.strain
+    judgement, model, strain = group.judgement, group.placed.model, group.placed.strain
     if strain is not None:
         return remark(
             "given_strained",

@@ -60,9 +60,7 @@ def assignments(
         agreed: similarity on which more than half of the points agree with their names, if any. Three
             points may agree by chance, so other similarities are tried as well.
     """
-    from scipy.optimize import (
-        linear_sum_assignment,
-    )  # takes half a second; rarely needed
+    from scipy.optimize import linear_sum_assignment  # takes half a second; rarely needed
     from scipy.spatial.distance import cdist
 
     at = np.flatnonzero(np.isfinite(given).all(axis=1))

@@ -14,13 +14,7 @@ from scipy.linalg import block_diag
 
 from sfm.judgement.given.free_network import FreeNetwork, Reference, confirmed
 from sfm.judgement.given.mistakes import explanations
-from sfm.judgement.given.scales import (
-    Scales,
-    common_scale,
-    difference_of,
-    numbers_of_scale,
-    scales_of,
-)
+from sfm.judgement.given.scales import Scales, common_scale, difference_of, numbers_of_scale, scales_of
 from sfm.judgement.given.values import GivenModel
 from sfm.model.conventions import FloatArray, rotation_from_angles
 from sfm.model.network import Network

@@ -18,14 +18,7 @@ import numpy as np
 
 from sfm.judgement.given.free_network import Reference, centre_and_size
 from sfm.judgement.given.mistakes import assignments, cost_of_choice, explanations, find_renamed
-from sfm.judgement.given.values import (
-    RANK,
-    GivenModel,
-    Judgement,
-    cost_of_scatter,
-    judge_values,
-    misfit_of,
-)
+from sfm.judgement.given.values import RANK, GivenModel, Judgement, cost_of_scatter, judge_values, misfit_of
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, rotation_from_vector
 from sfm.model.distributions import MARGIN
 from sfm.model.errors import GeometryError
@@ -355,10 +348,8 @@ def _strained(
             strain = replace(strain, F=F)
         if model is not None and model.fits(level) and model.confirms_rest(()):
             judgement = judge_values(model, level)
-            q, fall = (
-                as_given.judgement.dof - judgement.dof,
-                as_given.judgement.statistic - judgement.statistic,
-            )
+            q = as_given.judgement.dof - judgement.dof
+            fall = as_given.judgement.statistic - judgement.statistic
             cost = cost_of_scatter(q, fall, len(model.v)) + 2 * log(len(STRAINS))
             fitting.append((PlacedPoints(judgement, placing, model, points, cost_of_strain=cost), strain))
     if not fitting:
@@ -398,27 +389,19 @@ def _placed(
     best: PlacedPoints | None = None
     for k, placing in enumerate(_starts(points, start)):
         # with the similarity on which most agree, the others are left out before they can change it
-        at_start = judge_values(points.model(placing, estimated=estimated), level) if k else None
-        judged = _judged(points, placing, () if at_start is None else at_start.wrong, level, estimated)
+        out = judge_values(points.model(placing, estimated=estimated), level).wrong if k else ()
+        tried: set[tuple[int, ...]] = set()
+        while out not in tried:  # until the similarity is free of wrong points
+            tried.add(out)
+            placing, model = _converged(points, placing, out, estimated)
+            judgement = judge_values(model, level)
+            out = judgement.wrong
+        judged = PlacedPoints(judgement, placing, model, points)
         if judged.judgement.fits:
             return judged
         if best is None or judged.judgement.misfit < best.judgement.misfit:
             best = judged
     return best
-
-
-def _judged(
-    points: GivenPoints, placing: Similarity, out: tuple[int, ...], level: float, estimated: bool
-) -> PlacedPoints:
-    """Judge points with the similarity that fits best, repeatedly, until it is free of wrong points."""
-    tried: set[tuple[int, ...]] = set()
-    while True:
-        tried.add(out)
-        placing, model = _converged(points, placing, out, estimated)
-        judgement = judge_values(model, level)
-        out = judgement.wrong
-        if out in tried:
-            return PlacedPoints(judgement, placing, model, points)
 
 
 def _converged(

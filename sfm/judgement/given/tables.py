@@ -85,14 +85,11 @@ def judge_tables(
         wrong = list(judge.explained(kept)) or judge.contradicting(kept)
         kept = as_judged(kept, wrong)
         contradictions += wrong
-    unexplained = (
-        not contradiction.mistakes and contradiction.factor == 1.0 for contradiction in contradictions
-    )
     return tuple(
-        replace(contradiction, mistakes=judge.mistakes_of(contradiction, given, kept))
-        if open_
-        else contradiction
-        for contradiction, open_ in zip(contradictions, unexplained, strict=True)
+        contradiction
+        if contradiction.mistakes or contradiction.factor != 1.0
+        else replace(contradiction, mistakes=judge.mistakes_of(contradiction, given, kept))
+        for contradiction in contradictions
     )
 
 
@@ -125,11 +122,15 @@ class _Judge:
 
     def model(self, kinds: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
         """Return the differences of observations from what the right values imply, and the kind of each."""
+        model, kind = self._beside_right(kinds)
+        return model.beside((kind < 0)[model.item]), kind[kind >= 0]
+
+    def _beside_right(self, kinds: Sequence[Kind]) -> tuple[GivenModel, IntArray]:
+        """Return the differences of all, and the kind of each: negative for values that are right."""
         right = [kind for kind in confirmed(self.network) if len(kind)]
         placing = self.place(self.network.with_given(further=tuple(kinds)))
         model, kind = self.reference.differences([*right, *kinds], placing)
-        of_right = kind < len(right)
-        return model.beside(of_right[model.item]), kind[~of_right] - len(right)
+        return model, kind - len(right)
 
     def fit(self, kinds: Sequence[Kind]) -> bool:
         """Return whether observations fit the network, the right values and one another."""
@@ -180,11 +181,9 @@ class _Judge:
 
         If the kind contradicts the image points alone, at the scale of all, these are among the others.
         """
-        placing = self.place(self.network.with_given(further=tuple(table.kind for table in tables)))
-        right = [kind for kind in confirmed(self.network) if len(kind)]
-        kinds = [*right, *(table.kind for table in tables)]
-        model, kind = self.reference.differences(kinds, placing)
-        of_kind = np.array([member.name == name for member in kinds])[kind][model.item]
+        model, kind = self._beside_right([table.kind for table in tables])
+        named = np.flatnonzero([table.kind.name == name for table in tables])
+        of_kind = np.isin(kind, named)[model.item]
         rest = model.part(~of_kind).kept().dof if (~of_kind).any() else 0
         confirming = rest
         at_scale = replace(model, A=np.delete(model.A, 6, axis=1)).part(of_kind)
