@@ -251,12 +251,7 @@ class Given:
 
 @computed_once
 def given_of(a: Adjustment, length_unit: str) -> Given:
-    """Return the residuals of all given values that took part in an adjustment.
-
-    Args:
-        a: result of `adjust`.
-        length_unit: unit of its coordinates.
-    """
+    """Return the residuals of all given values that took part in an adjustment, in its unit of lengths."""
     took_part = {part.index: (part.rows, part.redundancy_numbers, part.standardised) for part in a.observed}
     residuals: list[GivenResiduals] = []
     for index, part in given_residuals(a.network, a.estimate, length_unit, took_part):

@@ -72,11 +72,7 @@ def camera_is_result(adjustment: Adjustment, plates: tuple[SeenPlate, ...] = ())
     point are known if all three are given with a standard deviation below a pixel in its photographs.
     Points with standard deviations as small as those of a plate are practically fixed. The points of an
     additional plate are known relative to one another. The pose of such a plate is not a result, like the
-    pose of a photograph.
-
-    Args:
-        adjustment: finished.
-        plates: plates of the survey, including those used as control.
+    pose of a photograph. The plates include those used as control.
     """
     network, known = adjustment.network, np.zeros(len(adjustment.network.points), dtype=bool)
     if adjustment.datum != "control" or not adjustment.unknown_counts[1]:

@@ -123,9 +123,6 @@ def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] |
 def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
     """Return the median blur of the target edges of each photograph.
 
-    Args:
-        photographs: photographs with their targets.
-
     Returns:
         Standard deviation of an edge, px, by name; photographs without measured edges are left out.
     """

@@ -264,11 +264,7 @@ def largest(values: FloatArray) -> FloatArray:
 
 
 def point_sigma(covariance: FloatArray) -> tuple[float, float]:
-    """Return RMS and largest known standard deviation of point coordinates, object unit, NaN if unknown.
-
-    Args:
-        covariance: covariance of each point, object unit^2, (n, 3, 3).
-    """
+    """Return RMS and largest known standard deviation of points of covariances (n, 3, 3), NaN if unknown."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     known = sigma[np.isfinite(sigma)]
     return root_mean_square(sigma), float(known.max()) if len(known) else float("nan")

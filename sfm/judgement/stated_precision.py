@@ -29,11 +29,7 @@ SPREAD = 1 / (4 * DENSITY * MEDIAN)  # standard deviation of ln of a scale by th
 
 
 def stated_precision_remarks(a: Adjustment) -> tuple[Remark, ...]:
-    """Return the remark on image points whose stated standard deviations are too small beside the others.
-
-    Args:
-        a: finished adjustment.
-    """
+    """Return the remark on image points whose stated standard deviations are too small beside the others."""
     seen = a.network.image_points
     if not len(a.standardised) or a.is_exact:
         return ()

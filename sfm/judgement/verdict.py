@@ -59,11 +59,7 @@ HEADLINES: Mapping[Level, str] = {
 
 
 def judge_survey(result: SurveyResult) -> SurveyResult:
-    """Return the result of a survey with its verdict.
-
-    Args:
-        result: a result with the remarks of its stages; an earlier verdict is replaced.
-    """
+    """Return the result of a survey with its verdict; an earlier verdict is replaced."""
     a = result.adjustment
     statistics, consistency = statistics_of(a), consistency_of(a)
     of_sigma0 = sigma0_remarks(sigma0_of(a), a)
@@ -308,10 +304,7 @@ def consistency_remarks(
 ) -> tuple[Remark, ...]:
     """Return the tests of points and photographs, and remarks on those that a person can correct.
 
-    Args:
-        consistency: the tests.
-        rejected: number of rejected image points.
-        automatic: names of the points that nobody named, such as those of natural texture, or can correct.
+    Automatic points are those that nobody named, such as those of natural texture, or can correct.
     """
     remarks = []
     doubtful = [point.point for point in consistency.doubtful]
@@ -387,11 +380,7 @@ def given_remarks(
 ) -> tuple[Remark, ...]:
     """Return the remarks on given values that took part or check the result.
 
-    Args:
-        result: result of a survey.
-        given: residuals of the given values that took part.
-        statistics: statistics of the adjustment.
-        checks: coordinates that took no part.
+    The checks are coordinates that took no part.
     """
     level = result.adjustment.levels.question
     tests = [

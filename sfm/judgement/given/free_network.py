@@ -96,11 +96,9 @@ class Reference:
     C: FloatArray  # joint covariance, (r + 3 p, r + 3 p)
 
     def places(self, kind: Kind, placing: Similarity | None = None) -> FloatArray:
-        """Return the points and projection centres that observations depend on, in the free or object frame.
+        """Return the points and projection centres that observations depend on, (n, 3).
 
-        Args:
-            kind: observations.
-            placing: object frame from the frame of the free network; the latter frame if None.
+        They are in the object frame, or without a `placing` in the frame of the free network.
         """
         free = self.marginal.adjustment.estimate
         by_type = {POINT: free.points, PHOTOGRAPH: free.position}
@@ -110,9 +108,7 @@ class Reference:
     def compare(self, kinds: Sequence[Kind], placing: Similarity) -> Differences:
         """Return the differences of observations from the free network; each part of a kind is a value.
 
-        Args:
-            kinds: observations.
-            placing: object frame from the frame of the free network.
+        `placing` is the object frame from the frame of the free network.
         """
         free = placing.apply_estimate(self.marginal.adjustment.estimate)
         values = values_of(free)

@@ -133,14 +133,9 @@ class Group:
         return points
 
     def as_judged(self, given: C, *, rescale: bool, used: bool) -> C:
-        """Return the given points that fit, with their covariance; none if they are not used.
+        """Return the given points of the kind that fit, with their covariance; none if they are not used.
 
         The values of names that were exchanged are those of the right names.
-
-        Args:
-            given: all points of the kind.
-            rescale: whether standard deviations that are too small may be replaced.
-            used: whether the points are used.
         """
         keep = np.full(len(given), used)
         keep[self.rows[list(self.judgement.wrong)]] = False
@@ -175,10 +170,6 @@ def contradiction_of(task: Task, groups: Sequence[Group]) -> Remark | None:
 
     Each by itself fits the network with a similarity. Both have the errors of the same network. With their
     joint covariance, one similarity is tested against two, which have seven more parameters.
-
-    Args:
-        task: settings of the test.
-        groups: control and projection centres.
     """
     if len(groups) < 2:
         return None
@@ -212,12 +203,7 @@ def remarks_on_unchecked(
 ) -> Iterator[Remark]:
     """Yield remarks on given values whose errors nothing, or hardly anything, would reveal.
 
-    Args:
-        of: kind of the given values.
-        names: names of the given values.
-        model: differences of the given values.
-        without: indices of values that are left out.
-        level: level of the test of a value.
+    `without` are the values that are left out, and `level` is that of the test of one value.
     """
     reach, rank = model.external(without, level=level), model.kept(without).decreases()[1]
     for kind, concerned in (

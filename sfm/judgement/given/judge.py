@@ -363,11 +363,7 @@ def shift_of_fixed(model: GivenModel, sigma: float) -> float:
     """Return the shift of coordinates by errors of points that are held fixed, in standard deviations.
 
     It is the standard deviation of the shift by the datum over that of the coordinate, at the given point
-    where this ratio is largest.
-
-    Args:
-        model: differences of the fixed points.
-        sigma: standard deviation of their errors.
+    where this ratio is largest. Sigma is the standard deviation of the errors.
     """
     fixed = replace(model, stated=np.zeros_like(model.stated), estimated=False)
     datum = model.A @ parameters_of(fixed, np.ones(len(model.v), dtype=bool))

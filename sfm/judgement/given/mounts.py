@@ -30,10 +30,7 @@ def judge_mounts(
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the mounts whose rotation and base direction the photographs confirm, and remarks on the others.
 
-    Args:
-        given: mounts, held fixed or observed.
-        free: adjustment of the image points alone.
-        level: probability that right mounts are reported as wrong.
+    The mounts are held fixed or observed.
     """
     reference, mounts = free.reference_of([given]), free.adjustment.estimate.mounts
     if reference is None or mounts is None:
@@ -83,12 +80,8 @@ def judge_mount_scales(
 ) -> tuple[MountObservations, tuple[Remark, ...]]:
     """Return the mounts if their scales agree; otherwise no mounts, and the remark that they contradict.
 
-    Args:
-        given: mounts whose rotation and direction the photographs confirm.
-        network: has all other given values and observations that were found right.
-        reference: the unknowns of all these.
-        place: gives the object frame from the frame of the free network, by all given values of a network.
-        level: probability that right mounts are reported as wrong.
+    The network has all other given values and observations that were found right. `place` gives the object
+    frame from the frame of the free network, by all given values of a network.
     """
     right = [kind for kind in (*confirmed(network), *network.further) if len(kind)]
     free = reference.marginal.adjustment.estimate

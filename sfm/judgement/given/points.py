@@ -53,12 +53,7 @@ class Strain:
         return float(np.trace(self.F) - 3 if len(self.derivatives) == 1 else d[0] / d[-1] - 1)
 
     def of(self, model: GivenModel, X: FloatArray) -> GivenModel:
-        """Return the differences of stretched points, with the strain among the parameters.
-
-        Args:
-            model: differences of all coordinates of points.
-            X: points that are stretched about their centre, (n, 3).
-        """
+        """Return the differences of points X, (n, 3), that are stretched; the strain is a parameter."""
         centre, size = centre_and_size(X)
         by_strain = np.einsum("uab,nb->nau", self.derivatives, (X - centre) / size)
         A = np.hstack([self._turned(model.A), by_strain.reshape(len(model.v), -1)])
@@ -124,12 +119,7 @@ class GivenPoints:
         return replace(self, kind=self.kind.mistakes()["mirrored"])
 
     def model(self, placing: Similarity, *, estimated: bool) -> GivenModel:
-        """Return the differences from the free network after a similarity.
-
-        Args:
-            placing: similarity, given frame from free frame.
-            estimated: whether the standard deviations are unknown.
-        """
+        """Return the differences from the free network after a similarity to the given frame."""
         X = self.reference.places(self.kind, placing)
         if self.strain is None:
             model, _ = self.reference.differences([self.kind], placing)
@@ -143,11 +133,6 @@ class GivenPoints:
 
     def moved(self, placing: Similarity, model: GivenModel, without: tuple[int, ...]) -> Similarity:
         """Return the similarity that best fits the given values, without some, by generalised least squares.
-
-        Args:
-            placing: approximate similarity.
-            model: differences after it.
-            without: points left out.
 
         Source: Mikhail (1976), Observations and Least Squares, ch. 8.
         """
@@ -256,14 +241,11 @@ def judge_points(
 
 
 def excludes_mirror(placed: PlacedPoints) -> bool:
-    """Return whether points, without the wrong ones, fit the network but not the mirrored network.
+    """Return whether points fit the network, but not the mirrored network, without the wrong ones.
 
-    With n differences the mirror image is less likely by n ln of the ratio of both chi-squares, in -2 ln
-    likelihood. This assumes an unknown variance factor of at least 1. Both chi-squares include the misfit of
-    points that contradict one another.
-
-    Args:
-        placed: judged points that are not mirrored.
+    They must not be mirrored. With n differences the mirror image is less likely by n ln of the ratio of both
+    chi-squares, in -2 ln likelihood. This assumes an unknown variance factor of at least 1. Both chi-squares
+    include the misfit of points that contradict one another.
 
     Source: Seber and Wild (1989), Nonlinear Regression, sec. 2.2.
     """

@@ -54,10 +54,6 @@ def judge_scales(task: Task, groups: Sequence[Group]) -> JudgedScales:
 
     Rows that contradict most of their table are left out. If nothing shows which rows of a table are wrong,
     each of them is a source.
-
-    Args:
-        task: values to judge.
-        groups: dependable groups of given points.
     """
     bars, rescale = task.network.scale_bars, task.settings.rescale
     used, factor = np.ones(len(bars), dtype=bool), np.ones(len(bars))
@@ -168,9 +164,6 @@ class Scales(NamedTuple):
         the length and of the length that the median scale predicts. A difference of any size is then the same
         number of standard deviations in lengths and in logarithms.
 
-        Args:
-            reference: the free network.
-
         Source: Stolarsky (1975), Generalizations of the logarithmic mean, Math. Mag. 48(2), 87-92.
         """
         off, k = self.log - np.median(self.log), len(self.log)
@@ -187,11 +180,7 @@ def scales_of(
 ) -> Scales:
     """Return the scales that observations give, from their differences from the free network.
 
-    Args:
-        reference: the free network.
-        kinds: observations.
-        placing: object frame from the frame of the free network.
-        by_values: derivatives of the logarithms of scales by the given values, (k, m).
+    `by_values` are the derivatives of the logarithms of scales by the given values, (k, m).
     """
     comparison, W = reference.compare(kinds, placing), csr_matrix(by_values)
     left = 1 - W @ comparison.v  # length in the free network, over the given one
@@ -214,14 +203,9 @@ def common_scale(
     without: tuple[int, ...] = (),
     estimated: bool = False,
 ) -> Scales | None:
-    """Return the scale that observations give together, in the object frame; None if they give none.
+    """Return the scale that observations, without some values, give together; None if they give none.
 
-    Args:
-        reference: the free network.
-        kinds: observations.
-        placing: object frame from the frame of the free network.
-        without: given values left out.
-        estimated: whether the standard deviations are unknown.
+    `placing` is the object frame from the frame of the free network.
     """
     if not kinds:
         return None
@@ -309,11 +293,7 @@ class Comparison(NamedTuple):
         return remarks_on_unchecked("lengths", self.names, self.model, self.judgement.wrong, self.level)
 
     def as_one(self, table: str) -> Source:
-        """Return the right ones as one source, with standard deviations that fit.
-
-        Args:
-            table: name of the table, if they are its rows.
-        """
+        """Return the right ones as one source, with sigmas that fit; rows take the name of the table."""
         first, *others = (source for k, source in enumerate(self.sources) if k not in self.judgement.wrong)
         scales = Scales.joined([first.scales, *(source.scales for source in others)])
         variance = self.factor**2 * scales.variance
@@ -333,12 +313,7 @@ class Comparison(NamedTuple):
         ]
 
     def remarks(self, of: str, *, rescale: bool) -> Iterator[Remark]:
-        """Yield remarks on wrong sources and on standard deviations.
-
-        Args:
-            of: what the standard deviations belong to.
-            rescale: whether standard deviations that are too small are replaced.
-        """
+        """Yield remarks on wrong sources and on standard deviations, which `rescale` replaces."""
         wrong = self.judgement.wrong
         for k in wrong:
             what = "plate" if self.sources[k].is_plate else "given"
@@ -356,9 +331,7 @@ class Comparison(NamedTuple):
     def is_open(self, *, on_points: bool) -> bool:
         """Return whether the others do not identify the wrong ones.
 
-        Args:
-            on_points: whether points carry the datum: bars, which may share a wrong unit, do not replace
-                them.
+        If points carry the datum, bars, which may share a wrong unit, do not replace them.
         """
         of_points = {k for k, source in enumerate(self.sources) if source.points}
         outvoted = on_points and len(of_points) > 0 and of_points <= {*self.judgement.wrong}
@@ -415,12 +388,9 @@ def difference_of(model: GivenModel, a: int, b: int) -> tuple[float, float]:
 
 
 def numbers_of_scale(log: float, sigma: float, level: float) -> dict[str, Any]:
-    """Return the numbers for a remark on a difference of scale, with the two units if it is a unit factor.
+    """Return the numbers for a remark on the logarithm of a ratio of scales, with its standard deviation.
 
-    Args:
-        log: logarithm of the ratio of scales.
-        sigma: standard deviation of the logarithm.
-        level: probability that a unit factor is not recognised.
+    They include both units if it is a unit factor; `level` is the probability that one is not recognised.
     """
     unit = find_unit(float(np.exp(abs(log))), float(np.sqrt(chi2_isf(level, 1))) * sigma)
     numbers: dict[str, Any] = {"sigmas": abs(log) / sigma}

@@ -49,11 +49,7 @@ class Contradiction:
     rest: int | None = None  # degrees of freedom of the others, if these confirm one another
 
     def remark(self, names: Sequence[Sequence[str]]) -> Remark:
-        """Return the remark on these observations.
-
-        Args:
-            names: names of the parts of each kind of the survey.
-        """
+        """Return the remark on these observations, from the names of the parts of each kind of the survey."""
         if self.factor != 1.0:
             return remark("given_sigmas", of=self.kind, factor=self.factor, used=self.factor)
         if self.whole:

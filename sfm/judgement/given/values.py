@@ -59,9 +59,6 @@ class Kept:
     def without(self, item: int) -> Kept:
         """Leave out one more value, by updating the partitioned inverse.
 
-        Args:
-            item: index of the value.
-
         Source: Foerstner and Wrobel (2016), sec. 4.6.2.
         """
         rows = np.flatnonzero(self.model.item == item)
@@ -84,11 +81,7 @@ class Kept:
         return np.where(on, w2 / np.where(on, d, 1.0), 0.0).sum(axis=1), on.sum(axis=1)
 
     def difference(self, item: int) -> tuple[FloatArray, FloatArray]:
-        """Return the difference of a value from the prediction by the others, (k,), and its covariance.
-
-        Args:
-            item: index of the value.
-        """
+        """Return the difference of a value from the prediction by the others, (k,), and its covariance."""
         rows = np.flatnonzero(self.model.item == item)
         covariance = np.linalg.pinv(self.precision[np.ix_(rows, rows)], rcond=RANK, hermitian=True)
         return covariance @ self.u[rows], np.asarray(covariance, dtype=np.float64)
@@ -139,12 +132,7 @@ class Kept:
     def may_fit(self, level: float, fall: float, rank: int) -> bool:
         """Return whether the test of all differences together lets them fit after a decrease of chi-square.
 
-        It is a part of `probability` that needs no further inverse.
-
-        Args:
-            level: probability that correct values are rejected.
-            fall: decrease of chi-square.
-            rank: decrease of its degrees of freedom, less than `dof`.
+        It is a part of `probability` that needs no further inverse. The rank is less than `dof`.
         """
         if self.model.estimated:
             return True
@@ -244,12 +232,7 @@ class GivenModel:
         return replace(self, stated=MAX_FACTOR**2 * stated, estimated=False)
 
     def fits(self, level: float, without: tuple[int, ...] = ()) -> bool:
-        """Return whether values fit without some; unknown standard deviations must also be plausible.
-
-        Args:
-            level: probability that correct values are rejected.
-            without: values left out.
-        """
+        """Return whether values fit without some; unknown standard deviations must also be plausible."""
         at_worst = self.at_worst.kept(without) if self.estimated else None
         return _fits(self.kept(without), at_worst, level)
 
@@ -258,9 +241,6 @@ class GivenModel:
 
         Each value must be checked, and the degrees of freedom must suffice to check one in all its rows.
         Fewer values would fit in any case.
-
-        Args:
-            out: values left out.
         """
         return self.kept(out).dof >= self.blocks[1].shape[1] and not np.isinf(self.external(out)).any()
 
@@ -276,10 +256,7 @@ class GivenModel:
         )
 
     def beside(self, right: BoolArray) -> GivenModel:
-        """Return the model of the other differences, predicted by the network and by values that are right.
-
-        Args:
-            right: which differences belong to values that are right, (m,).
+        """Return the model of the other differences, predicted by the network and by the right ones, (m,).
 
         Source: Foerstner and Wrobel (2016), sec. 4.2.7 (sequential estimation).
         """
@@ -313,10 +290,6 @@ class GivenModel:
 
         It is the largest shift that a just detectable error of the value causes in the parameters that only
         given values determine, in standard deviations of the parameters.
-
-        Args:
-            without: values left out.
-            level: level of the test of a value.
         """
         out, delta0 = np.full(self.items, np.nan), non_centrality(level)
         part = self.part(~np.isin(self.item, without))
@@ -402,12 +375,7 @@ class Judgement:
 
 
 def judge_values(model: GivenModel, level: float) -> Judgement:
-    """Return the errors of given values.
-
-    Args:
-        model: differences of the values from the free network.
-        level: probability that correct values are reported as wrong.
-    """
+    """Return the errors of given values; `level` is the probability that correct ones are called wrong."""
     every = model.kept()
     judgement = Judgement(every.chi2, every.dof, every.probability())
     if every.dof < 1 or model.fits(level):
@@ -445,10 +413,6 @@ def misfit_of(model: GivenModel, judgement: Judgement) -> float:
 
     Unknown standard deviations take their largest plausible values. With wrong values, chi-square is computed
     from the other values directly, because a difference of two values of 1e29 would be rounding only.
-
-    Args:
-        model: differences of the values from the free network.
-        judgement: errors found.
     """
     if not judgement.wrong:
         return model.at_worst.kept().chi2 if model.estimated else judgement.misfit
@@ -495,14 +459,9 @@ def _score(model: GivenModel, out: tuple[int, ...], kept: Kept, *, scatter: bool
 
 
 def _cost_of(model: GivenModel, out: tuple[int, ...], kept: Kept, *, scatter: bool = True) -> float:
-    """Return the cost of the errors of some values and of their choice.
+    """Return the cost of the errors of some values, without which the others are kept, and of their choice.
 
-    Args:
-        model: model of all values.
-        out: wrong values.
-        kept: the differences without them.
-        scatter: whether their errors have one distribution, as with a factor; otherwise each error is a
-            separate parameter.
+    The errors have one distribution, as with a factor, if they scatter; otherwise each is a parameter.
     """
     every, m = model.kept(), len(model.v)
     q = every.dof - kept.dof
@@ -577,13 +536,7 @@ def _misfits_like(model: GivenModel, out: tuple[int, ...]) -> Iterator[tuple[tup
 def _each_but_one(
     kept: Kept, without: tuple[int, ...], values: tuple[int, ...]
 ) -> Iterator[tuple[tuple[int, ...], Kept]]:
-    """Yield the differences without all but one of some values, for each of them, in n ln n updates.
-
-    Args:
-        kept: the differences without the values `without`.
-        without: values left out already.
-        values: further values, one or more.
-    """
+    """Yield the differences without all but one of some values, for each of them, in n ln n updates."""
     if len(values) == 1:
         yield without, kept
         return

@@ -66,9 +66,7 @@ MIN_OF_BODY = 3  # points that determine the six motions of a body
 def alternatives_of(reduced: Reduced) -> tuple[Alternative, ...]:
     """Return all alternatives, best evidence first.
 
-    Args:
-        reduced: adjustment of the image points alone, or with control. With control, only changes of the
-            camera and of the object, and strained control, are tested.
+    With control, only changes of the camera and of the object, and strained control, are tested.
     """
     a, alternatives = reduced.a, list(_by_photographs(reduced))
     in_all = Alternative(STRAIN if a.datum == "control" else FORMAT, "all", np.ones(reduced.photographs))
@@ -91,9 +89,6 @@ def count_alternatives(a: Adjustment) -> int:
 
     They are held and given parameters, families of photographs with their patterns, the format and moved
     points.
-
-    Args:
-        a: adjustment.
     """
     owners = [owner for family in (HELD, GIVEN) for owner in interior_parameters(a, family)]
     held = sum(len(owner) + (len(owner) > 1) for owner in owners)
@@ -110,10 +105,7 @@ def count_alternatives(a: Adjustment) -> int:
 def is_significant(alternative: Alternative, rows: int, level: float) -> bool:
     """Return whether chance would produce such a gain in a smaller share of all surveys than the level.
 
-    Args:
-        alternative: alternative with its gain.
-        rows: number of alternatives tested together.
-        level: probability of naming any alternative if none is true, `Levels.family`.
+    The level is that of naming any alternative if none is true, `Levels.family`. All rows share it.
     """
     return bool(alternative.log_p < np.log(level / rows) - alternative.search)
 
@@ -133,12 +125,7 @@ def needed_gain(rank: int, touched: int, search: float, rows: int, level: float)
 
 
 def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tuple[tuple[int, int], ...]]]:
-    """Return the held or given parameters of each camera or group of cameras, as (camera, parameter).
-
-    Args:
-        a: adjustment.
-        family: family of held or of given parameters.
-    """
+    """Return the held or given parameters of each camera or group of cameras, as (camera, parameter)."""
     network = a.network
     given = network.interior
     owners: dict[str, dict[str, list[tuple[int, int]]]] = {}
@@ -266,11 +253,7 @@ def _of_each(reduced: Reduced, part: Part, run: IntArray, level: float) -> Itera
 
 
 def cameras_of_photographs(a: Adjustment) -> IntArray:
-    """Return the camera number of each photograph, (m,); cameras that share parameters count as one.
-
-    Args:
-        a: adjustment.
-    """
+    """Return the camera number of each photograph, (m,); cameras that share parameters count as one."""
     names = [camera.shared_name for camera in a.estimate.cameras]
     _, number = np.unique([names[k] for k in a.network.camera], return_inverse=True)
     return np.asarray(number)
@@ -279,11 +262,7 @@ def cameras_of_photographs(a: Adjustment) -> IntArray:
 def photographs_among(family: CameraFamily | ObjectFamily, camera: IntArray) -> list[BoolArray]:
     """Return the sets of photographs within which some may differ: those of each camera, or all, (m,) each.
 
-    More than MAX_RUNS cameras are too many to test.
-
-    Args:
-        family: family of a camera or of the object.
-        camera: camera of each photograph, see `cameras_of_photographs`, (m,).
+    More than MAX_RUNS cameras, see `cameras_of_photographs`, are too many to test.
     """
     if not family.of_camera:
         return [np.ones(len(camera), dtype=bool)]
@@ -349,12 +328,7 @@ class Part:
         return np.array(groups).reshape(-1, m)
 
     def spread(self, factor: FloatArray, gain: Gain) -> Spread:
-        """Return the spread of the photographs in the family beyond what a pattern explains.
-
-        Args:
-            factor: factors of the pattern, (m,).
-            gain: gain of the pattern.
-        """
+        """Return the spread of the photographs in the family beyond what a pattern explains by its gain."""
         m = len(self.g)
         left = self.g + np.tensordot(self.H, factor, (2, 0)) @ gain.beta
         others = np.ones(m, dtype=bool) if np.count_nonzero(factor) > 1 else factor == 0
@@ -368,9 +342,6 @@ def runs_of(camera: IntArray) -> IntArray:
     """Return the run of each photograph, (m,): a run has successive photographs of one camera.
 
     With too many cameras to test, a run includes photographs of several cameras.
-
-    Args:
-        camera: camera of each photograph, (m,).
     """
     m = len(camera)
     if m <= MAX_RUNS:

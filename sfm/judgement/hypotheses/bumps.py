@@ -75,13 +75,7 @@ def find_bumps(a: Adjustment, stated: IntArray | None = None) -> tuple[Bump, ...
 
 
 def bump_remarks(a: Adjustment, unit: str, stated: IntArray | None = None) -> tuple[Remark, ...]:
-    """Return the remark on cameras that were displaced on a rig; empty if there are none.
-
-    Args:
-        a: adjustment.
-        unit: unit of its coordinates.
-        stated: moment of each photograph as the survey states it, see `find_bumps`, (m,).
-    """
+    """Return the remark on cameras that were displaced on a rig, see `find_bumps`; empty if none were."""
     bumps = find_bumps(a, stated)
     if not bumps:
         return ()
@@ -171,10 +165,6 @@ def _of_freed(a: Adjustment, freed: IntArray, stated: IntArray) -> Iterator[Bump
 
 def _difference(a: Adjustment, images: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return the difference of the relative poses of two pairs of photographs, and its derivatives.
-
-    Args:
-        a: adjustment.
-        images: two photographs, and two others of the same cameras.
 
     Returns:
         Shift and rotation in the axes of the second camera, object unit and rad, (6,). Derivatives by X0,

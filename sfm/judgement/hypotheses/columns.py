@@ -90,13 +90,9 @@ def columns_of(a: Adjustment) -> Columns:
 
 
 def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return the effect of the focal lengths of a camera on image points, 1 px at the edge, (k, 2).
+    """Return the effect of the focal lengths on image points of tangents uv, 1 px at the edge, (k, 2).
 
     With another c, the same rays pass through other parts of the distortion.
-
-    Args:
-        camera: camera.
-        uv: tangents of the rays, (k, 2).
     """
     focal = camera.plays(Role.FOCAL)
     by_focal = parameter_jacobian(camera, uv)[:, :, focal] @ camera.parameters[focal]
@@ -106,8 +102,7 @@ def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
 def _camera(flat: FloatArray) -> FloatArray:
     """Return the effect of the freedoms of a camera other than c, 1 px at the edge, (k, 2, 8).
 
-    Args:
-        flat: tangents divided by that of half the longer side, y up, (k, 2).
+    Tangents are divided by that of half the longer side, y up, (k, 2).
     """
     x, y = flat.T
     r2, ones, zero = x**2 + y**2, np.ones(len(x)), np.zeros(len(x))
@@ -148,10 +143,6 @@ def rigid_motions(points: FloatArray, body: IntArray | BoolArray) -> FloatArray:
     """Return the displacements of points by the six motions of a rigid body, (n, 3, 6).
 
     The motions are three shifts and three small rotations about its centre, which also move its points by 1.
-
-    Args:
-        points: object points, (n, 3).
-        body: those on the body.
     """
     away = points - points[body].mean(axis=0)
     turned = np.swapaxes(np.cross(np.eye(3), away[:, None]), 1, 2) / mean_distance(points[body])

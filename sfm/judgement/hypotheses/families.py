@@ -64,11 +64,7 @@ class Alternative:
     design_effect: float = 1.0  # factor of correlated errors of neighbours on the gain expected by chance
 
     def priced(self, reduced: Reduced) -> Alternative:
-        """Return the alternative with its price, by the image points that each part of it moves.
-
-        Args:
-            reduced: normal equations of the adjustment.
-        """
+        """Return the alternative with its price, by the image points that each part of it moves."""
         on, parts = self.factor[reduced.image] != 0, 1
         if self.pattern == "each":
             on, parts = np.ones_like(on), int(self.factor.max()) + 1
@@ -112,12 +108,7 @@ class Alternative:
         return kinds.get(self.pattern, kinds[""])
 
     def columns(self, a: Adjustment, columns: Columns) -> FloatArray:
-        """Return its columns for all image points of an adjustment, px, (k, 2, q).
-
-        Args:
-            a: adjustment.
-            columns: derivatives of its image points.
-        """
+        """Return its columns for all image points of an adjustment, px, (k, 2, q)."""
         return self.family.columns(self, a, columns)
 
     def whitened(self, reduced: Reduced) -> FloatArray:
@@ -125,12 +116,7 @@ class Alternative:
         return reduced.whiten(self.columns(reduced.a, reduced.columns))
 
     def deflated(self, gain: float, redundancy: int) -> float:
-        """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect.
-
-        Args:
-            gain: gain of ln likelihood.
-            redundancy: redundancy of the adjustment.
-        """
+        """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect."""
         if self.design_effect == 1:
             return gain
         return log_likelihood_gain(squares_gained(gain, redundancy) / self.design_effect, redundancy)
@@ -152,11 +138,7 @@ class Family(ABC):
     def parts(self, alternative: Alternative, a: Adjustment, beta: FloatArray, unit: str) -> Parts:
         """Return the parts of the remark on an alternative.
 
-        Args:
-            alternative: alternative of this family.
-            a: adjustment with the alternative.
-            beta: parameters of the alternative, (q,).
-            unit: object unit.
+        The adjustment is the one with the alternative, and beta are its parameters, (q,).
         """
 
     def cause(self, alternative: Alternative) -> tuple[object, ...]:

@@ -116,12 +116,7 @@ class JudgedAssumptions:
 
 
 def judge_alternatives(final: Adjustment, *, unit: str = "") -> JudgedAssumptions:
-    """Return the evidence of the image points against the assumptions of an adjustment.
-
-    Args:
-        final: finished adjustment with its covariance.
-        unit: object unit, for the remarks.
-    """
+    """Return the evidence of the image points against the assumptions of a finished adjustment."""
     photographs = final.network.images
     if not final.converged or not final.sigma0 > 0 or final.is_exact:
         return JudgedAssumptions()  # no result, or an exact one, which nothing contradicts
@@ -222,13 +217,9 @@ def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | 
 
 
 def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = None) -> Remark:
-    """Return the remark on a cause.
+    """Return the remark on a cause that an adjustment does not include.
 
-    Args:
-        plain: adjustment without the cause.
-        cause: the accepted alternative.
-        unit: object unit.
-        without: name of what fixes all coordinates of the result, so that only those of `plain` shift.
+    `without` is what fixes all coordinates of the result, so that only those of the adjustment shift.
     """
     alternative, refitted = cause.alternative, cause.refit
     instead = tuple(dict.fromkeys(other.kind for other, _ in cause.as_well))
@@ -249,11 +240,7 @@ def remark_of(plain: Adjustment, cause: Cause, unit: str, without: str | None = 
 
 
 def find_causes(plain: Adjustment) -> tuple[Cause, ...]:
-    """Return the accepted alternatives, clearest first.
-
-    Args:
-        plain: adjustment of the image points alone, with gross errors rejected.
-    """
+    """Return the accepted alternatives, clearest first, for an adjustment of the image points alone."""
     causes: tuple[Cause, ...] = ()
     for _ in range(MAX_CAUSES):
         cause = _best(plain, causes)
@@ -328,12 +315,7 @@ def _best(
 
 
 def _to_adjust(every: Sequence[Alternative], level: float) -> list[Alternative]:
-    """Return the alternatives with most evidence: one of each cause, and at most MAX_TRIED of a kind.
-
-    Args:
-        every: all alternatives, best evidence first.
-        level: of the tests of a result.
-    """
+    """Return the alternatives with most evidence: one of each cause, and at most MAX_TRIED of a kind."""
     needed = np.log(1 / level)
     once: dict[tuple[object, ...], Alternative] = {}
     for alternative in every:
@@ -443,9 +425,6 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
     """Return the held interior parameters that the image points contradict, clearest first.
 
-    Args:
-        a: finished adjustment.
-
     Returns:
         (camera or group of cameras, parameter) for each parameter that improves the fit beyond chance when
         it alone is freed.
@@ -470,11 +449,7 @@ def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
 
 
 def free_network(final: Adjustment) -> Adjustment | None:
-    """Return the adjustment of the image points alone, with gross errors rejected; None without a solution.
-
-    Args:
-        final: finished adjustment.
-    """
+    """Return the adjustment of the image points alone, with gross errors rejected; None without one."""
     if not final.converged or not final.sigma0 > 0 or final.redundancy < 2:
         return None
     network, correlation = final.network, final.error_correlation
@@ -527,11 +502,7 @@ def adjust_image_points(
 
 
 def best_explanation(plain: Adjustment) -> Cause | None:
-    """Return the alternative that best explains an adjustment of image points alone; None if none does.
-
-    Args:
-        plain: adjustment of image points alone.
-    """
+    """Return the alternative that best explains an adjustment of image points alone; None if none does."""
     if len(plain.network.images) > MAX_PHOTOGRAPHS:
         return None
     try:

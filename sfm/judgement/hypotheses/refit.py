@@ -247,12 +247,8 @@ def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Seq
     """Return the variance of what photographs say of an alternative, relative to that expected by chance.
 
     Errors that image points of a photograph have in common resemble a movement of many points. They differ
-    among the photographs of one state of the object, where a true movement is the same.
-
-    Args:
-        refitted: adjustment with the alternative and the others.
-        alternative: the tested alternative.
-        others: alternatives that were adjusted with it.
+    among the photographs of one state of the object, where a true movement is the same. The effects of the
+    others, which were adjusted too, are removed.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -278,9 +274,6 @@ def precision_factor(a: Adjustment) -> float:
     It is the standard deviation of a coordinate from the scatter of what the photographs contribute to it,
     over the stated one; with control, of an interior parameter. Errors that groups of photographs have in
     common are not in it.
-
-    Args:
-        a: adjustment of image points, alone or with control.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -373,10 +366,7 @@ def _typical(a: Adjustment) -> Iterator[Alternative]:
 def reach_of(alternative: Alternative, reduced: Reduced, *, rows: int) -> float:
     """Return the largest shift of coordinates before an alternative is detected, in standard deviations.
 
-    Args:
-        alternative: assumption that is violated.
-        reduced: the adjustment.
-        rows: number of alternatives tested together, which share the level.
+    As many rows are tested together and share the level.
     """
     a, D = reduced.a, alternative.whitened(reduced)
     H, _, squares = reduced.project(D)

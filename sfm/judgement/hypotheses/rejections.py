@@ -36,12 +36,7 @@ class SecondPlace:
 
 
 def explain_rejections(a: Adjustment, *, unit: str = "") -> tuple[Remark, ...]:
-    """Return remarks that explain the rejected image points of an adjustment.
-
-    Args:
-        a: finished adjustment.
-        unit: object unit, for the remarks.
-    """
+    """Return remarks that explain the rejected image points of a finished adjustment."""
     if not a.rejected.any() or not a.sigma0 > 0 or a.undetermined:
         return ()
     misnamed = _other_points(a)

@@ -80,13 +80,9 @@ class Reduced:
         return np.asarray(self.F @ columns[self.used])
 
     def project_by_run(self, D: FloatArray, run: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns.
+        """Return H (u, f, u, f), g (u, f) and squares (u, f) of whitened columns (k, 2, f).
 
-        Every run of photographs has f separate freedoms.
-
-        Args:
-            D: whitened columns, (k, 2, f).
-            run: run of each photograph, (m,).
+        Every run of photographs (m,) has f separate freedoms.
         """
         count, f = int(run.max()) + 1, D.shape[2]
         H, g, squares = np.zeros((count, f, count, f)), np.zeros((count, f)), np.zeros((count, f))
@@ -108,10 +104,7 @@ class Reduced:
     def design_effect(self, D: FloatArray) -> float:
         """Return the factor by which correlated errors of neighbours multiply a gain by chance, at least 1.
 
-        Only the directions that the columns determine count.
-
-        Args:
-            D: whitened columns, (k, 2, q).
+        Only the directions that the whitened columns (k, 2, q) determine count.
         """
         a, network = self.a, self.a.network
         if a.error_correlation is None:
@@ -155,10 +148,7 @@ class Reduced:
         return by_points, by_cameras[6 * m :] / sigma[:, None]
 
     def absorb(self, D: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the unknowns absorb if the effect of columns is in the image points.
-
-        Args:
-            D: whitened columns, (k, 2, q).
+        """Return what the unknowns absorb if the effect of whitened columns (k, 2, q) is in the image points.
 
         Returns:
             Shifts of object points (n, 3, q), those of photographs and cameras (a, q), and what is left of
@@ -422,12 +412,7 @@ def gain_of(H: FloatArray, g: FloatArray, squares: FloatArray, least: float = MI
 
 
 def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
-    """Return the inverse of normal equations in the directions that are determined, as in `gain_of`.
-
-    Args:
-        H: normal equations after elimination, (q, q).
-        squares: squares of the columns before elimination, (q,).
-    """
+    """Return the inverse of normal equations in the directions that are determined, as in `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
     good = values > MIN_DETERMINED_SHARE
     half = scale[:, None] * vectors[:, good] / np.sqrt(values[good])
