@@ -105,12 +105,11 @@ def other_solutions(
             others.append(described)
     if others and others[0].vPv < 1:
         estimate = others[0].estimate
-        cameras = []
-        for camera in estimate.cameras:
-            free = camera.free.copy()
-            free[camera.parts[0]] |= camera.name in had_to_be_held
-            cameras.append(replace(camera, free=free))
-        ended = search.adjusted(replace(estimate, cameras=tuple(cameras)), tolerance=TOLERANCE)
+        free = [
+            camera.free | camera.parts[0] if camera.name in had_to_be_held else camera.free
+            for camera in estimate.cameras
+        ]
+        ended = search.adjusted(_with_free(estimate, free), tolerance=TOLERANCE)
         if ended is not None and ended.converged:
             others[0] = replace(others[0], estimate=ended.estimate, converges=True)
     return tuple(others)
@@ -177,13 +176,14 @@ class _Search:
         Gauss-Newton comes first: in the bent valleys of weak networks it takes a few steps, damping fifty.
         The damped method follows if it does not converge.
         """
-        cameras = tuple(_with_c_held(camera) for camera in start.cameras) if held else start.cameras
+        if held:
+            start = _with_free(start, [camera.free & ~camera.parts[0] for camera in start.cameras])
         adjusted: list[Adjustment] = []
         for method in ("gauss-newton", "levenberg-marquardt"):
             try:
                 a = adjust(
                     self.network,
-                    replace(start, cameras=cameras),
+                    start,
                     datum=self.datum,
                     reject="none",
                     covariance=False,
@@ -234,9 +234,8 @@ class _Search:
         track: list[_Candidate] = []
         estimate = start
         for k in range(steps + 1):
-            starts = (scale_estimate(estimate, factor), scale_estimate(start, factor**k))[: min(k, 2)] or (
-                start,
-            )
+            starts = [scale_estimate(estimate, factor), scale_estimate(start, factor**k)][: min(k, 2)]
+            starts = starts or [start]
             ended = [self.adjusted(start, held=steps > 0) for start in starts]
             lowest = min(
                 (adjustment for adjustment in ended if adjustment is not None),
@@ -250,12 +249,6 @@ class _Search:
             if lowest.vPv > BARRIER * vPv:
                 break
         return track
-
-
-def _with_c_held(camera: Camera) -> Camera:
-    free = camera.free.copy()
-    free[camera.parts[0]] = False
-    return replace(camera, free=free)
 
 
 def _with_free(estimate: Estimate, free: list[BoolArray]) -> Estimate:

@@ -127,11 +127,13 @@ def _with_others(task: Task, given: JudgedGiven, place: Callable[[Network], Simi
     """Return the judged values with the survey observations and mounts that do not contradict others."""
     settings, network, mounts = task.settings, given.network, given.mounts
     in_control = given.datum.kind == "control"
-    in_free = [(k, *task.in_free(kind)) for k, kind in enumerate(network.further)]
-    tables = [Table(kind, k, parts) for k, parts, kind in in_free if len(kind)]
+    further = map(task.in_free, network.further)
+    tables = [Table(kind, k, parts) for k, (parts, kind) in enumerate(further) if len(kind)]
     right = network if in_control else network.with_given(ObjectPoints(), ExteriorObservations())
     part = task.free.adjustment.network.with_given(
-        *(task.in_free(kind)[1] for kind in (right.control, right.exterior, right.scale_bars)),
+        task.in_free(right.control)[1],
+        task.in_free(right.exterior)[1],
+        task.in_free(right.scale_bars)[1],
         further=tuple(table.kind for table in tables),
     )
     kinds = [*confirmed(part), *part.further]
