@@ -141,11 +141,7 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
 def projection_of(
     adjustment: Adjustment, photographs: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return the projection uncertainty of the camera that took some photographs.
-
-    Args:
-        adjustment: finished, with its covariance.
-        photographs: True for those photographs, (m,).
+    """Return the projection uncertainty of the camera that took some photographs, (m,).
 
     Returns:
         Columns (c,) and rows (r,) of a grid, px, and the standard deviation at its nodes, px, (r, c); None if

@@ -121,11 +121,7 @@ def _format_around(at: FloatArray, width: int, height: int) -> tuple[int, int] |
 
 
 def edges_of(photographs: Sequence[PhotographTargets]) -> dict[str, float]:
-    """Return the median blur of the target edges of each photograph.
-
-    Returns:
-        Standard deviation of an edge, px, by name; photographs without measured edges are left out.
-    """
+    """Return the median blur of target edges, one sigma, px, by photograph; none where none is known."""
     median_blur = {}
     for photograph in photographs:
         blur = np.zeros(0) if photograph.blur is None else photograph.blur[np.isfinite(photograph.blur)]

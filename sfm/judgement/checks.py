@@ -279,10 +279,8 @@ def standard_deviations(covariance: FloatArray) -> FloatArray:
 def check_coordinates(result: SurveyResult, *, placed: bool = False) -> tuple[ControlCoordinate, ...]:
     """Return the coordinates that check a datum of control, with the test of their differences.
 
-    Args:
-        result: result of a survey.
-        placed: whether to return those that check a network placed on its control, too; their standard
-            deviations do not include those of the placing.
+    If asked for, those that check a network placed on its control, too; their standard deviations do not
+    include those of the placing.
     """
     a = result.adjustment
     compared = a.datum == "control" or (placed and result.control_check is not None)
@@ -303,16 +301,9 @@ def check_coordinates(result: SurveyResult, *, placed: bool = False) -> tuple[Co
 def compare_coordinate(
     point: str, c: int, given: float, prior: float, adjusted: float, posterior: float, difference: float
 ) -> ControlCoordinate:
-    """Return a coordinate that took no part, and its difference over the expected standard deviation.
+    """Return coordinate c, 0, 1 or 2 for X, Y or Z, of a point that took no part, as a `ControlCoordinate`.
 
-    Args:
-        point: name of the point.
-        c: 0, 1 or 2 for X, Y or Z.
-        given: given coordinate, object unit.
-        prior: its standard deviation, object unit.
-        adjusted: adjusted coordinate, object unit.
-        posterior: its standard deviation, object unit.
-        difference: adjusted minus given, object unit.
+    Its difference is tested against its expected standard deviation.
     """
     expected = float(np.hypot(prior, posterior))
     test = difference / expected if expected > 0 else np.nan

@@ -110,11 +110,7 @@ def solve_likeliest(
 ) -> Solution:
     """Return the solution of the likeliest model, of which the usual one need have none.
 
-    Args:
-        usual: the usual model; without its solution, the rows are given None in its place.
-        choices: as for `choose`.
-        solve: as for `choose`.
-        false_alarm: as for `choose`.
+    Without its solution, the rows are given None in its place. The other arguments are those of `choose`.
 
     Raises:
         GeometryError: no model has a solution; the reason is that of the usual one.

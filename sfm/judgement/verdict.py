@@ -90,12 +90,11 @@ def judge_survey(result: SurveyResult) -> SurveyResult:
 def judge_adjustment(adjustment: Adjustment, *, rejects: bool = True) -> Adjustment:
     """Return the adjustment of a network, without a survey around it, with its verdict.
 
-    The verdict is computed when it is asked for.
-
-    Photographs and points without start values take no part; such photographs are missing.
+    The verdict, which replaces an earlier one, is computed when it is asked for. Photographs and points
+    without start values take no part; such photographs are missing.
 
     Args:
-        adjustment: adjustment of a network; an earlier verdict is replaced.
+        adjustment: adjustment of a network.
         rejects: whether gross errors were rejected or weighted down.
     """
     return replace(adjustment, judge=partial(_verdict_of_adjustment, rejects=rejects))

@@ -114,10 +114,8 @@ def _camera(flat: FloatArray) -> FloatArray:
 def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
     """Return the displacements of points by strain and bending, (n, 3, 5 + 18), and the size of the object.
 
-    The size is the root mean square distance from the centre. A parameter of 1 displaces points by that size.
-
-    Args:
-        points: object points, NaN where unknown, (n, 3).
+    The size is the root mean square distance from the centre, where points are known. A parameter of 1
+    displaces points by that size.
     """
     known = np.asarray(np.isfinite(points).all(axis=1))
     centre = points[known].mean(axis=0)

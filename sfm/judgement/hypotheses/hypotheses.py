@@ -193,11 +193,7 @@ def cause_in_calibration(final: Adjustment, free: Adjustment | None) -> Cause | 
     """Return the cause that given points reveal: another camera in some photographs, or strained control.
 
     Image points alone reveal little about the cameras of a few photographs, or of many photographs of a
-    plane.
-
-    Args:
-        final: finished adjustment in which most points are given.
-        free: adjustment of its image points alone, see `free_network`; None if they determine no network.
+    plane. `free` is the adjustment of the image points alone; None if they determine no network.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.
@@ -423,11 +419,9 @@ def _with_joint_shifts(plain: Adjustment, causes: tuple[Cause, ...]) -> tuple[Ca
 
 
 def contradicted_parameters(a: Adjustment) -> tuple[tuple[str, str], ...]:
-    """Return the held interior parameters that the image points contradict, clearest first.
+    """Return (camera or group, parameter) of held parameters that image points contradict, clearest first.
 
-    Returns:
-        (camera or group of cameras, parameter) for each parameter that improves the fit beyond chance when
-        it alone is freed.
+    Each improves the fit of the finished adjustment beyond chance when it alone is freed.
     """
     plain = free_network(a) if len(a.network.images) <= MAX_PHOTOGRAPHS else None
     if plain is None:

@@ -297,10 +297,8 @@ def precision_factor(a: Adjustment) -> float:
 def unchecked_assumptions(a: Adjustment, without: str | None = None) -> tuple[Remark, ...]:
     """Return remarks on assumptions that the tests hardly check, with the shift of an undetected error.
 
-    Args:
-        a: adjustment of the image points alone, with its covariance.
-        without: name of what fixes all coordinates of the result, so that only those of `a` shift; None if
-            nothing does.
+    The adjustment is that of the image points alone. If something fixes all coordinates of the result, they
+    shift without it only: `without` is its name.
 
     Raises:
         numpy.linalg.LinAlgError: the network is not determined.

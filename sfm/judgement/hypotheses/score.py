@@ -420,13 +420,7 @@ def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
 
 
 def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the gains (n,) and ranks (n,) of n separate alternatives.
-
-    Args:
-        H: normal equations of each after elimination, (n, q, q).
-        g: right-hand sides, (n, q).
-        squares: squares of the columns before elimination, (n, q).
-    """
+    """Return the gains (n,) and ranks (n,) of separate alternatives, with arrays (n, ...) as for `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
     good = values > MIN_DETERMINED_SHARE
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
@@ -481,13 +475,7 @@ class Spread:
     among: bool = True  # whether an alternative that concerns some of the parts was chosen from them
 
     def ratio(self, gain: float, q: int, redundancy: int) -> float:
-        """Return the ratio of a gain of v'Pv, per parameter, to the spread of the parts.
-
-        Args:
-            gain: decrease of v'Pv over the variance factor.
-            q: number of parameters.
-            redundancy: redundancy of the adjustment.
-        """
+        """Return the ratio of a gain, per parameter, to the spread of the parts; see `log_probability`."""
         left = max(redundancy - gain, 1.0) / redundancy  # remaining share of the variance factor
         return gain / max(q, 1) / max(self.factor, 1.0) / left
 
