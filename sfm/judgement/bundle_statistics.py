@@ -40,6 +40,7 @@ from sfm.adjustment.result import Adjustment, computed_once
 from sfm.judgement.calibrated_cameras import families, family_of_photographs
 from sfm.judgement.checks import rms_of_groups
 from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.network import rows_of
 from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals, given_residuals
 from sfm.model.observations.control_and_bars import InteriorObservations, ObjectPoints, ScaleBars
 from sfm.orientation.image_rays import ray_angles
@@ -99,12 +100,8 @@ def statistics_of(adjustment: Adjustment) -> Statistics:
     image points have the weight that their residuals suggest.
     """
     kinds = by_kind(adjustment)
-    detectable, w, tau, pairs = (
-        reliability(adjustment),
-        w_test(adjustment),
-        tau_test(adjustment),
-        correlations(adjustment),
-    )
+    detectable, pairs = reliability(adjustment), correlations(adjustment)
+    w, tau = w_test(adjustment), tau_test(adjustment)
     of_cameras = {
         f"{name} of camera {camera.owner_of(s)}"
         for camera in adjustment.estimate.cameras
@@ -184,10 +181,9 @@ def geometry_of(adjustment: Adjustment) -> Geometry:
     size = np.array([adjustment.estimate.cameras[a].size_px for a in network.camera], dtype=float)[used.image]
     scaled = (used.xy - (size - 1) / 2) / size  # -1/2 to 1/2 in both axes
     radius = np.linalg.norm(scaled * size, axis=1) / (np.linalg.norm(size, axis=1) / 2)
-    ends = np.cumsum(np.bincount(used.image, minlength=m))
-    rows_of = np.split(np.argsort(used.image, kind="stable"), ends[:-1])
-    hull = np.array([hull_area(scaled[rows]) for rows in rows_of])
-    farthest = np.array([radius[rows].max(initial=0.0) for rows in rows_of])
+    of_images = rows_of(used.image, m)
+    hull = np.array([hull_area(scaled[rows]) for rows in of_images])
+    farthest = np.array([radius[rows].max(initial=0.0) for rows in of_images])
     family = family_of_photographs(adjustment)
     coverage = tuple(
         Coverage(name, hull[family == f], hull_area(scaled[family[used.image] == f]), farthest[family == f])

@@ -17,6 +17,7 @@ from sfm.matching.epipolar import essential_matrices
 from sfm.model.camera import Camera, camera_families, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, angles_from_rotation
 from sfm.model.distortion.models import MODELS, Parameter, Role
+from sfm.model.remarks.remark import of_kind
 
 TINY = float(np.finfo(float).tiny)
 
@@ -97,15 +98,11 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
     camera with known c.
     """
     adjustment = result.adjustment
-    failed = {
-        name
-        for stage_remark in result.stage_remarks
-        if stage_remark.kind == CALIBRATION_FAILED
-        for name in stage_remark.names("camera")
-    }
+    remarks = of_kind(result.stage_remarks, CALIBRATION_FAILED)
+    failed = {name for failure in remarks for name in failure.names("camera")}
     if not camera_is_result(adjustment, result.plates):
         return ()
-    calibrated = []
+    seen, calibrated = adjustment.network.image_points.select(~adjustment.rejected), []
     for f, family in enumerate(interior.families):
         if family.name in failed:
             continue
@@ -116,7 +113,6 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
         if projection is None and not any(np.isinf(parameter.sigma) for parameter in family.parameters):
             continue  # held
         rms = largest = inner = np.inf
-        seen = adjustment.network.image_points.select(~adjustment.rejected)
         xy = seen.xy[(interior.family == f)[seen.image]]
         nodes = np.zeros((0, 2))
         if projection is not None:
@@ -125,16 +121,11 @@ def calibrated_cameras(result: SurveyResult, interior: InteriorOrientation) -> t
         if projection is not None:
             sigma = projection[2]
             known = np.isfinite(sigma)
-            rms, largest = (
-                root_mean_square(sigma[known]),
-                float(sigma[known].max()) if known.any() else np.nan,
-            )
+            rms = root_mean_square(sigma[known])
+            largest = float(sigma[known].max()) if known.any() else np.nan
             inner = root_mean_square(sigma[known & inside.reshape(sigma.shape)])
-        calibrated.append(
-            CalibratedCamera(
-                family.name, parameters, rms, largest, inner, area / float(np.prod(family.camera.size_px))
-            )
-        )
+        observed = area / float(np.prod(family.camera.size_px))
+        calibrated.append(CalibratedCamera(family.name, parameters, rms, largest, inner, observed))
     return tuple(calibrated)
 
 
@@ -187,22 +178,15 @@ class InteriorOrientation:
 def interior_of(adjustment: Adjustment) -> InteriorOrientation:
     """Return the interior orientation of an adjustment."""
     parameters, listed = interior_parameters(adjustment), families(adjustment)
-    common = {
-        name: tuple(parameter for parameter in parameters if parameter.owner == name)
-        for name in (name for name, _ in listed)
-    }
+    names, of_families = {name for name, _ in listed}, []
+    for name, camera in listed:
+        common = tuple(parameter for parameter in parameters if parameter.owner == name)
+        photographs = max((parameter.photographs for parameter in common), default=0)
+        of_families.append(CameraFamily(name, camera, common, photographs))
     return InteriorOrientation(
         parameters,
-        tuple(
-            CameraFamily(
-                name,
-                camera,
-                common[name],
-                max((parameter.photographs for parameter in common[name]), default=0),
-            )
-            for name, camera in listed
-        ),
-        tuple(parameter for parameter in parameters if parameter.owner not in common),
+        tuple(of_families),
+        tuple(parameter for parameter in parameters if parameter.owner not in names),
         tuple(adjustment.interior_sigma(a) for a in range(len(adjustment.estimate.cameras))),
         family_of_photographs(adjustment),
     )

@@ -134,8 +134,8 @@ def count_observations(adjustment: Adjustment) -> ObservationCounts:
     image = 2 * int((~adjustment.rejected).sum())
     control = 0
     if adjustment.datum == "control":
-        control = int(is_observed(_variances(network.control.covariance)).sum())
-    exterior = int(is_observed(_variances(network.exterior.covariance)).sum())
+        control = int(is_observed(np.diagonal(network.control.covariance, axis1=1, axis2=2)).sum())
+    exterior = int(is_observed(np.diagonal(network.exterior.covariance, axis1=1, axis2=2)).sum())
     sigma = network.interior.sigma
     interior = int(((sigma > 0) & np.isfinite(sigma)).sum())
     first = len(network.observations) - len(network.further)
@@ -169,10 +169,6 @@ def largest_residuals(adjustment: Adjustment, count: int = MAX_LISTED) -> tuple[
     worse = np.argmax(w[rows], axis=1)
     tests = np.column_stack([a.residuals[rows], a.standardised[rows, worse], a.tau[rows, worse]]).tolist()
     return tuple((*name, *test) for name, test in zip(names, tests, strict=True))
-
-
-def _variances(covariance: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nii->ni", covariance))
 
 
 @dataclass(frozen=True)

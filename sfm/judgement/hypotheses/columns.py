@@ -19,7 +19,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.model.camera import Camera, parameter_jacobian, pixel_jacobian
-from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
 from sfm.model.network import rows_of
 from sfm.model.similarity import mean_distance
@@ -59,7 +59,7 @@ def columns_of(a: Adjustment) -> Columns:
     network, estimate = a.network, a.estimate
     seen = network.image_points
     R, UVW = estimate.rotation[seen.image], _in_photographs(a, np.arange(len(seen)))
-    U, V, W = UVW.T
+    W = UVW[:, 2]
     uv = -UVW[:, :2] / W[:, None]
     k = len(seen)
     J, flat, by_c = np.zeros((k, 2, 2)), np.zeros((k, 2)), np.zeros((k, 2))
@@ -74,11 +74,7 @@ def columns_of(a: Adjustment) -> Columns:
     by_axes = -np.concatenate([np.tile(np.eye(2), (k, 1, 1)), uv[:, :, None]], axis=2) / W[:, None, None]
     by_axes = J @ by_axes
     point = by_axes @ np.swapaxes(R, 1, 2)
-    zero = np.zeros_like(U)
-    turned = np.stack(
-        [np.stack([zero, W, -V], -1), np.stack([-W, zero, U], -1), np.stack([V, -U, zero], -1)], axis=2
-    )
-    exterior = np.concatenate([-point, by_axes @ turned], axis=2)
+    exterior = np.concatenate([-point, by_axes @ skew(UVW)], axis=2)
     by_object = np.einsum("kac,kcf->kaf", point, object_fields(estimate.points)[0][seen.point])
     usable = np.isfinite(point).all(axis=(1, 2)) & (W < 0)
     columns = Columns(
@@ -119,7 +115,7 @@ def object_fields(points: FloatArray) -> tuple[FloatArray, float]:
     """
     known = np.asarray(np.isfinite(points).all(axis=1))
     centre = points[known].mean(axis=0)
-    size = float(np.sqrt(((points[known] - centre) ** 2).sum(axis=1).mean()))
+    size = mean_distance(points[known])
     x, y, z = (np.where(known[:, None], points - centre, 0.0) / size).T
     zero = np.zeros_like(x)
     strain = np.stack(
@@ -143,7 +139,7 @@ def rigid_motions(points: FloatArray, body: IntArray | BoolArray) -> FloatArray:
     The motions are three shifts and three small rotations about its centre, which also move its points by 1.
     """
     away = points - points[body].mean(axis=0)
-    turned = np.swapaxes(np.cross(np.eye(3), away[:, None]), 1, 2) / mean_distance(points[body])
+    turned = -skew(away) / mean_distance(points[body])
     return np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), turned], axis=2)
 
 

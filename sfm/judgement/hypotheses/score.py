@@ -26,9 +26,10 @@ from scipy.linalg import cho_factor, cho_solve
 from sfm.adjustment.engine.correlated import correlated_sum
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.hypotheses.columns import Columns, columns_of, interior_columns
-from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
+from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import f_sf
 from sfm.model.network import rows_of, sum_rows
+from sfm.model.similarity import similarity_motions
 from sfm.runtime.compiling import compiled
 
 # Share of the squares of combined columns that must remain after eliminating photographs, cameras and points.
@@ -347,9 +348,7 @@ def _constraints(a: Adjustment, S: FloatArray, m: int) -> FloatArray:
     X0, R = a.estimate.position, a.estimate.rotation
     centre = X0.mean(axis=0)
     G = np.zeros((m, 6, 7))
-    G[:, :3, :3] = np.eye(3)
-    G[:, :3, 3:6], G[:, 3:, 3:6] = -skew(X0 - centre), np.swapaxes(R, 1, 2)
-    G[:, :3, 6] = X0 - centre
+    G[:, :3], G[:, 3:, 3:6] = similarity_motions(X0, centre=centre), np.swapaxes(R, 1, 2)
     scale = np.sqrt(np.diagonal(S)[: 6 * m])
     heavy = np.zeros_like(S)
     Q = np.linalg.qr(scale[:, None] * G.reshape(6 * m, 7))[0]
@@ -420,7 +419,7 @@ def determined_inverse(H: FloatArray, squares: FloatArray) -> FloatArray:
 
 
 def gains_of(H: FloatArray, g: FloatArray, squares: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return the gains (n,) and ranks (n,) of separate alternatives, with arrays (n, ...) as for `gain_of`."""
+    """Return the gains (n,) and ranks (n,) of separate alternatives, with arrays (n, ...) as in `gain_of`."""
     values, vectors, scale = directions_of(H, squares)
     good = values > MIN_DETERMINED_SHARE
     projected = np.einsum("nij,ni->nj", vectors, scale * g)
