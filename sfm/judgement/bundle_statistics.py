@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
+from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.quality.statistics import (
     CoordinateTest,
     Correlation,
@@ -199,12 +199,7 @@ def geometry_of(adjustment: Adjustment) -> Geometry:
 
 def hull_area(xy: FloatArray) -> float:
     """Return the area of the convex hull of points (k, 2), 0 if they lie on a line."""
-    if len(xy) < 3:
-        return 0.0
-    try:
-        return float(ConvexHull(xy).volume)
-    except QhullError:
-        return 0.0
+    return observed_part(xy, np.zeros((0, 2)))[0]
 
 
 @dataclass(frozen=True)

@@ -114,8 +114,6 @@ def by_kind(adjustment: Adjustment) -> VarianceComponents:
     Kinds are image points and those of `Network.observations` that took part. The redundancies of all kinds
     add up to that of the adjustment.
 
-
-
     Args:
         adjustment: finished adjustment.
     """

@@ -22,12 +22,7 @@ from sfm.model.estimate import Mounts
 from sfm.model.remarks.remark import of_kind, remark
 from sfm.model.remarks.row import Quantity
 from sfm.runtime.progress import report_step
-from sfm.survey.adjusting.solved_survey import (
-    SolvedSurvey,
-    SurveyModel,
-    log_likelihood_of_all,
-    solve_model,
-)
+from sfm.survey.adjusting.solved_survey import SolvedSurvey, SurveyModel, log_likelihood_of_all, solve_model
 from sfm.survey.inputs.checks.copies import find_copies, without_copies
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.sources.source import Correspondences

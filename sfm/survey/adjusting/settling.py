@@ -395,18 +395,11 @@ def nearer_start(network: Network, start: Estimate, ended: Estimate, datum: Datu
     Returns:
         The start values, with the cameras as in `start`; None if no adjustment converges.
     """
-    adjustments = [
-        adjustment
-        for adjustment in (
-            _adjust_with_cameras_held(network, candidate, datum)
-            for candidate in _start_candidates(network, start, ended, datum)
-        )
-        if adjustment
-    ]
-    if not adjustments:
-        return None
-    best = min(adjustments, key=lambda adjustment: adjustment.vPv)
-    return replace(best.estimate, cameras=start.cameras)
+    candidates = _start_candidates(network, start, ended, datum)
+    attempts = [_adjust_with_cameras_held(network, candidate, datum) for candidate in candidates]
+    converged = [adjustment for adjustment in attempts if adjustment is not None]
+    best = min(converged, key=lambda adjustment: adjustment.vPv, default=None)
+    return None if best is None else replace(best.estimate, cameras=start.cameras)
 
 
 def held_to_converge(before: tuple[Camera, ...], after: tuple[Camera, ...]) -> tuple[Remark, ...]:

@@ -30,9 +30,8 @@ from sfm.survey.placing import mounts_give_scale, scale_sigma
 WEAK_SCALE = 0.01  # a scale with a larger relative standard deviation is reported
 # Relative change of c by focusing from infinity to 1 : 5: c = f (1 + 1/5), thin lens.
 MAX_C_CHANGE = 0.2
-MIN_SIDE_DIFFERENCE = (
-    0.005  # relative difference of the sides of a pixel; no camera sensor has such a difference
-)
+# Relative difference of the sides of a pixel; no camera sensor has such a difference.
+MIN_SIDE_DIFFERENCE = 0.005
 
 
 def remarks_on_solution(
