@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm.adjustment.result import Adjustment
-from sfm.model.camera import Camera, parameter_jacobian, pixel_jacobian
+from sfm.model.camera import parameter_jacobian, pixel_jacobian
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
 from sfm.model.network import rows_of
@@ -67,9 +67,12 @@ def columns_of(a: Adjustment) -> Columns:
         estimate.cameras, rows_of(network.camera[seen.image], len(estimate.cameras)), strict=True
     ):
         if len(rows):
+            half, focal = max(camera.size_px) / 2, camera.plays(Role.FOCAL)
             J[rows] = pixel_jacobian(camera, seen.xy[rows])
-            flat[rows] = uv[rows] * camera.c_px / (max(camera.size_px) / 2)
-            by_c[rows] = _scaled(camera, uv[rows])
+            flat[rows] = uv[rows] * camera.c_px / half
+            # with another c, the same rays pass through other parts of the distortion
+            by_focal = parameter_jacobian(camera, uv[rows])[:, :, focal] @ camera.parameters[focal]
+            by_c[rows] = np.nan_to_num(by_focal) / half
     # d (u, v) / d (U, V, W) = -(1, 0, u) / W
     by_axes = -np.concatenate([np.tile(np.eye(2), (k, 1, 1)), uv[:, :, None]], axis=2) / W[:, None, None]
     by_axes = J @ by_axes
@@ -83,16 +86,6 @@ def columns_of(a: Adjustment) -> Columns:
     for part in (columns.exterior, columns.point, columns.freedoms):
         part[~usable] = 0.0
     return columns
-
-
-def _scaled(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Return the effect of the focal lengths on image points of tangents uv, 1 px at the edge, (k, 2).
-
-    With another c, the same rays pass through other parts of the distortion.
-    """
-    focal = camera.plays(Role.FOCAL)
-    by_focal = parameter_jacobian(camera, uv)[:, :, focal] @ camera.parameters[focal]
-    return np.asarray(np.nan_to_num(by_focal)) / (max(camera.size_px) / 2)
 
 
 def _camera(flat: FloatArray) -> FloatArray:
