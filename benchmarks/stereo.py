@@ -21,12 +21,12 @@ import numpy as np
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import AdjustmentOptions, adjust
-from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.model.camera import Camera, project
 from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_vector
 from sfm.model.distortion.models import MODELS
 from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import ImagePoints, Network
+from sfm.report.rig_mounts import rigs_of
 
 MOMENTS, NOISE_PX, PITCH = 14, 0.03, 30.0
 ROWS, COLUMNS, BASE = 6, 9, 100.0

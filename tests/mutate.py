@@ -19,7 +19,7 @@ rings are sampled, as arcs are counted alike in a mirror; in given.py the length
 rigid_frames.py the singular values below which a step is cut, which only rounding needs; in intersection.py
 how much room there is for directions, of which there may be more; in point_pairs.py the multiple of 2 pi by
 which directions are wrapped; in bumps.py the step of a numerical derivative; in mounts.py and
-calibrated_cameras.py the smallest number that divides; in values.py how much covariance along the parameters
+rig_mounts.py the smallest number that divides; in values.py how much covariance along the parameters
 makes that of fixed values regular.
 """
 
@@ -53,6 +53,9 @@ COMPILING = 120.0  # s beside it, for kernels that a mutation makes compile agai
 Ended = Literal["killed", "survived", "timed out"]
 ROOMS = (  # modules, and folders with all that are in them
     "sfm/judgement",
+    "sfm/report/precision.py",
+    "sfm/report/network_geometry.py",
+    "sfm/report/rig_mounts.py",
     "sfm/model/remarks",
     "sfm/model/observations",
     "sfm/adjustment/quality/statistics.py",

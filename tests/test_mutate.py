@@ -20,7 +20,7 @@ def test_a_mutation_changes_one_expression() -> None:
     module = Module(FILE)
     before = ast.dump(module.tree)
     texts = [module.changed(old, new) for _, _, old, new in changes_of(module)]
-    assert len(texts) > 50 and len(set(texts)) == len(texts)
+    assert len(texts) > 20 and len(set(texts)) == len(texts)
     assert ast.dump(module.tree) == before  # as it was
     text = module.text.decode()
     for changed in texts:

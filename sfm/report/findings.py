@@ -13,30 +13,29 @@ from typing import Any
 import numpy as np
 
 from sfm.adjustment.quality.consistency import Consistency, consistency_of
-from sfm.judgement.bundle_statistics import Geometry, Given, Statistics, geometry_of, given_of, statistics_of
+from sfm.judgement.bundle_statistics import Given, Statistics, given_of, statistics_of
 from sfm.judgement.calibrated_cameras import (
     CalibratedCamera,
     InteriorOrientation,
-    Rig,
     calibrated_cameras,
     interior_of,
-    rigs_of,
 )
 from sfm.judgement.cameras import edges_of
-from sfm.judgement.checks import (
-    ObservationCounts,
-    Precision,
-    Sigma0,
-    count_observations,
-    largest_residuals,
-    precision_of,
-    sigma0_of,
-)
+from sfm.judgement.checks import Sigma0, sigma0_of
 from sfm.judgement.survey_result import SurveyResult
 from sfm.judgement.verdict import with_remark as judge_with_remark
 from sfm.model.remarks.remark import Remark
 from sfm.model.remarks.verdict import Verdict
+from sfm.report.network_geometry import Geometry, geometry_of
+from sfm.report.precision import (
+    ObservationCounts,
+    Precision,
+    count_observations,
+    largest_residuals,
+    precision_of,
+)
 from sfm.report.protocol import Protocol, protocol_of
+from sfm.report.rig_mounts import Rig, rigs_of
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from sfm.files.open_folders import disk_errors, make_folder, open_regular_file, 
 from sfm.files.plain_text import Content, Name, or_none, read_json
 from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
-from sfm.judgement.checks import adjusted_sigmas, root_mean_square
+from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import StageTime, SurveyResult
 from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
@@ -49,6 +49,7 @@ from sfm.report.figures.plot_process import PlotProcess, draw_plots
 from sfm.report.findings import Findings, with_remark
 from sfm.report.pages import html_of, page_of, text, texts_of
 from sfm.report.phrases import finer_unit
+from sfm.report.precision import adjusted_sigmas
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.report.tables.summary import write_summary

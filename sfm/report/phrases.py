@@ -12,8 +12,8 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import GlobalTest
 from sfm.adjustment.result import Adjustment
-from sfm.judgement.calibrated_cameras import CalibratedCamera, Rig
-from sfm.judgement.checks import Precision, Sigma0
+from sfm.judgement.calibrated_cameras import CalibratedCamera
+from sfm.judgement.checks import Sigma0
 from sfm.judgement.survey_result import ControlCheck, SurveyResult
 from sfm.model.conventions import SUPERSCRIPTS, FloatArray
 from sfm.model.conventions import finer_unit as finer_unit
@@ -22,6 +22,8 @@ from sfm.model.distributions import normal_ppf
 from sfm.model.remarks.row import probability as probability
 from sfm.model.remarks.row import significant as significant
 from sfm.report.findings import Findings
+from sfm.report.precision import Precision
+from sfm.report.rig_mounts import Rig
 
 MIN_PLAIN_VALUE = 1e-3  # parameters below it are written with an exponent
 ROUNDING = 1e-10  # standard deviation over value below which it counts as zero

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison
-from sfm.judgement.checks import point_sigma
 from sfm.model.display import counted, program_name
 from sfm.model.remarks.remark import of_kind
 from sfm.report.findings import Findings
 from sfm.report.page import Column, Heading, Note, Paragraph, Part, Statement, Table, columns, facts
 from sfm.report.phrases import finer_unit, fixed, general, scientific, significant, words_left_out
+from sfm.report.precision import point_sigma
 
 
 def adjuster_parts(f: Findings) -> Iterator[Part]:

@@ -8,13 +8,13 @@ import numpy as np
 
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION, Correlation
 from sfm.files.result_tables import VARIANCE_COMPONENTS
-from sfm.judgement.bundle_statistics import WEAK_DEG, Geometry
 from sfm.judgement.calibrated_cameras import InteriorParameter
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.distributions import POWER
 from sfm.report.findings import Findings
 from sfm.report.given_residuals import given_parts
+from sfm.report.network_geometry import WEAK_DEG, Geometry
 from sfm.report.page import (
     Column,
     FoldedParts,

@@ -12,10 +12,10 @@ from adapters.formats.photomodeler import read_photomodeler
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
-from sfm.judgement.bundle_statistics import Geometry, geometry_of, hull_area
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.network import ObjectPoints
 from sfm.orientation.image_rays import ray_angles
+from sfm.report.network_geometry import Geometry, geometry_of, hull_area
 from sfm.report.pages import WIDTH, html_of
 from sfm.report.survey_quality import MAX_BINS, points_by_rays
 from sfm.report.survey_report import text_report

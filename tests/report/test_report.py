@@ -21,7 +21,6 @@ from sfm.adjustment.solve import adjust
 from sfm.cli.console import print_result
 from sfm.comparison.two_adjusters.adjusters import compare_adjusters
 from sfm.files.open_folders import refuse_foreign_folder
-from sfm.judgement.bundle_statistics import geometry_of
 from sfm.judgement.survey_result import (
     ControlCheck,
     FailedImage,
@@ -40,6 +39,7 @@ from sfm.report import survey_report
 from sfm.report.figures import overlays
 from sfm.report.figures.overlays import USED, Overlay, draw_photograph, overlay_names
 from sfm.report.figures.plots import SHADES, all_plots, network_figure, plan_axes
+from sfm.report.network_geometry import geometry_of
 from sfm.report.output import plot_data, write_result
 from sfm.report.page import Paragraph, Section
 from sfm.report.pages import WIDTH, html_of, page_of, wrapped

@@ -27,15 +27,7 @@ from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, BackendAdjustment, compare_adjusters
 from sfm.judgement.bundle_statistics import given_of, statistics_of
 from sfm.judgement.calibrated_cameras import families, interior_parameters
-from sfm.judgement.checks import (
-    MAX_LISTED,
-    count_observations,
-    largest_residuals,
-    longest_residual,
-    point_precision,
-    precision_of,
-    sigma0_of,
-)
+from sfm.judgement.checks import longest_residual, sigma0_of
 from sfm.judgement.hypotheses.hypotheses import judge_alternatives
 from sfm.judgement.survey_result import ControlCheck, Eccentricity, SurveyResult
 from sfm.model.camera import Camera
@@ -54,6 +46,13 @@ from sfm.report.phrases import (
     describe_weights,
     signed,
     to_precision,
+)
+from sfm.report.precision import (
+    MAX_LISTED,
+    count_observations,
+    largest_residuals,
+    point_precision,
+    precision_of,
 )
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables

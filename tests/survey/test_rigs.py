@@ -13,7 +13,6 @@ import pytest
 
 from adapters.formats.result_tables import read_result
 from sfm.adjustment.quality.variance_components import by_kind
-from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import project
 from sfm.model.conventions import FloatArray, angles_from_rotation, rotation_from_vector
@@ -25,6 +24,7 @@ from sfm.pipeline import run_survey
 from sfm.products.planning.prediction import simulate_network
 from sfm.report.figures.plots import epipolar_figure
 from sfm.report.output import plot_data, write_result
+from sfm.report.rig_mounts import rigs_of
 from sfm.report.survey_report import text_report
 from sfm.survey import rigs
 from sfm.survey.inputs.survey import CameraSetup, Survey, read_survey

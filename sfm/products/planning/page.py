@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from sfm.adjustment.quality.statistics import reliability
 from sfm.files.result_tables import IN_FILES
-from sfm.judgement.calibrated_cameras import rigs_of
 from sfm.model.camera import Camera
 from sfm.model.conventions import FloatArray, angles_from_rotation
 from sfm.model.display import counted
@@ -59,6 +58,7 @@ from sfm.report.phrases import (
     significant,
     with_exponent,
 )
+from sfm.report.rig_mounts import rigs_of
 from sfm.report.tables.summary import summary_of_rigs
 from sfm.report.viewer.embedded import Viewer, scene_of_stored, viewer_of
 from sfm.report.viewer.pictures import Pictures

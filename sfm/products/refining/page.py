@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.bundle_statistics import given_of
-from sfm.judgement.checks import rms_of_groups, standard_deviations
+from sfm.judgement.checks import standard_deviations
 from sfm.model.conventions import IntArray
 from sfm.model.display import counted
 from sfm.model.remarks.verdict import judge
@@ -17,6 +17,7 @@ from sfm.products.refining.oriented_windows import PREFIX
 from sfm.products.refining.refinement import MAX_SHIFT_FACTOR, MIN_SHIFT_PX, Refinement
 from sfm.products.refining.windows import MIN_RAYS
 from sfm.report.given_residuals import given_parts
+from sfm.report.network_geometry import rms_of_groups
 from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, axes, columns, file_columns
 from sfm.report.phrases import general, significant
 

@@ -17,14 +17,14 @@ from sfm.adjustment.quality.variance_components import VarianceComponents
 from sfm.adjustment.result import Adjustment
 from sfm.files.plain_text import or_none
 from sfm.judgement.bundle_statistics import Given, Spread, summarise_redundancy
-from sfm.judgement.calibrated_cameras import Rig
-from sfm.judgement.checks import point_sigma
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.conventions import FloatArray
 from sfm.model.observation_residuals import CENTRE, ROTATION, GivenResiduals
 from sfm.report.findings import Findings
 from sfm.report.page import plain, values_of
 from sfm.report.phrases import describe_test, describe_weights
+from sfm.report.precision import point_sigma
+from sfm.report.rig_mounts import Rig
 
 
 def write_summary(findings: Findings, folder: Path) -> None:

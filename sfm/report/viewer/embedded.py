@@ -25,7 +25,6 @@ import numpy as np
 from markupsafe import Markup
 
 from sfm.files.plain_text import or_none
-from sfm.judgement.checks import rms_of_groups
 from sfm.judgement.survey_result import sort_likeliest_first
 from sfm.model.camera import project
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray, angles_from_rotation
@@ -34,6 +33,7 @@ from sfm.model.solution import MAX_POINTS, SeenTargets, Solution
 from sfm.orientation.image_rays import ray_angles
 from sfm.report.figures.overlays import nearest_image_points
 from sfm.report.findings import Findings
+from sfm.report.network_geometry import rms_of_groups
 from sfm.report.phrases import finer_unit
 from sfm.report.viewer.pictures import (
     COLUMNS,
