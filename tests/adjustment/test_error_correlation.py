@@ -261,7 +261,7 @@ def test_the_design_effect_is_by_how_much_common_errors_multiply_a_gain(
         effect = reduced.design_effect(D)
     assert effect > 5
     assert np.mean(gains) == pytest.approx(effect, rel=4 * np.sqrt(2 / len(gains)))
-    alone = replace(reduced, a=replace(a, error_correlation=None))
+    alone = replace(reduced, adjustment=replace(a, error_correlation=None))
     assert alone.design_effect(D) == 1.0
 
 

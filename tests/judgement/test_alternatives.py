@@ -197,7 +197,7 @@ def test_given_values_of_free_parameters_have_weight(dense: Dense) -> None:
     units = [interior_columns(a, [(index, 0)])[2][0] for index in range(2)]  # of the first, mm for a column
     np.testing.assert_allclose(both[:, :, 0], found[:, :, 0] + units[0] / units[1] * found[:, :, 1])
     assert both.shape[2] == 1 and prior == pytest.approx(weight)
-    held = tuple(alternatives.interiors(replace(dense.reduced, a=a), families.HELD))
+    held = tuple(alternatives.interiors(replace(dense.reduced, adjustment=a), families.HELD))
     assert [len(one.parameters) for one in held] == [
         *[2] * (len(held) - 1),
         2 * len(a.estimate.cameras[0].names) - 2,

@@ -147,7 +147,7 @@ def moves_of(
         np.array([0.0, 0, 1, 1]), np.arange(n), alone, np.zeros((n, 3, 1)), g, 2 * alone, alone
     )
     reduced = SimpleNamespace(
-        a=SimpleNamespace(estimate=SimpleNamespace(points=points)),
+        adjustment=SimpleNamespace(estimate=SimpleNamespace(points=points)),
         t=np.zeros(1),
         Sinv=np.zeros((1, 1)),
         redundancy=5000,
@@ -216,7 +216,7 @@ def body_motion(points: FloatArray, members: BoolArray, beta: FloatArray) -> Flo
 def test_points_that_moved_as_a_body_are_found(count: int) -> None:
     """By a shift and a rotation, which are those of least squares; their residuals are the spread."""
     reduced, still = moves_of(np.zeros((20, 3)), f"body {count}")
-    points = reduced.a.estimate.points
+    points = reduced.adjustment.estimate.points
     members = np.arange(20) < count
     beta = np.array([20.0, -15.0, 10.0, 4.0, -3.0, 5.0])
     d = body_motion(points, members, beta)

@@ -72,7 +72,7 @@ def test_a_held_parameter_shifts_coordinates_by_its_reach(name: str) -> None:
     assert gained == pytest.approx(least, rel=0.02)
     assert reach == pytest.approx(shift, rel=0.1)
     strict = replace(a, false_alarm=a.false_alarm / 1e6)
-    assert reach_of(one, replace(reduced, a=strict), rows=count_alternatives(a)) > 1.2 * reach
+    assert reach_of(one, replace(reduced, adjustment=strict), rows=count_alternatives(a)) > 1.2 * reach
 
 
 def test_common_errors_let_a_held_parameter_reach_farther() -> None:
@@ -156,7 +156,7 @@ def test_a_parameter_that_nothing_determines_counts_by_what_it_shifts() -> None:
     one = next(unchecked._typical(a))
     H = reduced.project(one.whitened(reduced))[0]
     blind = SimpleNamespace(
-        a=a,
+        adjustment=a,
         columns=reduced.columns,
         whiten=reduced.whiten,
         absorb=reduced.absorb,

@@ -68,7 +68,7 @@ def alternatives_of(reduced: Reduced) -> tuple[Alternative, ...]:
 
     With control, only changes of the camera and of the object, and strained control, are tested.
     """
-    a, alternatives = reduced.a, list(_by_photographs(reduced))
+    a, alternatives = reduced.adjustment, list(_by_photographs(reduced))
     in_all = Alternative(STRAIN if a.datum == "control" else FORMAT, "all", np.ones(reduced.photographs))
     alternatives += _in_all(reduced, in_all, in_all.whitened(reduced))
     if a.datum != "control":
@@ -146,9 +146,9 @@ def interior_parameters(a: Adjustment, family: InteriorFamily) -> list[list[tupl
 def interiors(reduced: Reduced, family: InteriorFamily) -> Iterator[Alternative]:
     """Yield an alternative for each held or given interior parameter, and one for all of a camera."""
     everywhere = np.ones(reduced.photographs)
-    for sets in interior_parameters(reduced.a, family):
+    for sets in interior_parameters(reduced.adjustment, family):
         of_camera = tuple(pair for places in sets for pair in places)
-        D = reduced.whiten(interior_columns(reduced.a, of_camera)[0])
+        D = reduced.whiten(interior_columns(reduced.adjustment, of_camera)[0])
         every = gain_of(*reduced.project(D))
         tested = [(places, [k]) for k, places in enumerate(sets)]
         if len(sets) > 1:
@@ -190,11 +190,11 @@ def _by_photographs(reduced: Reduced) -> Iterator[Alternative]:
     If there are more than MAX_RUNS photographs, neighbours in the sequence are combined. A camera changes in
     some of its photographs, an object in some of all photographs.
     """
-    camera = cameras_of_photographs(reduced.a)
+    camera = cameras_of_photographs(reduced.adjustment)
     run = runs_of(camera)
     every_run = Part(*reduced.project_by_run(reduced.whiten(reduced.columns.freedoms), run))
     if len(every_run.g) >= 2 * MIN_GROUP and not too_many_cameras(camera):
-        yield from _of_each(reduced, every_run, run, reduced.a.levels.family)
+        yield from _of_each(reduced, every_run, run, reduced.adjustment.levels.family)
     for family in OF_PHOTOGRAPHS:
         for among in photographs_among(family, camera):
             runs = np.unique(run[among])
@@ -445,7 +445,7 @@ def _as_one_body(reduced: Reduced, moves: _Moves) -> Iterator[Alternative]:
 
     The motion is then that of the set, in turn with the set, until it stays the same.
     """
-    X, squares = reduced.a.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
+    X, squares = reduced.adjustment.estimate.points[moves.points], np.einsum("nii->ni", moves.squares)
     single, _ = gains_of(moves.blocks, moves.g, squares)
     for first in np.argsort(-single)[:STARTS]:
         d = -np.linalg.lstsq(moves.blocks[first], moves.g[first], rcond=None)[0]

@@ -113,7 +113,7 @@ class Alternative:
 
     def whitened(self, reduced: Reduced) -> FloatArray:
         """Return its whitened columns for the accepted image points, (k, 2, q)."""
-        return reduced.whiten(self.columns(reduced.a, reduced.columns))
+        return reduced.whiten(self.columns(reduced.adjustment, reduced.columns))
 
     def deflated(self, gain: float, redundancy: int) -> float:
         """Return a gain of ln likelihood after dividing the gain of v'Pv by the design effect."""

@@ -259,7 +259,7 @@ def spread_of_photographs(refitted: Refit, alternative: Alternative, others: Seq
     effect = alternative.whitened(reduced) @ refitted.beta
     left = reduced.absorb(effect[:, :, None])[2].ravel()
     if others:
-        taken = reduced.whiten(_side_by_side(others, reduced.a, reduced.columns))
+        taken = reduced.whiten(_side_by_side(others, reduced.adjustment, reduced.columns))
         taken = reduced.absorb(taken)[2]
         taken = taken.reshape(len(left), -1)
         left = left - taken @ np.linalg.lstsq(taken, left, rcond=None)[0]
@@ -366,7 +366,7 @@ def reach_of(alternative: Alternative, reduced: Reduced, *, rows: int) -> float:
 
     As many rows are tested together and share the level.
     """
-    a, D = reduced.a, alternative.whitened(reduced)
+    a, D = reduced.adjustment, alternative.whitened(reduced)
     H, _, squares = reduced.project(D)
     values, vectors, scale = directions_of(H, squares)
     rank = max(int((values > MIN_DETERMINED_SHARE).sum()), 1)

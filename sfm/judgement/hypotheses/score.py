@@ -45,7 +45,7 @@ class Reduced:
     factor.
     """
 
-    a: Adjustment
+    adjustment: Adjustment
     columns: Columns  # derivatives of all its image points
     used: IntArray  # accepted image points, (k,)
     F: FloatArray  # whitening of each image point, (k, 2, 2)
@@ -64,12 +64,12 @@ class Reduced:
     @property
     def photographs(self) -> int:
         """Number of photographs."""
-        return len(self.a.network.images)
+        return len(self.adjustment.network.images)
 
     @property
     def redundancy(self) -> int:
         """Redundancy of the adjustment."""
-        return self.a.redundancy
+        return self.adjustment.redundancy
 
     @property
     def count(self) -> float:
@@ -107,7 +107,7 @@ class Reduced:
 
         Only the directions that the whitened columns (k, 2, q) determine count.
         """
-        a, network = self.a, self.a.network
+        a, network = self.adjustment, self.adjustment.network
         if a.error_correlation is None:
             return 1.0
         H, _, squares = self.project(D)
@@ -251,7 +251,7 @@ def reduce_adjustment(a: Adjustment) -> Reduced:
     scale = 1 / np.sqrt(np.diagonal(S))
     inverse = cho_solve(cho_factor(S * scale[:, None] * scale), np.diag(scale)) * scale[:, None]
     return Reduced(
-        a=a,
+        adjustment=a,
         columns=columns,
         used=used,
         F=F,
