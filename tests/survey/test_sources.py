@@ -108,6 +108,25 @@ def test_targets_and_texture_are_one_survey(tmp_path: Path) -> None:
     assert len(first.xy) > len(alone.photographs[0].xy)
 
 
+def test_targets_too_few_to_orient_anything_stand_beside_texture(tmp_path: Path) -> None:
+    """Two targets in each photograph: texture orients the photographs, and the targets are points of it."""
+    path, truth = write(tmp_path, "[tie_points]\n"), code_centres()
+    shown = sorted(truth)[:2]
+    for i, (at, R) in enumerate(zip(*stations(6), strict=True), 1):
+        picture = cv2.imread(str(tmp_path / f"photo {i}.png"), cv2.IMREAD_GRAYSCALE)
+        for code, X in truth.items():
+            if code not in shown:
+                x, y = project(camera(), at, R, X[None])[0]
+                cv2.circle(picture, (round(x), round(y)), 32, 110, -1)
+        cv2.imwrite(str(tmp_path / f"photo {i}.png"), picture)
+    result = run_survey(read_survey(path))
+    network = result.adjustment.network
+    assert len(network.images) == 6 and result.adjustment.estimate.oriented.all()
+    assert set(map(str, shown)) <= set(network.points)
+    rows = [network.points.index(str(code)) for code in shown]
+    assert (network.rays()[rows] >= 3).all() and (network.source == 1).sum() > 500
+
+
 def test_photographs_are_decoded_as_often_as_for_one_source(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

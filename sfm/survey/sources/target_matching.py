@@ -14,6 +14,7 @@ from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import adjust
 from sfm.model.camera import tangents_from_pixel
 from sfm.model.conventions import MAD_TO_SIGMA, BoolArray
+from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of, without_given
 from sfm.model.reduced_network import MIN_IMAGE_POINTS, merge_estimate, reduce_network, select_determined
@@ -53,8 +54,6 @@ def match_targets_of(
         start: orientation of the photographs, with its final tolerance.
         jobs: not used, the targets are measured already.
 
-    Raises:
-        GeometryError: fewer than two photographs keep enough points.
     """
     survey, photographs, naming = oriented.survey, measured.photographs, measured.naming
     assert photographs is not None
@@ -164,7 +163,10 @@ def _match_and_adjust(
         naming, estimate = match_uncoded(photographs, naming, estimate, tolerance_px=tolerance_px)
         network = build_network(survey, photographs, naming)
         everything = np.ones(len(network.image_points), dtype=bool)
-        images, points = select_determined(network, estimate, everything, min_rays(naming))
+        try:
+            images, points = select_determined(network, estimate, everything, min_rays(naming))
+        except GeometryError:  # too few targets to orient photographs, which other sources may orient
+            break
         part, values = reduce_network(without_given(network), estimate, images, points, everything)
         adjusted = adjust(part, values, datum=Datum("free"), reject="huber", covariance=False)
         estimate = restore_strayed(estimate, adjusted, images, points, tolerance_px=tolerance_px)
