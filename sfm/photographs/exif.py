@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import PhotographError
@@ -98,6 +99,8 @@ class Metadata:
     """time of exposure by the clock of the camera"""
     position: SatellitePosition | None = None
     """position by satellite navigation"""
+    several: bool = False
+    """whether the file has further pictures of this size, which are not read"""
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -114,13 +117,14 @@ def read_metadata(path: str | Path) -> Metadata:
     """
     path = Path(path)
     with opened_header(path, path) as image:
-        size = image.size
+        size = stored_size(image)
         try:
             exif = image.getexif()
         except Exception:  # Pillow fails in many ways on damaged EXIF data, which are ignored
             exif = Image.Exif()
         camera, gps = _directory(exif, ExifTags.IFD.Exif), _directory(exif, ExifTags.IFD.GPSInfo)
         xmp = image.info.get("xmp", b"")
+        several = isinstance(image, Image.Image) and _has_further_pictures(image)
     focal = _between(camera.get(ExifTags.Base.FocalLength), FOCAL_MM)
     equivalent = _between(camera.get(ExifTags.Base.FocalLengthIn35mmFilm), FOCAL_MM)
     orientation = exif.get(ExifTags.Base.Orientation, 1)
@@ -146,7 +150,20 @@ def read_metadata(path: str | Path) -> Metadata:
         taken_px=(round(width), round(height)) if width and height else None,
         taken=taken,
         position=satellite_position(gps, xmp if isinstance(xmp, bytes) else b""),
+        several=several,
     )
+
+
+def _has_further_pictures(image: Image.Image) -> bool:
+    """Return whether a file has a second picture of the size of the first: no preview, no map of depth."""
+    size = image.size
+    if image.format in ("PNG", "WEBP"):  # animated: all are of one size
+        return bool(getattr(image, "n_frames", 1) > 1)
+    if image.format in ("TIFF", "MPO"):
+        with suppress(Exception):  # there is none, or it is damaged
+            image.seek(1)
+            return image.size == size
+    return False
 
 
 def _directory(exif: Image.Exif, which: ExifTags.IFD) -> dict[int, Any]:
@@ -335,8 +352,8 @@ def _sigma(value: float) -> float:
 
 
 Image.init()
-# Ending of files of telephones that must be converted first.
-AVIF = ".avif"
+# Kinds of files that must be converted first, by their endings.
+UNREAD = {".avif": "an AVIF file", ".gif": "a GIF file", ".jp2": "a JPEG 2000 file", ".jxl": "a JPEG XL file"}
 # Endings of videos, whose frames must be extracted first.
 VIDEO = (".3gp", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
          ".mxf", ".ogv", ".webm", ".wmv")  # fmt: skip
@@ -374,8 +391,8 @@ def conversion_of(path: Path) -> str:
     if library := missing_library(path):
         kind = "HEIF" if path.suffix.lower() in HEIF else "raw"
         return f"a {kind} file, which is read with {library}, and it is not installed: {INSTALL}"
-    if path.suffix.lower() == AVIF:
-        return "an AVIF file, which is not read; convert all at full size and quality to JPEG or PNG"
+    if kind := UNREAD.get(path.suffix.lower()):
+        return f"{kind}, which is not read; convert all at full size and quality to JPEG or PNG"
     if path.suffix.lower() in VIDEO:
         return (
             "a video, which is not read; extract sharp frames into their own folder, such as two a second, "
@@ -421,6 +438,19 @@ def opened_header(path: Path, source: Path | io.BytesIO) -> Iterator[Image.Image
         with image:
             _refuse_large(path, image.size)
             yield image
+
+
+def stored_size(header: Image.Image | CameraHeader) -> tuple[int, int]:
+    """Return the width and height as stored, px; Pillow gives those of a turned TIFF file as it is shown.
+
+    Args:
+        header: of `opened_header`.
+    """
+    size = header.size
+    if isinstance(header, TiffImageFile) and header.tag_v2.get(ExifTags.Base.Orientation, 1) > 4:
+        width, height = header.tag_v2[ExifTags.Base.ImageWidth], header.tag_v2[ExifTags.Base.ImageLength]
+        return int(width), int(height)
+    return size
 
 
 def _camera_header(path: Path, source: Path | io.BytesIO) -> CameraHeader:

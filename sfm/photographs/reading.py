@@ -16,7 +16,14 @@ from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import PhotographError
 from sfm.photographs.camera_files import HEIF, RAW, is_camera_file, pixels_of
-from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
+from sfm.photographs.exif import (
+    opened_header,
+    read_bytes,
+    refuse_bomb,
+    refuse_truncated,
+    stored_size,
+)
+from sfm.photographs.tiff_files import without_display_tags
 
 # PhotographError states the fault of a file; OpenCV's warnings on private TIFF tags do not help.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -116,12 +123,28 @@ def read_for_display(path: Path, *, shrink: int = 1) -> AnyArray:
     }
     data = read_bytes(path)
     with opened_header(path, io.BytesIO(data)) as header:
-        size = header.size
+        size = stored_size(header)
     refuse_bomb(path, size, data)
     if is_camera_file(path):
         return _displayed(_camera_pixels(path, data), shrink)
+    return decoded_as_stored(path, data, flags[shrink])
+
+
+def decoded_as_stored(path: Path, data: bytes, flags: int) -> AnyArray:
+    """Return the pixels of a file as OpenCV reads it, but never turned.
+
+    Args:
+        path: the photograph, for error messages.
+        data: content of the file.
+        flags: those of `cv2.imdecode`.
+
+    Raises:
+        PhotographError: it cannot be decoded.
+    """
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags[shrink] | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(
+            np.frombuffer(without_display_tags(data), np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION
+        )
     except cv2.error:
         image = None
     if image is None:
@@ -167,21 +190,13 @@ def _decode(path: Path, channel: str, *, may_be_plain: bool = False) -> AnyArray
     data = read_bytes(path)
     refuse_truncated(path, data)
     with opened_header(path, io.BytesIO(data)) as header:
-        size = header.size
+        size = stored_size(header)
     if not may_be_plain:
         refuse_bomb(path, size, data)
     if is_camera_file(path):
         return _of_size(path, _channel_of(_camera_pixels(path, data), channel), size)
     colour = cv2.IMREAD_GRAYSCALE if channel == "luminance" else cv2.IMREAD_COLOR
-    try:
-        image = cv2.imdecode(
-            np.frombuffer(data, np.uint8), colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error:
-        image = None
-    if image is None:
-        raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
-    image = _of_size(path, image, size)
+    image = _of_size(path, decoded_as_stored(path, data, colour | cv2.IMREAD_ANYDEPTH), size)
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
     if image.ndim == 3:

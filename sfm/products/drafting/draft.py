@@ -22,7 +22,7 @@ from sfm.model.display import agreeing, counted
 from sfm.model.errors import GeometryError, PhotographError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark, unless_note
 from sfm.photographs.camera_files import is_camera_file
-from sfm.photographs.exif import AVIF, USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
+from sfm.photographs.exif import UNREAD, USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.photographs.masks import MASKS, Masks, find_masks
 from sfm.photographs.reading import PLAIN, SUFFIXES
 from sfm.products.drafting.camera_groups import (
@@ -60,6 +60,7 @@ OUTSIDE = "not used outside the folder: move the masks, or uncomment the line fo
 PITCH = 25.0  # assumed pitch of a plate, UNIT: that of many printed boards
 UNIT = "mm"
 IMAGES = "images"  # folder of the photographs in a project of COLMAP and the programs that follow it
+FURTHER = "its further pictures, as only the first of a file is read; save each as a file of its own"
 MAX_SHOWN = 8  # names listed on a line
 
 
@@ -123,7 +124,8 @@ def draft_survey(
     trial = try_targets(paths, folder=folder, masks=masks, store=store, progress=progress)
     name = name or next(names_of_folder(folder))
     positions = sum(metadata[photograph].position is not None for photograph in used)
-    left_out = (*unreadable, *grouping.left_out, *trial.unreadable)
+    further = ((name, FURTHER) for name in used if metadata[name].several)
+    left_out = (*unreadable, *grouping.left_out, *trial.unreadable, *further)
     content = _Content(name, stated, grouping, trial, pitch, left_out, positions, masked, unused)
     if trial.plate is not None:
         silent = _text(content, models=False)
@@ -219,7 +221,7 @@ def _files_of(folder: Path) -> list[Path]:
         files = files or [
             path
             for path in find_files(folder, depth, hidden=depth == DEPTHS[0])
-            if path.suffix.lower() in SUFFIXES or path.suffix.lower() == AVIF
+            if path.suffix.lower() in SUFFIXES or path.suffix.lower() in UNREAD
         ]
     return files
 

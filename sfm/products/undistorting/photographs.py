@@ -12,7 +12,14 @@ from PIL import ExifTags, Image
 from sfm.model.conventions import AnyArray
 from sfm.model.errors import PhotographError
 from sfm.photographs.camera_files import CameraHeader
-from sfm.photographs.exif import opened_header, read_bytes, refuse_bomb, refuse_truncated
+from sfm.photographs.exif import (
+    opened_header,
+    read_bytes,
+    refuse_bomb,
+    refuse_truncated,
+    stored_size,
+)
+from sfm.photographs.reading import decoded_as_stored
 from sfm.products.undistorting.views import View
 
 QUALITY = 97  # percent, of JPEG; noise of a new compression is below that of the photograph
@@ -57,7 +64,7 @@ class UndistortedPhotographs:
         with opened_header(path, io.BytesIO(data)) as header:
             if isinstance(header, CameraHeader):
                 raise PhotographError(f"{path.name}: this kind cannot be written as {out.suffix}")
-            size, kind = header.size, header.format or ""
+            size, kind = stored_size(header), header.format or ""
             exif = header.info.get("exif") or _exif(header)
             icc = header.info.get("icc_profile") if header.mode in COLOURS else None
         if max(size) > MAX_SIDE_PX:
@@ -98,19 +105,14 @@ class UndistortedPhotographs:
 
 def _decoded(path: Path, data: bytes) -> AnyArray:
     """Return the pixels as stored, with all bits and colours, (H, W) or (H, W, 3 or 4)."""
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
-        raise PhotographError(f"{path.name}: not a photograph that can be decoded ({len(data)} bytes)")
+    image = decoded_as_stored(path, data, cv2.IMREAD_UNCHANGED)
     if image.dtype not in (np.uint8, np.uint16):
         raise PhotographError(f"{path.name}: found {image.dtype} intensities, expected 8 or 16 bit")
     return np.asarray(image)
 
 
 def _exif(header: Image.Image) -> bytes:
-    """Return the EXIF data of a file without a block of its own: of TIFF, which OpenCV turns upright."""
+    """Return the EXIF data of a file without a block of its own, as of TIFF."""
     found, kept = header.getexif(), Image.Exif()
     for tag in OF_PHOTOGRAPH & set(found):
         kept[tag] = found[tag]
@@ -118,6 +120,4 @@ def _exif(header: Image.Image) -> bytes:
         kept.get_ifd(directory).update(found.get_ifd(directory))
         if kept.get_ifd(directory):
             kept[directory] = kept.get_ifd(directory)
-    if ExifTags.Base.Orientation in kept:
-        kept[ExifTags.Base.Orientation] = 1
     return kept.tobytes() if len(kept) else b""
