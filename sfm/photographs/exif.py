@@ -391,8 +391,8 @@ def conversion_of(path: Path) -> str:
     if library := missing_library(path):
         kind = "HEIF" if path.suffix.lower() in HEIF else "raw"
         return f"a {kind} file, which is read with {library}, and it is not installed: {INSTALL}"
-    if kind := UNREAD.get(path.suffix.lower()):
-        return f"{kind}, which is not read; convert all at full size and quality to JPEG or PNG"
+    if unread := UNREAD.get(path.suffix.lower()):
+        return f"{unread}, which is not read; convert all at full size and quality to JPEG or PNG"
     if path.suffix.lower() in VIDEO:
         return (
             "a video, which is not read; extract sharp frames into their own folder, such as two a second, "
