@@ -54,8 +54,8 @@ class Command(NamedTuple):
 
 
 COMMANDS = (
-    Command("run", run, "PHOTOS|SURVEY.toml", "photographs -> report"),
-    Command("init", init, "PHOTOS", "draft the survey file of a folder of photographs"),
+    Command("run", run, "PHOTOS|VIDEO|SURVEY.toml", "photographs -> report"),
+    Command("init", init, "PHOTOS|VIDEO", "draft the survey file of a folder of photographs"),
     Command("calibrate", calibrate, "PHOTOS", "a camera, how far to trust it, and which photograph next"),
     Command("adjust", adjust, "SURVEY.toml", "measured image points -> report"),
     Command("batch", batch, "SURVEYS...", "many surveys, on this computer or a cluster"),

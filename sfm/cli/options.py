@@ -13,9 +13,9 @@ SurveyFile = Annotated[
 SurveyOrPhotographs = Annotated[
     Path,
     typer.Argument(
-        metavar="SURVEY.toml|PHOTOS",
-        help="Survey file, whose paths are relative to its folder, or a folder of photographs, for which a "
-        "survey file is drafted.",
+        metavar="SURVEY.toml|PHOTOS|VIDEO",
+        help="Survey file, whose paths are relative to its folder, or a folder of photographs, a video or a "
+        "folder of videos, for which a survey file is drafted.",
     ),
 ]
 Out = Annotated[
@@ -93,3 +93,13 @@ ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", help="Result fol
 PlanOut = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the page and the tables.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
+Frames = Annotated[
+    int | None,
+    typer.Option(
+        "--frames",
+        metavar="N",
+        min=2,
+        help="Number of frames to take of a video, evenly spaced by the motion of the camera.  [default: "
+        "as many as neighbours need to have points in common]",
+    ),
+]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.model.errors import KolinearError, OutputError
@@ -211,15 +211,18 @@ def stated_or_drafted(
     out: Path | None,
     pitch: float | None,
     *,
+    frames: int | None = None,
     overwrite: bool = False,
     edit: Callable[[str], str] | None = None,
 ) -> tuple[Path, Path | None, Path | None]:
-    """Return the survey file of what a command is given, a survey file or a folder of photographs.
+    """Return the survey file of what a command is given: survey file, folder of photographs, or video.
 
     Args:
-        place: survey file, or a folder, whose survey.toml is taken, or else a draft beside the result.
+        place: survey file, a folder, whose survey.toml is taken, or else a draft beside the result, or a
+            video.
         out: see `drafted_beside`.
         pitch: see `drafted_beside`.
+        frames: see `drafted_beside`.
         overwrite: see `drafted_beside`.
         edit: see `drafted_beside`.
 
@@ -227,16 +230,29 @@ def stated_or_drafted(
         The survey file, the result folder, and the folder of the photographs of a draft, else None.
 
     Raises:
-        KolinearError: a pitch is given though the survey file exists, or see `drafted_beside`.
+        KolinearError: a pitch, or another number of frames, is given though the survey file exists, or see
+            `drafted_beside`.
     """
-    if place.is_dir() and not (place / SURVEY_FILE).is_file():
-        return *drafted_beside(place, out, pitch, overwrite=overwrite, edit=edit), place
+    from sfm.photographs.video_files import is_video
+    from sfm.products.drafting.frames_folder import frames_beside
+
+    if is_video(place) or (place.is_dir() and not (place / SURVEY_FILE).is_file()):
+        return drafted_beside(place, out, pitch, overwrite=overwrite, edit=edit, frames=frames)
     if place.is_dir():
         place = place / SURVEY_FILE
         print(f"Running {place}", file=sys.stderr)
     if place.is_file():
         refuse_pitch(pitch, place)
+        refuse_frames(frames, frames_beside(place), place)
     return place, out, None
+
+
+class Drafted(NamedTuple):
+    """A survey that was drafted, or whose draft exists."""
+
+    file: Path  # survey file
+    out: Path  # result folder
+    photographs: Path  # their folder
 
 
 def drafted_beside(
@@ -247,50 +263,58 @@ def drafted_beside(
     within: Path = Path("out"),
     overwrite: bool = False,
     edit: Callable[[str], str] | None = None,
-) -> tuple[Path, Path]:
+    frames: int | None = None,
+) -> Drafted:
     """Draft the survey file of a folder of photographs, unless it is already beside the result.
 
+    Of a video, frames are written beside it, which are the photographs.
+
     Args:
-        photographs: folder of the photographs.
+        photographs: folder of the photographs, or a video or folder of videos.
         out: result folder; None for WITHIN/NAME OF THE FOLDER, with the name of the folder above it too where
             other photographs have this name.
         pitch: pitch of a board or plate, mm; None to assume it.
         within: folder of the results.
         overwrite: whether a result of other photographs is replaced; the survey file never is.
         edit: changes the text of a new draft; a file that exists stays as it is.
-
-    Returns:
-        The survey file and the result folder.
+        frames: number of frames of each video; None for as many as are needed.
 
     Raises:
-        KolinearError: there are no photographs, a pitch is given though the survey file exists, the survey
-            file or the result is of other photographs, or the file cannot be written.
+        KolinearError: there are no photographs, a pitch or another number of frames is given though the
+            survey file exists, the survey file or the result is of other photographs, or the file cannot be
+            written.
     """
     with loading():
         from sfm.files.open_folders import refuse_links
+        from sfm.products.drafting.frames_folder import frames_beside, source_of, videos_of
         from sfm.report.output import Origin, refuse_other_origin
 
-    name = None
+    name, source = None, photographs
     if out is None:
-        name, out = _name_of_result(photographs, within)
+        name, out = _name_of_result(source, within)
     file = out.parent / f"{out.name}.toml"
     refuse_links(file)
     if file.exists():
-        drafted_of = _drafted_of(file, out) or photographs
-        if drafted_of.resolve() != photographs.resolve():
+        drafted_of = source_of(_drafted_of(file, out) or source)
+        if drafted_of.resolve() != source.resolve():
             raise OutputError(
                 f"{file}: is the survey file of the photographs in {os.path.normpath(drafted_of)} and is "
                 "not replaced; choose another folder with --out, or remove the file to draft a new one"
             )
+    if videos_of(source):
+        photographs = frames_beside(file)
     if not overwrite:
         refuse_other_origin(out, Origin(file, photographs))
     if file.exists():
         refuse_pitch(pitch, file)
+        refuse_frames(frames, photographs, file)
+    photographs, name = photographs_of(source, file, frames, name)
+    if file.exists():
         print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
-        return file, out
+        return Drafted(file, out, photographs)
     draft = draft_folder(photographs, file, pitch, name)
     write_draft(draft if edit is None else replace(draft, text=edit(draft.text)), photographs, file)
-    return file, out
+    return Drafted(file, out, photographs)
 
 
 def _name_of_result(photographs: Path, within: Path) -> tuple[str, Path]:
@@ -300,10 +324,13 @@ def _name_of_result(photographs: Path, within: Path) -> tuple[str, Path]:
     photographs have.
     """
     from sfm.products.drafting.draft import names_of_folder
+    from sfm.products.drafting.frames_folder import source_of
     from sfm.report.output import folder_name
 
-    names = [(name, within / folder_name(name)) for name in names_of_folder(photographs)]
-    owners = [_drafted_of(out.parent / f"{out.name}.toml", out) for _, out in names]
+    folder = photographs if photographs.is_dir() else photographs.with_suffix("")
+    names = [(name, within / folder_name(name)) for name in names_of_folder(folder)]
+    drafted = [_drafted_of(out.parent / f"{out.name}.toml", out) for _, out in names]
+    owners = [folder if folder is None else source_of(folder) for folder in drafted]
     here = photographs.resolve()
     own = (k for k, owner in enumerate(owners) if owner is not None and owner.resolve() == here)
     free = (k for k, owner in enumerate(owners) if owner is None)
@@ -321,6 +348,56 @@ def _drafted_of(file: Path, out: Path) -> Path | None:
             return file.parent / stated
     earlier = read_origin(out)
     return earlier.images if earlier else None
+
+
+def photographs_of(
+    source: Path, file: Path, frames: int | None = None, name: str | None = None
+) -> tuple[Path, str | None]:
+    """Return the folder of the photographs that a draft is of, and its name; of videos, take the frames.
+
+    Args:
+        source: folder of photographs, or a video or folder of videos.
+        file: the survey file, beside which frames are written.
+        frames: number of frames of each video; None for as many as are needed.
+        name: name of the survey; None for that of the source.
+
+    Raises:
+        KolinearError: frames are asked for without a video, or a video cannot be read.
+    """
+    from sfm.products.drafting.draft import names_of_folder
+    from sfm.products.drafting.frames_folder import frames_beside, take_frames, videos_of
+    from sfm.runtime.progress_bar import drawn_progress
+
+    if not videos_of(source):
+        if frames is not None:
+            raise KolinearError(f"{source}: --frames {frames} is for videos, and it is none")
+        return source, name
+    folder, said = frames_beside(file), list[str]()
+    with working_on(str(source)), drawn_progress() as drawn:
+        take_frames(source, folder, count=frames, tell=said.append, progress=drawn)
+    for line in said:
+        print(line, file=sys.stderr)
+    return folder, name or next(names_of_folder(source if source.is_dir() else source.with_suffix("")))
+
+
+def refuse_frames(frames: int | None, folder: Path, file: Path) -> None:
+    """Refuse another number of frames for a survey file that exists.
+
+    Args:
+        frames: value of --frames, or None.
+        folder: folder of the frames.
+        file: the survey file.
+
+    Raises:
+        KolinearError: another number is given.
+    """
+    from sfm.products.drafting.frames_folder import count_of
+
+    if frames is not None and frames != count_of(folder):
+        raise KolinearError(
+            f"{file}: --frames {frames} is for drafting a survey file, but this one exists, with its frames "
+            f"in {folder}; remove both, or choose another --out"
+        )
 
 
 def refuse_pitch(pitch: float | None, file: Path) -> None:

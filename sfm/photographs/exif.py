@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import shlex
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -33,6 +34,7 @@ from sfm.photographs.camera_files import (
     is_camera_file,
     missing_library,
 )
+from sfm.photographs.video_files import VIDEO, missing_av
 
 # warnings.catch_warnings is not thread-safe, and several threads read photographs.
 _PILLOW = Lock()
@@ -354,9 +356,6 @@ def _sigma(value: float) -> float:
 Image.init()
 # Kinds of files that must be converted first, by their endings.
 UNREAD = {".avif": "an AVIF file", ".gif": "a GIF file", ".jp2": "a JPEG 2000 file", ".jxl": "a JPEG XL file"}
-# Endings of videos, whose frames must be extracted first.
-VIDEO = (".3gp", ".avi", ".insv", ".lrv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
-         ".mxf", ".ogv", ".webm", ".wmv")  # fmt: skip
 MAX_FILE_BYTES = 2**30
 MAX_PIXELS = 250_000_000  # the largest aerial scans; digital backs have 151 million
 # A larger picture in fewer bytes is a decompression bomb; a JPEG of a single grey value has 250 px per byte.
@@ -394,10 +393,9 @@ def conversion_of(path: Path) -> str:
     if unread := UNREAD.get(path.suffix.lower()):
         return f"{unread}, which is not read; convert all at full size and quality to JPEG or PNG"
     if path.suffix.lower() in VIDEO:
-        return (
-            "a video, which is not read; extract sharp frames into their own folder, such as two a second, "
-            "by ffmpeg -i VIDEO -vf fps=2 FRAMES/%04d.png, and give that folder"
-        )
+        if missing_av():
+            return f"a video, whose frames are read with PyAV, and it is not installed: {INSTALL}"
+        return f"a video; kolinear init {shlex.quote(str(path))} writes its frames as photographs beside it"
     return ""
 
 

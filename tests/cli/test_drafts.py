@@ -16,7 +16,7 @@ import pytest
 import sfm
 from sfm.model.errors import SurveyFileError
 from sfm.products.drafting.draft import names_of_folder
-from tests.commands import kolinear
+from tests.commands import kolinear, refused
 from tests.surveys import write_photograph_survey
 from tests.tables import rows_of
 
@@ -213,21 +213,26 @@ def test_masks_of_a_draft_are_found_beside_its_photographs(rendered: Path, start
     assert single == batched and min(float(row["x_px"]) for row in single) > 200
 
 
-def test_a_video_is_refused_with_what_to_do(
+def test_a_video_that_cannot_be_read_is_refused_in_one_line(
     rendered: Path, started: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By every command that takes photographs; beside photographs it does not matter."""
     Path("clips").mkdir()
     for name in ("Flug über Köln.MP4", "v.avi"):
         Path("clips", name).write_bytes(bytes(1_244_590))
-    for command in ("run", "init", "mark"):
-        for given in ("clips/Flug über Köln.MP4", "clips/v.avi", "clips"):
-            assert kolinear(command, given) == 2
-            said = capsys.readouterr().err
-            assert "a video, which is not read" in said and "ffmpeg -i" in said and "1000000" not in said
-            assert len(said.splitlines()) == 1
+    for command, words in (
+        ("run", "not a video that can be read"),
+        ("init", "not a video that can be read"),
+        ("mark", "a video; kolinear init 'clips/Flug über Köln.MP4'"),
+        ("adjust", "a video; kolinear init 'clips/Flug über Köln.MP4'"),
+    ):
+        for given in (
+            ("clips/Flug über Köln.MP4", "clips") if command != "adjust" else ("clips/Flug über Köln.MP4",)
+        ):
+            said = refused(capsys, command, given)
+            assert words in said and "1000000" not in said
     assert kolinear("batch", "clips/v.avi") == 1
-    assert "ffmpeg -i" in capsys.readouterr().out
+    assert "not a video that can be read" in capsys.readouterr().out
     shutil.copytree(rendered, "photos")
     shutil.copy("clips/v.avi", "photos/v.avi")
     assert kolinear("init", "photos") == 0

@@ -10,6 +10,7 @@ import typer
 from sfm.cli.options import (
     AllowOutside,
     Calibration,
+    Frames,
     Jobs,
     Out,
     Overwrite,
@@ -34,6 +35,7 @@ def run(
         ),
     ] = None,
     pitch: Pitch = None,
+    frames: Frames = None,
     camera: Calibration = None,
     camera_weighted: Weighted = False,
     out: Out = None,
@@ -46,14 +48,19 @@ def run(
     """Run a survey from its photographs to the report.
 
     If a folder is given, its survey.toml is run. If it has none, a survey file is drafted from the
-    photographs, written beside the result and run; edit it there and run it again.
+    photographs, written beside the result and run; edit it there and run it again. Of a video, or of the
+    videos of a folder without photographs, sharp frames are written there and are the photographs.
 
     Exit code 0 with a dependable result, with or without remarks; 1 if the result is not dependable, for the
     reasons in the report, or a stage cannot go on; 2 if the input must be corrected.
     """
-    if survey_file.is_dir() and images is not None:
-        raise KolinearError(f"{survey_file}: a folder of photographs needs no --images {images}")
-    survey_file, out, photographs = stated_or_drafted(survey_file, out, pitch, overwrite=overwrite)
+    from sfm.photographs.video_files import is_video
+
+    if images is not None and (survey_file.is_dir() or is_video(survey_file)):
+        raise KolinearError(f"{survey_file}: photographs and videos need no --images {images}")
+    survey_file, out, photographs = stated_or_drafted(
+        survey_file, out, pitch, frames=frames, overwrite=overwrite
+    )
     options = RunOptions(
         images=photographs or images,
         out=out,

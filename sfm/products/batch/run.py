@@ -22,6 +22,7 @@ from sfm.files.open_folders import MANIFEST, locked, owner_of, refuse_foreign_fo
 from sfm.files.plain_text import as_plain
 from sfm.files.whole_files import remove_leftovers
 from sfm.model.errors import BackendError, FolderInUseError, SurveyFileError
+from sfm.photographs.video_files import is_video
 from sfm.products.batch.job import (
     LOCK,
     LOGS,
@@ -40,6 +41,7 @@ from sfm.products.batch.job import (
 )
 from sfm.products.batch.table import PAGES, refuse_foreign_pages, write_batch_pages
 from sfm.products.drafting.draft import has_photographs
+from sfm.products.drafting.frames_folder import videos_of
 from sfm.report.output import SurveyLog, folder_name, refuse_other_log, remove_log
 from sfm.report.viewer.pictures import BUDGET_MB
 from sfm.runtime.executor import Call, Done, Engine, Lost, Sent, Work
@@ -223,13 +225,14 @@ def calls_of(files: Sequence[Path], *, allow_outside: bool = False) -> int:
 def _survey_files_in(path: Path, draft: Callable[[Path], Path] | None) -> list[Path]:
     """Return the survey files of a folder or the one drafted for its photographs, or a file itself."""
     if not path.is_dir():
-        return [path.resolve()]
+        return [draft(path).resolve() if draft is not None and is_video(path) else path.resolve()]
     below = find_files(path, f"**/{SURVEY_NAME}") or find_files(path, "*.toml")
-    if not below and draft is not None and has_photographs(path):
+    if not below and draft is not None and (has_photographs(path) or videos_of(path)):
         below = [draft(path)]
     if not below:
         raise SurveyFileError(
-            f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it, nor photographs"
+            f"{path}: no {SURVEY_NAME} in or below this folder, nor any *.toml in it, nor photographs "
+            "or videos"
         )
     return [file.resolve() for file in below]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from sfm.photographs.camera_files import is_camera_file
 from sfm.photographs.exif import UNREAD, USUAL_SIGMAS_M, Metadata, conversion_of, read_metadata
 from sfm.photographs.masks import MASKS, Masks, find_masks
 from sfm.photographs.reading import PLAIN, SUFFIXES
+from sfm.photographs.video_files import PREVIEW, VIDEO
 from sfm.products.drafting.camera_groups import (
     BY_TIMES,
     CameraGroup,
@@ -202,7 +204,24 @@ def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[s
             metadata[name] = read_metadata(path)
         except PhotographError as error:
             unreadable.append((name, str(error).removeprefix(f"{path.name}: ")))
-    return metadata, tuple(unreadable)
+    return metadata, (*unreadable, *_videos_beside(folder, files))
+
+
+def _videos_beside(folder: Path, files: Sequence[Path]) -> tuple[tuple[str, str], ...]:
+    """Return the videos beside photographs with the reason why they are left out.
+
+    Telephones write a short video beside each photograph, of its name: it is of no further use.
+    """
+    alive = {path.stem.casefold() for path in files}
+    videos = [path for path in find_files(folder, "*", hidden=False) if path.suffix.lower() in VIDEO]
+    return tuple(
+        (
+            as_plain(path.name),
+            f"a video beside photographs; run it alone: kolinear run {as_plain(shlex.quote(str(path)))}",
+        )
+        for path in videos
+        if path.stem.casefold() not in alive and path.suffix.lower() != PREVIEW
+    )
 
 
 def has_photographs(folder: Path) -> bool:

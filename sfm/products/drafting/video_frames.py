@@ -1,0 +1,269 @@
+"""Frames of videos as photographs: sharp ones, spaced by how far the camera has moved.
+
+The way of the camera is followed by points that are tracked from frame to frame. It is measured by the angle
+between the directions in which the object is seen: a shift of the picture over the principal distance, and a
+change of the figure of the points over its size. An object in the middle of the picture, around which the
+camera moves, changes its figure; a wall along which it moves shifts.
+
+Frames are evenly spaced on this way, whatever the speed, so a camera that stands still gives one frame. Of
+the frames near each place the sharpest is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image
+
+from sfm.files.plain_text import as_plain
+from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.errors import PhotographError
+from sfm.photographs.video_files import Video, opened_video
+from sfm.products.drafting.camera_groups import FOCAL_PER_SIDE
+from sfm.runtime.progress import SILENT, Progress
+
+# Directions that differ by more are not matched well by any detector (Moreels and Perona 2007, IJCV 73). A
+# point needs three photographs to be checked, so this is the largest angle of neighbours but one.
+MATCHED_RAD = math.radians(25.0)
+REACH = 0.25  # of the spacing: how far from its place the sharpest frame is searched
+# Neighbours but one are at most two spacings and two reaches apart.
+SPACING_RAD = MATCHED_RAD / (2 + 2 * REACH)
+FINE_RAD = SPACING_RAD / 4  # after which points are chosen anew; a hand that holds still moves less
+TRACKED_SIDE_PX = 640  # longer side of the pictures in which points are tracked
+POINTS, MIN_POINTS = 300, 8
+BACK_PX = 0.5  # largest distance of a point that is tracked there and back
+QUALITY = 98  # of the JPEG files: their noise is below that of the video
+
+
+@dataclass(frozen=True)
+class Way:
+    """The way of a camera along a video."""
+
+    times_s: FloatArray  # of the frames, (k,)
+    way_rad: FloatArray  # from the first frame to each, never less than before, (k,)
+    sharpness: FloatArray  # comparable between frames of one scene, (k,)
+
+
+class _Tracker:
+    """Follows points from frame to frame and adds up the way."""
+
+    def __init__(self) -> None:
+        self._base = 0.0  # way up to the picture in which the points were chosen
+        self._since = 0.0  # farthest since then
+        self._picture: AnyArray | None = None  # last one with points
+        self._start = np.zeros((0, 2), np.float32)  # points where they were chosen, and where they are now
+        self._now = self._start
+        self._chosen = 0
+        self._lost: AnyArray | None = None  # last picture in which the points were lost
+
+    @property
+    def way(self) -> float:
+        """Angle from the first frame, rad."""
+        return self._base + self._since
+
+    def add(self, picture: AnyArray) -> None:
+        """Follow the points into the next picture, (H, W), uint8."""
+        if self._picture is None:
+            self._choose(picture)
+            return
+        moved, kept = _tracked(self._picture, picture, self._now)
+        if 2 * kept.sum() >= self._chosen and kept.sum() >= MIN_POINTS:
+            self._start, self._now = self._start[kept], moved[kept]
+            self._picture, self._lost = picture, None
+            self._since = max(self._since, _angle(self._start, self._now, max(picture.shape)))
+            if self._since >= FINE_RAD:
+                self._choose(picture)
+        elif self._lost is None:  # blurred perhaps: the next picture may show the points again
+            self._lost = picture
+        else:
+            points = _points(self._lost)
+            _, kept = _tracked(self._lost, picture, points)
+            self._lost = picture
+            if 2 * kept.sum() >= len(points) >= MIN_POINTS:  # another scene, or far away
+                self._since += SPACING_RAD
+                self._choose(picture)
+
+    def _choose(self, picture: AnyArray) -> None:
+        """Choose points in a picture, from which the way is continued."""
+        points = _points(picture)
+        if len(points) < MIN_POINTS and self._picture is not None:
+            return
+        self._base, self._since = self.way, 0.0
+        self._start = self._now = points
+        self._chosen, self._picture, self._lost = len(points), picture, None
+        if len(points) < MIN_POINTS:  # such as a black first frame
+            self._picture = None
+
+
+def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
+    """Return the way of the camera along a video, and how sharp its frames are.
+
+    Args:
+        video: an open video, all of whose frames are decoded.
+        progress: receives a step for every frame.
+
+    Raises:
+        PhotographError: no frame can be decoded.
+    """
+    tracker, way, sharpness = _Tracker(), list[float](), list[float]()
+    for frame in video.frames():
+        grey = frame.grey()
+        factor = min(1.0, TRACKED_SIDE_PX / max(grey.shape))
+        size = max(1, round(factor * grey.shape[1])), max(1, round(factor * grey.shape[0]))
+        small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+        tracker.add(small)
+        way.append(tracker.way)
+        sharpness.append(_sharpness(grey))
+        progress.advance(f"{frame.time_s:.1f} s")
+    return Way(np.array(video.times_s), np.array(way), np.array(sharpness))
+
+
+def choose_frames(way: Way, count: int | None = None) -> IntArray:
+    """Return the frames to use, in order, (n,).
+
+    Args:
+        way: that of the camera.
+        count: number of frames; fewer are chosen where the camera stands still. None: as many as neighbours
+            need that have points in common.
+    """
+    total = float(way.way_rad[-1])
+    if count is None:
+        count = round(total / SPACING_RAD) + 1
+    spacing = total / max(count - 1, 1)
+    chosen: dict[int, None] = {}
+    for place in np.linspace(0, total, count) if count > 1 else (total / 2,):
+        away = np.abs(way.way_rad - place)
+        reach = REACH * spacing if count > 1 else total
+        near = np.flatnonzero(away <= max(reach, away.min()))
+        chosen[int(near[np.argmax(way.sharpness[near])])] = None
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
+def write_frames(video: Video, chosen: IntArray, folder: Path, name: str) -> tuple[str, ...]:
+    """Write frames as JPEG files whose EXIF data state one camera; return their names.
+
+    Args:
+        video: an open video.
+        chosen: indices of the frames.
+        folder: where they are written.
+        name: begins their names, and tells the cameras of several videos apart.
+
+    Raises:
+        PhotographError: a frame cannot be decoded any more.
+    """
+    wanted, names = set(chosen.tolist()), list[str]()
+    for frame in video.frames():
+        if frame.index in wanted:
+            names.append(f"{name}-{round(1000 * frame.time_s):07d}ms.jpg")
+            exif = Image.Exif()
+            exif[ExifTags.Base.Model] = _plain(f"{video.model or ''} {name}".strip())
+            if video.make:
+                exif[ExifTags.Base.Make] = _plain(video.make)
+            exif[ExifTags.Base.Orientation] = video.orientation
+            exif[ExifTags.Base.ImageDescription] = f"{frame.time_s:.3f} s of {_plain(video.path.name)}"
+            picture = Image.fromarray(frame.colours())
+            picture.save(folder / names[-1], quality=QUALITY, subsampling=0, exif=exif)
+        if len(names) == len(wanted):
+            return tuple(names)
+    raise PhotographError(f"{video.path.name}: changed while it was read")
+
+
+def _plain(text: str | None) -> str:
+    """Return a text of the file as EXIF data can state it, different for different texts."""
+    return as_plain(text or "").encode("ascii", "backslashreplace").decode("ascii")
+
+
+def _points(picture: AnyArray) -> AnyArray:
+    """Return corners of a picture, evenly spread, (n, 2), float32."""
+    apart = math.sqrt(picture.size / POINTS) / 2
+    corners = cv2.goodFeaturesToTrack(picture, POINTS, 0.01, apart)
+    return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners.reshape(-1, 2))
+
+
+def _tracked(first: AnyArray, second: AnyArray, points: AnyArray) -> tuple[AnyArray, AnyArray]:
+    """Return points of one picture in another, (n, 2), and which are found there and back, (n,)."""
+    if not len(points):
+        return points, np.zeros(0, dtype=bool)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, points, None)  # type: ignore[call-overload]
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None)  # type: ignore[call-overload]
+    near = np.linalg.norm(back - points, axis=1) <= BACK_PX
+    return there, (found.ravel() == 1) & (found_back.ravel() == 1) & near
+
+
+def _angle(start: AnyArray, now: AnyArray, side_px: int) -> float:
+    """Return the angle by which a camera sees points from elsewhere, rad.
+
+    Args:
+        start: points in the first picture, (n, 2).
+        now: the same in the second, (n, 2).
+        side_px: longer side of the pictures.
+    """
+    moved = now - start
+    shift = np.median(moved, axis=0)
+    size = np.median(np.linalg.norm(start - np.median(start, axis=0), axis=1))
+    figure = np.median(np.linalg.norm(moved - shift, axis=1)) / max(float(size), 1.0)
+    return float(np.hypot(np.linalg.norm(shift) / (FOCAL_PER_SIDE * side_px), figure))
+
+
+def _sharpness(grey: AnyArray) -> float:
+    """Return the power of gradients from pixel to pixel over that from two pixels to two."""
+
+    def power(picture: AnyArray) -> float:
+        values = picture.astype(np.float32)
+        return float(np.square(np.diff(values, axis=0)).mean() + np.square(np.diff(values, axis=1)).mean())
+
+    coarse = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    return power(grey) / max(power(np.asarray(coarse)), 1e-6)
+
+
+def _name_of(video: Path, others: Sequence[Path]) -> str:
+    """Return the name of a video among others: without its ending, if that is enough."""
+    alike = [other for other in others if other.stem.casefold() == video.stem.casefold()]
+    return as_plain(video.stem if len(alike) < 2 else video.name.replace(".", "-"))
+
+
+@dataclass(frozen=True)
+class WrittenFrames:
+    """The frames that were taken of a video."""
+
+    video: Path
+    names: tuple[str, ...]
+    frames: int  # that the video has
+    seconds: float  # of the last one
+    said: tuple[str, ...]  # sentences for the person
+
+
+def extract_frames(
+    videos: Sequence[Path], folder: Path, *, count: int | None = None, progress: Progress = SILENT
+) -> tuple[WrittenFrames, ...]:
+    """Write sharp frames of videos, spaced by the motion of the camera, as photographs.
+
+    Args:
+        videos: files; each is a camera.
+        folder: an empty folder.
+        count: number of frames of each; None for as many as are needed.
+        progress: receives the frames.
+
+    Raises:
+        PhotographError: a video cannot be read.
+    """
+    written = []
+    for path in videos:
+        with opened_video(path) as video:
+            stream = video.container.streams.video[0]
+            progress.stage(f"frames {path.stem}"[:12], stream.frames or None)
+            way = follow_camera(video, progress)
+            chosen = choose_frames(way, count)
+            said = list(video.remarks())
+            names = write_frames(video, chosen, folder, _name_of(path, videos))
+        if len(names) == 1 < len(way.times_s):
+            said.append("the camera does not move: one frame is taken; film the object from several places")
+        elif count is not None and len(names) < count:
+            said.append(f"only {len(names)} of {count} frames are of different places")
+        written.append(WrittenFrames(path, names, len(way.times_s), float(way.times_s[-1]), tuple(said)))
+    return tuple(written)
