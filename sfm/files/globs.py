@@ -15,6 +15,7 @@ from sfm.model.errors import SurveyFileError
 
 MAX_ENTRIES = 500_000  # files and folders that are examined
 BELOW = "**"  # a folder and everything below it
+COMPANION = "._"  # begins the name of a file of macOS on other disks, which has the name of another after it
 
 
 def why_no_folder(path: Path) -> str:
@@ -42,7 +43,7 @@ def find_files(
     folders: bool = False,
     hidden: bool = True,
 ) -> list[Path]:
-    """Return the files that match a glob, sorted; `**` follows no links.
+    """Return the files that match a glob, sorted; `**` follows no links, wildcards match no file of macOS.
 
     Args:
         folder: folder to search.
@@ -117,6 +118,7 @@ def _entries(path: Path, part: str, *, hidden: bool) -> Iterator[tuple[Path, boo
         with os.scandir(path) as entries:
             for entry in entries:
                 shown = hidden or not entry.name.startswith(".") or part.startswith(".")
+                shown = shown and not entry.name.startswith(COMPANION)
                 yield path / entry.name, shown and matches(os.path.normcase(entry.name)) is not None
     except PermissionError:  # ignored, as in globs of pathlib and the shell
         return

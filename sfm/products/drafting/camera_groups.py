@@ -51,6 +51,7 @@ class CameraGroup:
     assumed: bool  # whether pixel size or principal distance is only assumed
     fisheye: str  # what shows that it has a fisheye lens, for people, else ""
     remarks: tuple[Remark, ...]  # on the photographs
+    body: str = ""  # make, model and serial number; empty if the files state none
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,10 @@ class Grouping:
 
 
 def group_photographs(
-    metadata: dict[str, Metadata], sensor_width: SensorWidth = lambda make, model: None
+    metadata: dict[str, Metadata],
+    sensor_width: SensorWidth = lambda make, model: None,
+    *,
+    others: Sequence[str] = (),
 ) -> Grouping:
     """Return the cameras that took the photographs, and the rig that they may be mounted on.
 
@@ -84,6 +88,7 @@ def group_photographs(
     Args:
         metadata: metadata of every readable photograph, by its file name.
         sensor_width: looks up the sensor width if EXIF data do not give the pixel size.
+        others: names of further files there, which no glob of a camera shall match.
     """
     named = cameras_in_names(sorted(metadata))
     if named is not None and (_is_one_camera(named, metadata) or _are_apart(named, metadata)):
@@ -107,7 +112,7 @@ def group_photographs(
             break
     return Grouping(
         tuple(
-            _group(label, tuple(names), metadata, sensor_width)
+            _group(label, tuple(names), metadata, sensor_width, (*metadata, *others))
             for label, names in zip(labels, kept, strict=True)
         ),
         tuple(left_out),
@@ -187,8 +192,13 @@ def _of_one_moment(moment: Mapping[str, str], cameras: Iterable[Sequence[str]]) 
 
 
 def _group(
-    label: str, names: tuple[str, ...], metadata: dict[str, Metadata], sensor_width: SensorWidth
+    label: str,
+    names: tuple[str, ...],
+    metadata: dict[str, Metadata],
+    sensor_width: SensorWidth,
+    everything: tuple[str, ...],
 ) -> CameraGroup:
+    """Return a camera; everything: names of all files there."""
     first = metadata[names[0]]
     side = max(first.size_px)
     pixel: float | None = None
@@ -213,7 +223,7 @@ def _group(
     return CameraGroup(
         label,
         names,
-        _globs(names, tuple(metadata)),
+        _globs(names, everything),
         first.size_px,
         (pixel, pixel),
         pixel_source,
@@ -229,6 +239,7 @@ def _group(
             "",
         ),
         _remarks(label, {name: metadata[name] for name in names}),
+        " ".join(filter(None, (first.make, first.model, first.serial))),
     )
 
 

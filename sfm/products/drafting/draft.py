@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -113,7 +114,7 @@ def draft_survey(
         masks.refuse_wrong({name: folder / name for name in metadata})
     except SurveyFileError as error:  # a folder of this name may have another purpose
         masks, unused = Masks(), f"not used: {error}"
-    grouping = group_photographs(metadata, sensor_width)
+    grouping = group_photographs(metadata, sensor_width, others=[photograph for photograph, _ in unreadable])
     if grouping.rig is None and any("/" in name for name in metadata):
         _refuse_folder(folder)
     used = [name for camera in grouping.cameras for name in camera.photographs]
@@ -529,9 +530,7 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
     assumed = [camera.name for camera in grouping.cameras if camera.assumed]
     if assumed:
         remarks.append(remark("camera_assumed", cameras=assumed))
-    if len(grouping.cameras) > 1:
-        each = [f"{camera.name} ({len(camera.photographs)})" for camera in grouping.cameras]
-        remarks.append(remark("several_cameras", cameras=each))
+    remarks += _remarks_on_several(grouping.cameras)
     if trial.plate is not None and content.pitch is None:
         remarks.append(remark("plate_pitch_assumed", pitch=(PITCH, UNIT)))
     if np.isfinite(trial.blur_px):
@@ -546,6 +545,24 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
         circles = round(trial.circles)
         remarks.append(remark("circles_without_codes", circles=circles, rows=rows, columns=columns))
     return tuple(remarks)
+
+
+def _remarks_on_several(cameras: Sequence[CameraGroup]) -> list[Remark]:
+    """Return remarks on cameras that may be one: those of one size, and those of one body and other sizes."""
+    remarks = []
+    alike = Counter(camera.size_px for camera in cameras)
+    same = [camera for camera in cameras if alike[camera.size_px] > 1]
+    if same:
+        each = [f"{camera.name} ({len(camera.photographs)})" for camera in same]
+        remarks.append(remark("several_cameras", cameras=each))
+    sizes: dict[str, dict[tuple[int, int], CameraGroup]] = {}
+    for camera in cameras:
+        sizes.setdefault(camera.body, {}).setdefault(camera.size_px, camera)
+    for of_body in sizes.values():
+        if len(of_body) > 1:
+            each = [f"{camera.name} of {width} x {height} px" for (width, height), camera in of_body.items()]
+            remarks.append(remark("cameras_of_other_sizes", cameras=each))
+    return remarks
 
 
 def _quoted(text: str) -> str:

@@ -18,6 +18,7 @@ from sfm.files.open_folders import manifest_text, sha256_of
 from sfm.model.errors import GeometryError, OutputError
 from sfm.products.drafting.draft import draft_survey
 from sfm.report.output import Origin, read_origin, refuse_other_origin
+from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey_file import read_survey_file
 from sfm.targets.codes.plates import FAMILIES, PLATES
 from tests.commands import kolinear
@@ -246,6 +247,29 @@ def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
     (tmp_path / "1.jpg").write_bytes(file.read_bytes())
     with pytest.raises(GeometryError, match="1 readable photograph, at least 2 are needed"):
         draft_survey(tmp_path)
+
+
+def test_files_that_are_no_photographs_are_in_no_glob(tmp_path: Path) -> None:
+    """What the draft leaves out is not read by the survey; companions that macOS writes are not there at all."""
+    for k in range(4):
+        smooth = Image.effect_noise((120, 80), 60).filter(ImageFilter.GaussianBlur(3))
+        smooth.save(tmp_path / f"IMG_{k}.jpg")
+        (tmp_path / f"._IMG_{k}.jpg").write_bytes(b"of macOS")
+    (tmp_path / "notes.jpg").write_bytes(b"no photograph")
+    draft = draft_survey(tmp_path)
+    assert [name for name, _ in draft.left_out] == ["notes.jpg"]
+    (tmp_path / "survey.toml").write_text(draft.text, encoding="utf-8")
+    survey = read_survey_file(tmp_path / "survey.toml")
+    assert find_photographs(survey).names == tuple(f"IMG_{k}.jpg" for k in range(4))
+
+
+def test_cameras_that_may_be_one_are_named_with_what_helps(tmp_path: Path) -> None:
+    """Photographs of other sizes cannot be combined in the survey file."""
+    for k in range(6):
+        smooth = Image.effect_noise((120, 80), 60).filter(ImageFilter.GaussianBlur(3))
+        (smooth.transpose(Image.Transpose.ROTATE_90) if k > 3 else smooth).save(tmp_path / f"{k}.png")
+    (said,) = (said for said in draft_survey(tmp_path).remarks if "cameras" in said.kind)
+    assert said.kind == "cameras_of_other_sizes" and "unnamed-2 of 80 x 120 px" in said.text
 
 
 def test_colmap_knows_the_width_of_a_sensor() -> None:

@@ -29,6 +29,13 @@ DRAFTS = (
         "If they are one camera, combine them in the survey file.",
     ),
     Kind(
+        "cameras_of_other_sizes",
+        "note",
+        "Photographs of other sizes are adjusted as cameras of their own: {cameras}.",
+        "photographs that a program turned, cropped or resized, or another setting of the camera",
+        "If one camera took them all, use its original files: EXIF orientation turns no photograph.",
+    ),
+    Kind(
         "targets_blurred",
         Grade("blur", warning=2.5),  # px: beyond it, centroids and codes suffer (`sfm.targets.fits.centroid`)
         "Edges of targets are blurred by {blur} (standard deviation).",
