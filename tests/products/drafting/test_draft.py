@@ -250,7 +250,7 @@ def test_a_truncated_photograph_is_passed_over_by_name(tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_photographs_are_in_no_glob(tmp_path: Path) -> None:
-    """What the draft leaves out is not read by the survey; companions that macOS writes are not there at all."""
+    """Neither what the draft leaves out nor what macOS writes beside files."""
     for k in range(4):
         smooth = Image.effect_noise((120, 80), 60).filter(ImageFilter.GaussianBlur(3))
         smooth.save(tmp_path / f"IMG_{k}.jpg")

@@ -31,7 +31,7 @@ DRAFTS = (
     Kind(
         "cameras_of_other_sizes",
         "note",
-        "Photographs of other sizes are adjusted as cameras of their own: {cameras}.",
+        "Photographs of other sizes are adjusted as other cameras: {cameras}.",
         "photographs that a program turned, cropped or resized, or another setting of the camera",
         "If one camera took them all, use its original files: EXIF orientation turns no photograph.",
     ),
