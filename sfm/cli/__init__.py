@@ -71,9 +71,6 @@ def _run() -> None:
     try:
         code = commands()(prog_name="kolinear", standalone_mode=False)
     except USAGE_ERROR as error:
-        if not sys.argv[1:]:  # no arguments: the user asks for help, which is no mistake
-            error.show()
-            raise SystemExit(BAD_INPUT) from None
         command = error.ctx.command_path if error.ctx else "kolinear"
         said = f"{error.format_message().rstrip()}{_decimal_comma(error, sys.argv[1:])}"
         _refuse(f"{said} (see {command} --help)".replace(". (see", " (see"))

@@ -252,15 +252,17 @@ def test_run_and_adjust_know_their_surveys(capsys: pytest.CaptureFixture[str], s
 
 def test_usage_errors_are_one_line_with_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "run")
-    assert line == "kolinear: Missing argument 'SURVEY.toml|PHOTOS' (see kolinear run --help)"
+    assert line == "kolinear: Missing argument 'SURVEY.toml|PHOTOS|VIDEO' (see kolinear run --help)"
     assert "--jobs" in refused(capsys, "run", "a.toml", "--jobs", "0")
     assert "No such command 'fly'" in refused(capsys, "fly")
     assert "No such option: --bogus" in refused(capsys, "run", "a.toml", "--bogus")
 
 
-def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_says_how_to_begin(capsys: pytest.CaptureFixture[str]) -> None:
     assert kolinear() == 2
-    assert "Commands:" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "kolinear run PHOTOS" in told and "kolinear --help" in told and len(told.splitlines()) < 12
+    assert max(map(len, told.splitlines())) <= 80
     assert kolinear("run", "--help") == 0
     assert "Exit code 0" in capsys.readouterr().out
 
@@ -367,10 +369,33 @@ def test_help_explains_every_command_and_option() -> None:
         text=True,
         check=True,
     ).stdout
-    assert "run" in shown and "adjust" in shown
-    assert "..." not in shown[shown.index("Commands:") :]
+    listed = shown[shown.index("Measure:") :]
+    assert "..." not in listed
+    for row in app.COMMANDS:
+        section = listed[listed.index(f"{row.task}:") :].partition("\n\n")[0]
+        assert f"\n  {row.words.partition(' ')[0]} " in section, row.words
     for command in app.app.registered_commands:
         assert command.callback is not None and command.callback.__doc__
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_a_shell_completes_commands_and_options(shell: str) -> None:
+    def ask(words: str, instruction: str) -> str:
+        typed = (
+            {"_TYPER_COMPLETE_ARGS": words} if shell == "zsh" else {"COMP_WORDS": words, "COMP_CWORD": "1"}
+        )
+        run = subprocess.run(
+            [sys.executable, "-c", "from sfm.cli import main; main()"],
+            env={**os.environ, "_KOLINEAR_COMPLETE": f"{instruction}_{shell}", **typed},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert not run.stderr
+        return run.stdout
+
+    assert "calibrate" in ask("kolinear cal", "complete")
+    assert "kolinear" in ask("", "source")
 
 
 def test_messages_stay_on_one_line() -> None:
