@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -13,7 +13,7 @@ from rich.text import Text
 from sfm.cli.process import FAILED
 from sfm.model.display import MAX_LISTED, counted, listed, program_name, wrapped
 from sfm.model.remarks.row import Severity
-from sfm.model.remarks.verdict import Line, Verdict
+from sfm.model.remarks.verdict import Line, Verdict, split_lines
 from sfm.report.findings import Findings
 from sfm.report.page import Banner
 from sfm.report.phrases import (
@@ -59,7 +59,7 @@ def print_result(findings: Findings, page: Path, *, seconds: float, verbose: boo
     for name, value in rows:
         table.add_row(Text(name, style="dim"), Text(wrapped(value, room)))
     console.print(table)
-    print_remarks(console, verdict.lines)
+    print_remarks(console, verdict.lines, folded=not verbose)
     for line in _failures(findings):
         console.print(Text(f"  {line}"), soft_wrap=True)
     if verbose:
@@ -106,7 +106,7 @@ def exit_by(verdict: Verdict | Banner) -> None:
         raise SystemExit(FAILED)
 
 
-def print_remarks(console: Console, lines: Iterable[Line]) -> None:
+def print_remarks(console: Console, lines: Sequence[Line], *, folded: bool = False) -> None:
     """Print remarks: errors and warnings with a leading `!`, then notes.
 
     Remedies are printed except for notes on which no photograph or point was lost.
@@ -114,12 +114,17 @@ def print_remarks(console: Console, lines: Iterable[Line]) -> None:
     Args:
         console: console of the terminal.
         lines: remarks in order of severity.
+        folded: whether notes are counted only where there are many.
     """
-    for line in lines:
+    shown, rest = split_lines(lines) if folded else (lines, ())
+    for line in shown:
         is_note = line.severity == "note"
         remedy = "" if is_note and not line.lost else line.remedy
         text = f"{' ' if is_note else '!'} {line.text} {remedy}".rstrip()
         console.print(Text(text, style=STYLES[line.severity]), soft_wrap=True)
+    if rest:
+        more = f"  {counted(len(rest), 'more note')}: in the report, or with --verbose"
+        console.print(Text(more, style=STYLES["note"]), soft_wrap=True)
 
 
 def _failures(findings: Findings) -> list[str]:

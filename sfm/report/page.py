@@ -20,7 +20,7 @@ from markupsafe import Markup
 from sfm.files.plain_text import csv_text, or_none
 from sfm.files.result_tables import ResultTable
 from sfm.model.display import aligned, counted
-from sfm.model.remarks.verdict import Line, Verdict
+from sfm.model.remarks.verdict import Line, Verdict, split_lines
 from sfm.report.figures.plot_data import Plot
 from sfm.report.phrases import significant
 from sfm.report.viewer.embedded import Viewer
@@ -345,6 +345,17 @@ class Page:
     def path(self) -> str:
         """File name of the page."""
         return f"{self.file or self.name}.html"
+
+    @property
+    def warnings(self) -> tuple[Line, ...]:
+        """The errors and warnings, which are read before the figures."""
+        return tuple(line for line in self.verdict.lines if line.severity != "note")
+
+    @property
+    def notes(self) -> tuple[tuple[Line, ...], tuple[Line, ...]]:
+        """The notes below the figures: those that are shown, and those that are folded."""
+        shown, folded = split_lines(self.verdict.lines)
+        return tuple(line for line in shown if line.severity == "note"), folded
 
     @property
     def links(self) -> tuple[Section, ...]:

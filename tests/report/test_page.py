@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import get_type_hints
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from sfm.cli.console import print_remarks
 from sfm.files.result_tables import GIVEN
 from sfm.model.conventions import FloatArray
 from sfm.model.remarks.remark import remark
-from sfm.model.remarks.verdict import judge
+from sfm.model.remarks.verdict import Line, judge
 from sfm.report.page import (
     MAX_ROWS,
     YES,
@@ -207,3 +210,28 @@ def test_columns_of_the_page_and_of_files_are_apart() -> None:
     assert list(table.cells) == [("b", "1.0", "inf")]
     assert table.csv == "id,dX,dY\na,0.001,\n"
     assert table.records == [{"id": "a", "dX": 0.001, "dY": None}]
+
+
+def test_figures_stand_before_notes_and_few_notes_are_shown() -> None:
+    """Errors and warnings are read first and all shown; of the notes of a good survey few are."""
+    notes = tuple(Line("note", f"note {k}") for k in range(9))
+    warnings = tuple(Line("warning", f"warning {k}") for k in range(7))
+    for lines, shown in ((notes, 5), ((*warnings[:2], *notes), 3), ((*warnings, *notes), 0)):
+        page = html(Page("x", "Kind", "Title", Banner("good", "g", lines), (), (Tile("Points", 5),)))
+        figures, folded = page.index("class=tiles"), page.index("more notes</summary>")
+        items = [match.start() for match in re.finditer('<li class="note"', page)]
+        assert len(items) == 9 and min(items) > figures
+        assert sum(place < folded for place in items) == shown
+        serious = [match.start() for match in re.finditer('<li class="warning"', page)]
+        assert len(serious) == len(lines) - 9 and max(serious, default=0) < figures
+    few = html(Page("x", "Kind", "Title", Banner("good", "g", notes[:5]), (), (Tile("Points", 5),)))
+    assert "more note" not in few and few.count('<li class="note"') == 5
+
+
+def test_the_terminal_counts_further_notes(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = (*(Line("warning", f"warning {k}", "Act.") for k in range(7)), Line("note", "last"))
+    for folded, count in ((True, 7), (False, 8)):
+        print_remarks(Console(), lines, folded=folded)
+        told = capsys.readouterr().out.splitlines()
+        assert len(told) == 8 and sum(line.startswith("!") for line in told) == 7
+        assert ("1 more note: in the report" in told[-1]) == (count == 7)

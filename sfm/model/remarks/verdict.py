@@ -7,7 +7,7 @@ makes it fair, and with notes alone it is good.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -110,6 +110,19 @@ def _worst_explained(cause: Remark, every: tuple[Remark, ...]) -> Severity:
     graded = not isinstance(cause.row.severity, str)
     explained = [effect.severity for effect in every if graded and _explains(cause, effect)]
     return min((cause.at_least, *explained), key=SEVERITIES.index)
+
+
+def split_lines(lines: Sequence[Line]) -> tuple[tuple[Line, ...], tuple[Line, ...]]:
+    """Return the lines that are shown under a headline, and the notes that are folded.
+
+    Errors and warnings are always shown. Notes are shown up to MAX_LISTED lines, as they change no decision.
+
+    Args:
+        lines: the most serious first.
+    """
+    serious = sum(line.severity != "note" for line in lines)
+    shown = max(serious, MAX_LISTED)
+    return tuple(lines[:shown]), tuple(lines[shown:])
 
 
 def lines_of(remarks: Iterable[Remark]) -> tuple[Line, ...]:
