@@ -36,6 +36,7 @@ SPACING_RAD = MATCHED_RAD / (2 + 2 * REACH)
 FINE_RAD = SPACING_RAD / 4  # after which points are chosen anew; a hand that holds still moves less
 TRACKED_SIDE_PX = 640  # longer side of the pictures in which points are tracked
 POINTS, MIN_POINTS = 300, 8
+LARGER = 0.75  # quantile of motion: an object that turns before its background has a quarter of the points
 BACK_PX = 0.5  # largest distance of a point that is tracked there and back
 QUALITY = 98  # of the JPEG files: their noise is below that of the video
 
@@ -47,6 +48,7 @@ class Way:
     times_s: FloatArray  # of the frames, (k,)
     way_rad: FloatArray  # from the first frame to each, never less than before, (k,)
     sharpness: FloatArray  # comparable between frames of one scene, (k,)
+    followed: bool = True  # whether any points could be followed
 
 
 class _Tracker:
@@ -65,6 +67,11 @@ class _Tracker:
     def way(self) -> float:
         """Angle from the first frame, rad."""
         return self._base + self._since
+
+    @property
+    def has_points(self) -> bool:
+        """Whether a picture had points."""
+        return self._picture is not None
 
     def add(self, picture: AnyArray) -> None:
         """Follow the points into the next picture, (H, W), uint8."""
@@ -120,7 +127,7 @@ def follow_camera(video: Video, progress: Progress = SILENT) -> Way:
         way.append(tracker.way)
         sharpness.append(_sharpness(grey))
         progress.advance(f"{frame.time_s:.1f} s")
-    return Way(np.array(video.times_s), np.array(way), np.array(sharpness))
+    return Way(np.array(video.times_s), np.array(way), np.array(sharpness), tracker.has_points)
 
 
 def choose_frames(way: Way, count: int | None = None) -> IntArray:
@@ -205,8 +212,8 @@ def _angle(start: AnyArray, now: AnyArray, side_px: int) -> float:
     """
     moved = now - start
     shift = np.median(moved, axis=0)
-    size = np.median(np.linalg.norm(start - np.median(start, axis=0), axis=1))
-    figure = np.median(np.linalg.norm(moved - shift, axis=1)) / max(float(size), 1.0)
+    size = np.quantile(np.linalg.norm(start - np.median(start, axis=0), axis=1), LARGER)
+    figure = np.quantile(np.linalg.norm(moved - shift, axis=1), LARGER) / max(float(size), 1.0)
     return float(np.hypot(np.linalg.norm(shift) / (FOCAL_PER_SIDE * side_px), figure))
 
 
@@ -214,8 +221,9 @@ def _sharpness(grey: AnyArray) -> float:
     """Return the power of gradients from pixel to pixel over that from two pixels to two."""
 
     def power(picture: AnyArray) -> float:
-        values = picture.astype(np.float32)
-        return float(np.square(np.diff(values, axis=0)).mean() + np.square(np.diff(values, axis=1)).mean())
+        down = cv2.norm(picture[1:], picture[:-1], cv2.NORM_L2SQR)
+        across = cv2.norm(picture[:, 1:], picture[:, :-1], cv2.NORM_L2SQR)
+        return (down + across) / picture.size
 
     coarse = cv2.resize(grey, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     return power(grey) / max(power(np.asarray(coarse)), 1e-6)
@@ -262,7 +270,8 @@ def extract_frames(
             said = list(video.remarks())
             names = write_frames(video, chosen, folder, _name_of(path, videos))
         if len(names) == 1 < len(way.times_s):
-            said.append("the camera does not move: one frame is taken; film the object from several places")
+            why = "the camera does not move" if way.followed else "its pictures show nothing to follow"
+            said.append(f"{why}: one frame is taken; film the object from several places, in good light")
         elif count is not None and len(names) < count:
             said.append(f"only {len(names)} of {count} frames are of different places")
         written.append(WrittenFrames(path, names, len(way.times_s), float(way.times_s[-1]), tuple(said)))
