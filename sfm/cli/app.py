@@ -129,7 +129,7 @@ All commands: kolinear --help. One of them: kolinear run --help.
 WITHOUT_COMMAND = 2  # exit code
 GROUPS = {
     "plan": "Plan a survey before the photographs are taken.",
-    "orient": "Orient one or two photographs step by step, from tables of coordinates.",
+    "orient": "Orient photographs step by step, from tables of coordinates.",
 }
 
 USAGE_ERROR: Any = (

@@ -41,7 +41,7 @@ def georeference(
         typer.Option("--crs", metavar="CRS", help="Coordinate system of the control, as EPSG:32749."),
     ] = None,
 ) -> None:
-    """Draw a photograph of a flat object in the frame of its control points.
+    """Draw a photograph of a flat object onto its control points.
 
     A photograph of a plane is a projective image of it. Facades, floors, plans and scans are georeferenced
     so; relief is not corrected. All transformations that the points determine are compared by how well each

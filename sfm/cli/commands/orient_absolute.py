@@ -22,9 +22,9 @@ def orient_absolute(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Bring a model onto its control points: scale, three rotations and three shifts.
+    """Bring a model onto its control points.
 
-    The model may come from `orient pair` or from another program. With sigma, points are weighted by
+    By scale, three rotations and three shifts. The model may come from `orient pair` or from another program. With sigma, points are weighted by
     1 / sigma^2.
     """
     with loading():

@@ -52,7 +52,7 @@ def orient_correct(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Correct photo coordinates, so that the collinearity equations hold.
+    """Correct photo coordinates for the collinearity equations.
 
     Principal point, radial and decentring distortion, refraction and curvature of the earth. The result needs
     no camera file in `resect` and `orient pair`, only --c.

@@ -28,7 +28,7 @@ def orient_fiducials(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Transform measured coordinates into the system of the fiducial marks.
+    """Transform measured to photo coordinates by fiducial marks.
 
     Measured coordinates are those of a comparator or a scan. Columns and rows of a scan count downwards, and
     need the affine transformation.

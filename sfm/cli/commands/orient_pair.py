@@ -46,9 +46,9 @@ def orient_pair(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Orient two photographs relative to each other, and compute the model.
+    """Orient two photographs relative to each other.
 
-    Points of the same name are conjugate; at least six are needed. `orient absolute` brings the model onto
+    The model is computed too. Points of the same name are conjugate; at least six are needed. `orient absolute` brings the model onto
     control points.
     """
     with loading():
