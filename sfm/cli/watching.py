@@ -27,6 +27,7 @@ class WatchedSurvey:
     is_watched: bool = False
     until: float = 0.0  # uncertainty at which watching ends
     result: SurveyResult | None = None  # of the last run; None if there was none
+    drafted: bool = False  # whether the survey file of this run was drafted just now
     own_draft: Path | None = None  # survey file that was drafted here
     is_dependable: bool = False  # the last result
 
@@ -45,7 +46,7 @@ class WatchedSurvey:
         """
         if self.own_draft is not None and not self.is_dependable:
             self.own_draft.unlink(missing_ok=True)
-        self.result, self.is_dependable = None, False
+        self.result, self.is_dependable, self.drafted = None, False, False
         return self.own_draft is not None and self.own_draft.is_file()
 
 

@@ -95,7 +95,7 @@ def calibrate(
         return _for_calibration(text, model)
 
     def run_once() -> None:
-        stays, product.drafted = product.begin(), False
+        stays = product.begin()
         survey_file, folder, images = stated_or_drafted(
             photographs, out, None if stays else pitch, overwrite=overwrite, edit=edit
         )
@@ -144,7 +144,6 @@ class _Product(WatchedSurvey):
     """The calibration of a survey."""
 
     distances: tuple[float, ...] = ()
-    drafted: bool = False  # whether the survey file was drafted just now, and may be changed
     calibration: Calibration | None = None  # once it is written
     page: Page | None = None
 

@@ -24,8 +24,8 @@ def orient_absolute(
 ) -> None:
     """Bring a model onto its control points.
 
-    By scale, three rotations and three shifts. The model may come from `orient pair` or from another program. With sigma, points are weighted by
-    1 / sigma^2.
+    By scale, three rotations and three shifts. The model may come from `orient pair` or from another
+    program. With sigma, points are weighted by 1 / sigma^2.
     """
     with loading():
         from sfm.cli.photo_tables import OBJECT, read_control, read_points, write_points

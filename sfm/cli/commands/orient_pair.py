@@ -48,8 +48,8 @@ def orient_pair(
 ) -> None:
     """Orient two photographs relative to each other.
 
-    The model is computed too. Points of the same name are conjugate; at least six are needed. `orient absolute` brings the model onto
-    control points.
+    The model is computed too. Points of the same name are conjugate; at least six are needed. `orient
+    absolute` brings the model onto control points.
     """
     with loading():
         from sfm.cli.photo_tables import OBJECT, read_pair, write_points

@@ -21,6 +21,7 @@ from sfm.cli.options import (
     Weighted,
 )
 from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
+from sfm.cli.watching import watch
 from sfm.model.errors import KolinearError
 
 
@@ -34,6 +35,21 @@ def run(
             help="Folder of the photographs, instead of the folder that the survey file states.",
         ),
     ] = None,
+    watched: Annotated[
+        bool,
+        typer.Option(
+            "--watch",
+            help="Run again whenever photographs are added to the folder, and say which ones are next.",
+        ),
+    ] = False,
+    until: Annotated[
+        float,
+        typer.Option(
+            "--until",
+            metavar="SIGMA",
+            help="Standard deviation of the worst point, unit of the survey, at which --watch ends.",
+        ),
+    ] = 0.0,
     pitch: Pitch = None,
     frames: Frames = None,
     camera: Calibration = None,
@@ -58,19 +74,44 @@ def run(
 
     if images is not None and (survey_file.is_dir() or is_video(survey_file)):
         raise KolinearError(f"{survey_file}: photographs and videos need no --images {images}")
-    survey_file, out, photographs = stated_or_drafted(
-        survey_file, out, pitch, frames=frames, overwrite=overwrite
-    )
-    options = RunOptions(
-        images=photographs or images,
-        out=out,
-        jobs=jobs,
-        allow_outside=allow_outside,
-        verbose=verbose,
-        from_photographs=True,
-        camera=camera,
-        weighted=camera_weighted,
-        overwrite=overwrite,
-        pictures_mb=pictures_mb,
-    )
-    run_survey_file(survey_file, options)
+    if until and not watched:
+        raise KolinearError(f"--until {until:g} is for --watch")
+    from sfm.cli.watched_survey import SurveySoFar
+
+    rounds = SurveySoFar(is_watched=watched, until=until)
+
+    def edit(text: str) -> str:
+        rounds.drafted = True
+        return text
+
+    def run_once() -> None:
+        stays = rounds.begin()
+        file, folder, photographs = stated_or_drafted(
+            survey_file,
+            out,
+            None if stays else pitch,
+            frames=None if stays else frames,
+            overwrite=overwrite,
+            edit=edit,
+        )
+        if rounds.drafted:
+            rounds.own_draft = file
+        options = RunOptions(
+            images=photographs or images,
+            out=folder,
+            jobs=jobs,
+            allow_outside=allow_outside,
+            verbose=verbose,
+            from_photographs=True,
+            camera=camera,
+            weighted=camera_weighted,
+            overwrite=overwrite,
+            pictures_mb=pictures_mb,
+            product=rounds if watched else None,
+        )
+        run_survey_file(file, options)
+
+    if watched:
+        watch(survey_file, run_once, rounds)
+    else:
+        run_once()
