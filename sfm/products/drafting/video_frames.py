@@ -6,7 +6,7 @@ change of the figure of the points over its size. An object in the middle of the
 camera moves, changes its figure; a wall along which it moves shifts.
 
 Frames are evenly spaced on this way, whatever the speed, so a camera that stands still gives one frame. Of
-the frames near each place the sharpest is taken.
+the frames near each place the sharpest is taken. A blurred one is left out if its neighbours can be matched.
 """
 
 from __future__ import annotations
@@ -139,16 +139,39 @@ def choose_frames(way: Way, count: int | None = None) -> IntArray:
             need that have points in common.
     """
     total = float(way.way_rad[-1])
+    places = np.linspace(0, total, count or round(total / SPACING_RAD) + 1)
+    if len(places) == 1:
+        return np.array([int(np.argmax(way.sharpness))], dtype=np.int64)
+    spacing = total / (len(places) - 1)
+    found = [_frame_near(place, spacing, way) for place in places]
+    chosen = np.unique([frame for frame, _ in found])
     if count is None:
-        count = round(total / SPACING_RAD) + 1
-    spacing = total / max(count - 1, 1)
-    chosen: dict[int, None] = {}
-    for place in np.linspace(0, total, count) if count > 1 else (total / 2,):
-        away = np.abs(way.way_rad - place)
-        reach = REACH * spacing if count > 1 else total
-        near = np.flatnonzero(away <= max(reach, away.min()))
-        chosen[int(near[np.argmax(way.sharpness[near])])] = None
-    return np.array(sorted(chosen), dtype=np.int64)
+        for frame in sorted({frame for frame, sharp in found if not sharp}):
+            k = int(np.searchsorted(chosen, frame))
+            beside = chosen[[max(k - 1, 0), min(k + 1, len(chosen) - 1)]]
+            if 0 < k < len(chosen) - 1 and np.ptp(way.way_rad[beside]) <= MATCHED_RAD:
+                chosen = np.delete(chosen, k)
+    return np.asarray(chosen, dtype=np.int64)
+
+
+def _frame_near(place: float, spacing: float, way: Way) -> tuple[int, bool]:
+    """Return the frame to take near a place of the way, and whether it is as sharp as most there.
+
+    It is the sharpest in reach. If that is blurred, a sharp one within half of the spacing is better: so far
+    from their places, neighbours are two spacings apart, which are still matched.
+    """
+    away = np.abs(way.way_rad - place)
+
+    def within(distance: float) -> IntArray:
+        return np.flatnonzero(away <= max(distance, away.min()))
+
+    near = within(REACH * spacing)
+    best = int(near[np.argmax(way.sharpness[near])])
+    usual = np.median(way.sharpness[within(spacing)])
+    if way.sharpness[best] >= usual:
+        return best, True
+    sharp = [k for k in within(spacing / 2).tolist() if way.sharpness[k] >= usual]
+    return (min(sharp, key=lambda k: away[k]), True) if sharp else (best, False)
 
 
 def write_frames(video: Video, chosen: IntArray, folder: Path, name: str) -> tuple[str, ...]:

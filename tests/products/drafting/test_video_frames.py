@@ -15,7 +15,14 @@ from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_photograph
 from sfm.photographs.video_files import opened_video, remarks_on_times
 from sfm.products.drafting.frames_folder import LIST
-from sfm.products.drafting.video_frames import SPACING_RAD, Way, choose_frames, extract_frames, follow_camera
+from sfm.products.drafting.video_frames import (
+    MATCHED_RAD,
+    SPACING_RAD,
+    Way,
+    choose_frames,
+    extract_frames,
+    follow_camera,
+)
 from sfm.survey.inputs.survey_file import read_survey_file
 from tests.commands import kolinear, refused
 from tests.surveys import code_centres
@@ -69,6 +76,19 @@ def test_blurred_frames_are_not_taken(tmp_path: Path) -> None:
     frames = [cv2.blur(frame, (9, 1)) if k in blurred else frame for k, frame in enumerate(frames)]
     chosen = choose_frames(way_of(write_video(tmp_path / "a.mkv", frames)))
     assert len(chosen) > 3 and not blurred & set(chosen.tolist())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_blurred_frames_of_a_fast_camera_are_passed_over(seed: int) -> None:
+    """With hardly more than two frames for each place, and no more than two places from one to the next."""
+    rng = np.random.default_rng(seed)
+    blurred = rng.uniform(size=200) < 0.4
+    sharpness = np.where(blurred, 0.13, 0.19) + rng.normal(0, 0.005, 200)
+    way = Way(np.arange(200) / 10, np.cumsum(rng.uniform(0.05, 0.09, 200)), sharpness)
+    chosen = choose_frames(way)
+    assert blurred[chosen].mean() < 0.2 < 0.3 < blurred.mean()
+    assert np.diff(way.way_rad[chosen]).max() < MATCHED_RAD * 1.1
+    assert len(choose_frames(way, 60)) > 55
 
 
 def test_frames_in_which_nothing_can_be_followed_end_no_way(tmp_path: Path) -> None:
