@@ -59,6 +59,7 @@ class Video:
 
     path: Path
     container: Any  # of PyAV
+    stream: Any  # of PyAV, its pictures
     make: str | None = None  # of the camera
     model: str | None = None
     orientation: int = 1  # EXIF orientation of all frames
@@ -89,10 +90,9 @@ class Video:
         import av
 
         self.container.seek(0)
-        stream = self.container.streams.video[0]
-        rate = float(stream.average_rate or 25)
+        rate = float(self.stream.average_rate or 25)
         first, count, whole = None, 0, True
-        packets = self.container.demux(stream)
+        packets = self.container.demux(self.stream)
         while True:
             try:
                 packet = next(packets, None)
@@ -131,7 +131,7 @@ class Video:
                 "interlaced: rows of a frame are of two moments, which moves points; run a copy made by "
                 f"ffmpeg -i {self.path.name} -vf yadif COPY.mkv"
             )
-        aspect = self.container.streams.video[0].sample_aspect_ratio
+        aspect = self.stream.sample_aspect_ratio
         if aspect and aspect != 1:
             said.append(
                 f"its pixels are {aspect.numerator}:{aspect.denominator}, not square: write pixel_mm with "
@@ -197,8 +197,8 @@ def opened_video(path: Path) -> Iterator[Video]:
         ) from error
     with container:
         pictures = [stream for stream in container.streams.video if not _is_cover(stream)]
-        if not pictures or pictures[0] is not container.streams.video[0]:
-            kinds = sorted({stream.type for stream in container.streams})
+        if not pictures:
+            kinds = sorted({"a cover" if _is_cover(stream) else stream.type for stream in container.streams})
             content = " and ".join(kinds) or "nothing"
             raise PhotographError(f"{path.name}: has no video, only {content}; give a file with pictures")
         stream = pictures[0]
@@ -210,6 +210,7 @@ def opened_video(path: Path) -> Iterator[Video]:
         yield Video(
             path,
             container,
+            stream,
             make=next((described[name] for name in MAKE if described.get(name)), None),
             model=next((described[name] for name in MODEL if described.get(name)), None),
             duration_s=stated,

@@ -286,8 +286,7 @@ def extract_frames(
     written = []
     for path in videos:
         with opened_video(path) as video:
-            stream = video.container.streams.video[0]
-            progress.stage(f"frames {path.stem}"[:12], stream.frames or None)
+            progress.stage("frames", video.stream.frames or None)
             way = follow_camera(video, progress)
             chosen = choose_frames(way, count)
             said = list(video.remarks())

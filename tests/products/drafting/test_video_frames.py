@@ -341,3 +341,16 @@ def test_two_videos_of_a_folder_are_two_cameras(
     assert kolinear("init", photographs) == 0
     told = capsys.readouterr().err
     assert "left out: walk.mp4: a video beside photographs" in told and "IMG_0.mov" not in told
+
+
+def test_a_picture_of_a_cover_is_no_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import av
+
+    with av.open(str(tmp_path / "music.mp4"), "w") as container:
+        cover = container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = 64, 64, "yuvj420p"
+        cover.disposition = av.stream.Disposition.attached_pic
+        picture = av.VideoFrame.from_ndarray(np.full((64, 64, 3), 90, np.uint8), format="rgb24")
+        container.mux(cover.encode(picture))
+        container.mux(cover.encode())
+    assert "has no video, only a cover" in refused(capsys, "run", tmp_path / "music.mp4")
