@@ -138,13 +138,15 @@ def _failures(findings: Findings) -> list[str]:
         for image in remark.names("photographs")
         for kind in remark.row.explains
     }
+    told = {remark.kind for remark in findings.verdict.remarks}  # with the remedy
     images: dict[tuple[str, str], list[str]] = {}
     for failed in findings.result.failed:
         if (failed.image, failed.reason.kind) not in said:
             reason = failed.reason
-            images.setdefault((reason.text, reason.remedy), []).append(failed.image)
+            remedy = "" if reason.kind in told else reason.remedy
+            images.setdefault((reason.text, remedy), []).append(failed.image)
     return [
-        f"{listed(names)}{', each' if len(names) > 1 else ''}: {text} {remedy}"
+        f"{listed(names)}{', each' if len(names) > 1 else ''}: {text} {remedy}".rstrip()
         for (text, remedy), names in images.items()
     ]
 

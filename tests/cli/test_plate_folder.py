@@ -58,7 +58,7 @@ def test_a_pitch_goes_into_a_drafted_file_only(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(drafting, "draft_folder", drafted)
     out = tmp_path / "out" / "plate"
     with stopped_once():  # as every command
-        file, _ = drafting.drafted_beside(tmp_path, out, 12.5)
+        file = drafting.drafted_beside(tmp_path, out, 12.5).file
         assert asked == [12.5] and file.is_file()
         with pytest.raises(KolinearError, match=r"targets\.pitch"):
             drafting.drafted_beside(tmp_path, out, 12.5)
@@ -76,7 +76,7 @@ def test_a_draft_of_other_photographs_is_neither_run_nor_replaced(
         folder.mkdir(parents=True)
     out = tmp_path / "all" / "out" / "plate"
     with stopped_once():
-        file, _ = drafting.drafted_beside(first, out, None)
+        file = drafting.drafted_beside(first, out, None).file
         file.write_text(file.read_text(encoding="utf-8") + "# mine\n", encoding="utf-8")
         edited = file.read_bytes()
         for overwrite in (False, True):

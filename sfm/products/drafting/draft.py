@@ -114,7 +114,9 @@ def draft_survey(
         masks.refuse_wrong({name: folder / name for name in metadata})
     except SurveyFileError as error:  # a folder of this name may have another purpose
         masks, unused = Masks(), f"not used: {error}"
-    grouping = group_photographs(metadata, sensor_width, others=[photograph for photograph, _ in unreadable])
+    # a link may be of use where the survey is run, which checks it
+    others = [other for other, _ in unreadable if not (folder / other).is_symlink()]
+    grouping = group_photographs(metadata, sensor_width, others=others)
     if grouping.rig is None and any("/" in name for name in metadata):
         _refuse_folder(folder)
     used = [name for camera in grouping.cameras for name in camera.photographs]
