@@ -1,1 +1,4 @@
-"""Photographs as untrusted files: `reading` (pixels) and `exif` (camera, time, satellite position)."""
+"""Photographs as untrusted files: `reading` (pixels) and `exif` (camera, time, satellite position).
+
+Kinds of files are modules: `tiff_files`, `camera_files` (HEIF and raw) and `video_files`.
+"""
