@@ -550,21 +550,15 @@ def _remarks(content: _Content) -> tuple[Remark, ...]:
 
 
 def _remarks_on_several(cameras: Sequence[CameraGroup]) -> list[Remark]:
-    """Return remarks on cameras that may be one: those of one size, and those of one body and other sizes."""
-    remarks = []
-    alike = Counter(camera.size_px for camera in cameras)
-    same = [camera for camera in cameras if alike[camera.size_px] > 1]
-    if same:
-        each = [f"{camera.name} ({len(camera.photographs)})" for camera in same]
-        remarks.append(remark("several_cameras", cameras=each))
-    sizes: dict[str, dict[tuple[int, int], CameraGroup]] = {}
-    for camera in cameras:
-        sizes.setdefault(camera.body, {}).setdefault(camera.size_px, camera)
-    for of_body in sizes.values():
-        if len(of_body) > 1:
-            each = [f"{camera.name} of {width} x {height} px" for (width, height), camera in of_body.items()]
-            remarks.append(remark("cameras_of_other_sizes", cameras=each))
-    return remarks
+    """Return a remark on cameras that may be one: those of one size, or of one body."""
+    of_size = Counter(camera.size_px for camera in cameras)
+    of_body = Counter(camera.body for camera in cameras)
+    alike = [camera for camera in cameras if max(of_size[camera.size_px], of_body[camera.body]) > 1]
+    each = [
+        f"{camera.name} ({len(camera.photographs)} of {camera.size_px[0]} x {camera.size_px[1]} px)"
+        for camera in alike
+    ]
+    return [remark("several_cameras", cameras=each)] if each else []
 
 
 def _quoted(text: str) -> str:

@@ -264,12 +264,13 @@ def test_files_that_are_no_photographs_are_in_no_glob(tmp_path: Path) -> None:
 
 
 def test_cameras_that_may_be_one_are_named_with_what_helps(tmp_path: Path) -> None:
-    """Photographs of other sizes cannot be combined in the survey file."""
+    """Photographs of other sizes cannot be combined in the survey file, but may be of one camera."""
     for k in range(6):
         smooth = Image.effect_noise((120, 80), 60).filter(ImageFilter.GaussianBlur(3))
         (smooth.transpose(Image.Transpose.ROTATE_90) if k > 3 else smooth).save(tmp_path / f"{k}.png")
     (said,) = (said for said in draft_survey(tmp_path).remarks if "cameras" in said.kind)
-    assert said.kind == "cameras_of_other_sizes" and "unnamed-2 of 80 x 120 px" in said.text
+    assert said.kind == "several_cameras" and "unnamed-2 (2 of 80 x 120 px)" in said.text
+    assert "original files" in said.remedy
 
 
 def test_colmap_knows_the_width_of_a_sensor() -> None:

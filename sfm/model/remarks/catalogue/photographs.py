@@ -25,15 +25,10 @@ DRAFTS = (
         "several_cameras",
         "note",
         "The photographs are from {cameras:camera} or settings: {cameras}.",
-        "another body, zoom, size or orientation of the photographs",
-        "If they are one camera, combine them in the survey file.",
-    ),
-    Kind(
-        "cameras_of_other_sizes",
-        "note",
-        "Photographs of other sizes are adjusted as other cameras: {cameras}.",
-        "photographs that a program turned, cropped or resized, or another setting of the camera",
-        "If one camera took them all, use its original files: EXIF orientation turns no photograph.",
+        "another body, zoom, size or orientation of the photographs; a program that turned, cropped or "
+        "resized them",
+        "If they are one camera, combine those of one size in the survey file, and use the original files of "
+        "others: EXIF orientation turns no photograph.",
     ),
     Kind(
         "targets_blurred",
