@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -74,6 +75,18 @@ def staging() -> Staging:
 @pytest.fixture(scope="module")
 def demo(staging: Staging, tmp_path_factory: pytest.TempPathFactory) -> SurveyResult:
     return run(staging, tmp_path_factory.mktemp("demo"), others=OtherPrograms(adjust_with_colmap))
+
+
+def test_the_readme_states_what_the_demo_reaches(demo: SurveyResult, staging: Staging) -> None:
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    figures = (
+        r"Of the (\d+) targets .* deviation of ([\d.]+) µm; .* off by ([\d.]+) µm .* residuals, ([\d.]+) px"
+    )
+    (said,) = re.findall(figures, text)
+    truth = compare(demo, staging, scale=1.0)
+    stated = 1000 * np.sqrt(np.einsum("kii->k", truth.covariance).mean() / 3)
+    reached = 1000 * np.sqrt((truth.error**2).mean())
+    assert said == (f"{len(truth.found)}", f"{stated:.1f}", f"{reached:.1f}", f"{demo.adjustment.rms_px:.3f}")
 
 
 def test_every_photograph_is_oriented_and_the_optimum_is_colmaps(demo: SurveyResult) -> None:
