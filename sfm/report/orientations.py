@@ -116,6 +116,8 @@ def pair_report(
     for name, value, s in zip(o.names, o.parameters * unit, sigma, strict=True):
         lines.append(f"{name:<7}{value:14.7f} ± {s:.7f}{'' if name in ('by', 'bz') else ' deg'}")
     lines += _sigma0(1000 * o.sigma0 * c_mm, "um", o.redundancy)
+    if o.is_ambiguous:
+        lines.append("another orientation fits as well: the points are close to a plane, others are needed")
     columns = (
         Column("point", "point"),
         *(Column(axis, axis, "", ".6f", unknown="-") for axis in "XYZ"),
@@ -135,6 +137,7 @@ def pair_report(
         "rotations": o.rotations,
         "sigma0_mm": o.sigma0 * c_mm,
         "redundancy": o.redundancy,
+        "is_ambiguous": o.is_ambiguous,
     }
     return OrientationReport(tuple(lines), Table(columns, rows), values, tuple(after))
 

@@ -24,17 +24,26 @@ import numpy as np
 from sfm.model.arguments import checked_arguments
 from sfm.model.camera import Camera, camera_from_values, project, ray_directions, tangents_from_pixel
 from sfm.model.conventions import AnyArray, FloatArray, angles_from_rotation, rotation_from_angles
+from sfm.model.display import counted
+from sfm.model.distributions import MARGIN
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.orientation.intersection import intersect
-from sfm.orientation.relative import UNKNOWNS, refine_coplanarity, relative_orientations, turned_pair
+from sfm.orientation.relative import (
+    SPATIAL_POINTS,
+    UNKNOWNS,
+    refine_coplanarity,
+    relative_orientations,
+    turned_pair,
+)
 from sfm.runtime.sampling import resample
 
 BORDER_POINTS = 40  # points per side of a photograph that give the format of its normal image
 MAX_LARGER = 4.0  # largest area of a normal image over that of its photograph; beyond, the base is along rays
 DIFFERENCE = 1e-6  # rad, step of central differences: their error is about 1e-12 of the derivative
 NO_BX = 1e-6  # smallest |bx| over the base for which a given bx determines by and bz
+SAME = 1e-6  # of base and rotation: adjustments that end at one solution differ less
 FIVE_POINT_TOLERANCE = 0.01  # tangents: the five-point start rejects pairs with larger residuals
 DEPENDENT = ("by", "bz", "omega", "phi", "kappa")
 INDEPENDENT = ("phi1", "kappa1", "omega2", "phi2", "kappa2")
@@ -53,6 +62,7 @@ class PairOrientation:
     residuals: FloatArray  # distance of each pair of rays from coplanarity, tangents, (n,)
     sigma0: float  # a posteriori standard deviation of an image coordinate, tangents; NaN without redundancy
     redundancy: int  # n - 5
+    is_ambiguous: bool = False  # whether another orientation fits, as of points close to a plane
 
 
 @checked_arguments(first="n 2", second="n 2", start="5")
@@ -72,15 +82,21 @@ def orient_dependent(
         The five parameters with their covariance, and both photographs in the frame of photograph 1.
 
     Raises:
-        GeometryError: there are too few pairs, the pairs do not determine the parameters, or the base is
-            undetermined or has no X component.
+        GeometryError: there are too few pairs, the pairs do not determine the parameters, the base is
+            undetermined or has no X component, or without a start bx has the wrong sign.
 
     Source: document 004, "dependent relative orientation"; Kraus (2007), sec. 4.3.
     """
-    if bx == 0:
-        raise GeometryError("dependent pair: bx is 0, but it sets the scale, expected another value")
+    if not (np.isfinite(bx) and bx != 0):
+        raise GeometryError(f"dependent pair: bx is {bx:g}, but it sets the scale, expected another value")
+    is_ambiguous = False
     if start is None:
-        b, R = _five_point(first, second)
+        b, R, is_ambiguous = _orient_without_start(first, second)
+        if b[0] * bx < 0:
+            raise GeometryError(
+                f"dependent pair: with bx = {bx:g} the rays meet behind the photographs, expected the other "
+                "sign, or the photographs in the other order"
+            )
     else:
         b = np.array([bx, start[0], start[1]])
         R = rotation_from_angles(start[2], start[3], start[4])
@@ -95,7 +111,16 @@ def orient_dependent(
     rotations = np.stack([np.eye(3), R])
     values, covariance, sigma0 = _with_precision(parameters, b, R, v, Q)
     return PairOrientation(
-        "dependent", DEPENDENT, values, covariance, positions, rotations, v, sigma0, len(v) - UNKNOWNS
+        "dependent",
+        DEPENDENT,
+        values,
+        covariance,
+        positions,
+        rotations,
+        v,
+        sigma0,
+        len(v) - UNKNOWNS,
+        is_ambiguous,
     )
 
 
@@ -120,8 +145,9 @@ def orient_independent(
 
     Source: document 004, "independent relative orientation"; Kraus (2007), sec. 4.3.
     """
+    is_ambiguous = False
     if start is None:
-        b, R = _five_point(first, second)
+        b, R, is_ambiguous = _orient_without_start(first, second)
     else:
         R1 = rotation_from_angles(0.0, start[0], start[1])
         b, R = R1[0], R1.T @ rotation_from_angles(start[2], start[3], start[4])
@@ -136,7 +162,16 @@ def orient_independent(
     rotations = np.stack([R1, R1 @ R])
     values, covariance, sigma0 = _with_precision(parameters, b, R, v, Q)
     return PairOrientation(
-        "independent", INDEPENDENT, values, covariance, positions, rotations, v, sigma0, len(v) - UNKNOWNS
+        "independent",
+        INDEPENDENT,
+        values,
+        covariance,
+        positions,
+        rotations,
+        v,
+        sigma0,
+        len(v) - UNKNOWNS,
+        is_ambiguous,
     )
 
 
@@ -152,13 +187,19 @@ def intersect_pair(orientation: PairOrientation, first: FloatArray, second: Floa
         Points with the smallest sum of squared image residuals; NaN where rays are parallel or meet behind a
         photograph.
     """
+    return _intersect(orientation.positions, orientation.rotations, first, second)
+
+
+def _intersect(
+    positions: FloatArray, rotations: FloatArray, first: FloatArray, second: FloatArray
+) -> FloatArray:
     n = len(first)
     return intersect(
         np.concatenate([first, second]),
         np.repeat([0, 1], n),
         np.tile(np.arange(n), 2),
-        orientation.positions,
-        orientation.rotations,
+        positions,
+        rotations,
         n_points=n,
     ).points
 
@@ -170,15 +211,37 @@ def _base_frame(base: FloatArray) -> FloatArray:
     return rotation_from_angles(0.0, phi, kappa)
 
 
-def _five_point(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return base and rotation without start values; of a planar scene, the solution that fits better."""
+def _orient_without_start(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
+    """Return base and rotation without start values, and whether another orientation fits as well.
+
+    Of a planar scene two orientations fit the rays. The right one has the points in front of both photographs;
+    the other one may have them there too.
+    """
+    if len(first) < SPATIAL_POINTS:
+        raise GeometryError(
+            f"relative orientation: {counted(len(first), 'pair')}, at least {SPATIAL_POINTS} are needed "
+            "without start values"
+        )
     solutions = relative_orientations(first, second, tolerance=FIVE_POINT_TOLERANCE)
     if solutions[0].kind == "infinite":
         raise GeometryError(
             "relative orientation: a rotation alone explains the rays, there is no base to determine"
         )
-    best = min(solutions, key=lambda solution: solution.rms)
-    return best.base, best.rotation
+    if solutions[0].kind != "planar":
+        return solutions[0].base, solutions[0].rotation, False
+    fits = []
+    for solution in solutions:
+        b, R, v, _ = refine_coplanarity(first, second, solution.base, solution.rotation)
+        points = _intersect(np.stack([np.zeros(3), b]), np.stack([np.eye(3), R]), first, second)
+        fits.append((-int(np.isfinite(points).all(axis=1).sum()), float(v @ v), b, R))
+    in_front, squares, b, R = min(fits, key=lambda fit: fit[:2])
+    is_ambiguous = any(
+        fit[0] == in_front
+        and len(first) * np.log(fit[1] / squares) < MARGIN
+        and not (np.allclose(fit[2], b, atol=SAME) and np.allclose(fit[3], R, atol=SAME))
+        for fit in fits
+    )
+    return b, R, is_ambiguous
 
 
 def _with_precision(

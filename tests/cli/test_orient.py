@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.textbook.pair import intersect_pair, orient_independent
 from sfm.textbook.photo_coordinates import PhotoCorrections, compute_photo_coordinates
 from tests.commands import kolinear, refused
 from tests.synthetic import seed_of
@@ -196,3 +197,77 @@ def test_an_existing_file_is_left_alone(pair: Pair, capsys: pytest.CaptureFixtur
     before = model.read_bytes()
     assert "exists already" in refused(capsys, "orient", "absolute", model, model, "--out", model)
     assert model.read_bytes() == before
+
+
+def photographs(X: FloatArray, noise: str) -> tuple[FloatArray, FloatArray]:
+    """Return the photo coordinates of points in two photographs, the second to the right, mm."""
+    rng = seed_of(noise)
+    stations = [
+        (np.array([100.0, 0, 1500]), rotation_from_angles(0.017, 0.035, 0.052)),
+        (np.array([700.0, 20, 1520]), rotation_from_angles(-0.017, 0.017, 0.087)),
+    ]
+    first, second = (
+        compute_photo_coordinates(X, at, R, c_mm=C_MM) + 0.005 * rng.standard_normal((len(X), 2))
+        for at, R in stations
+    )
+    return first, second
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_of_a_plane_the_orientation_with_points_in_front_is_taken(pair: Pair, seed: int) -> None:
+    """The other solution of a plane often fits better, with points behind a photograph."""
+    X = pair.X.copy()
+    X[:, 2] = 20 + 0.1 * X[:, 0]
+    first, second = (xy / C_MM for xy in photographs(X, f"plane {seed}"))
+    orientation = orient_independent(first, second)
+    assert np.isfinite(intersect_pair(orientation, first, second)).all() and not orientation.is_ambiguous
+    assert np.degrees(np.abs(orientation.parameters)).max() < 10
+
+
+def test_two_orientations_of_a_small_plane_are_said(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = seed_of("small plane")
+    X = np.column_stack([rng.uniform(700, 900, 12), rng.uniform(-100, 100, 12), np.zeros(12)])
+    X[:, 2] = 0.1 * X[:, 0]
+    tables = [
+        pair.write(f"{side}.csv", "point,x_mm,y_mm", range(12), xy)
+        for side, xy in zip("lr", photographs(X, "small"), strict=True)
+    ]
+    assert kolinear("orient", "pair", *tables, "--c", C_MM) == 0
+    assert "another orientation fits as well" in capsys.readouterr().out
+    assert said(capsys, "orient", "pair", *tables, "--c", C_MM)["is_ambiguous"] is True
+
+
+def test_five_points_and_a_wrong_sign_of_bx_are_refused(
+    pair: Pair, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = photographs(pair.X, "order")
+    left, right = (
+        pair.write(f"{side}.csv", "point,x_mm,y_mm", pair.names, xy)
+        for side, xy in (("l", first), ("r", second))
+    )
+    few = [
+        pair.write(f"{k}.csv", "point,x_mm,y_mm", pair.names[:5], xy[:5])
+        for k, xy in enumerate((first, second))
+    ]
+    assert "5 pairs, at least 6" in refused(capsys, "orient", "pair", *few, "--c", C_MM)
+    assert "the other sign" in refused(capsys, "orient", "pair", right, left, "--c", C_MM)
+    assert "the other sign" in refused(capsys, "orient", "pair", left, right, "--c", C_MM, "--bx", -1)
+    assert "bx is nan" in refused(capsys, "orient", "pair", left, right, "--c", C_MM, "--bx", "nan")
+    model = pair.folder / "turned.csv"
+    turned = said(capsys, "orient", "pair", right, left, "--c", C_MM, "--bx", -600, "--out", model)
+    assert all(point["Z"] < 0 for point in turned["points"])
+
+
+def test_a_model_has_only_points_with_a_place(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
+    """A pair of rays that meet behind the photographs gives no row, so that the model can be read."""
+    first, second = photographs(pair.X, "behind")
+    second[3, 0] = first[3, 0] + 20.0  # parallax of the other sign
+    left, right = (
+        pair.write(f"{side}.csv", "point,x_mm,y_mm", pair.names, xy)
+        for side, xy in (("l", first), ("r", second))
+    )
+    model = pair.folder / "model.csv"
+    assert kolinear("orient", "pair", left, right, "--c", C_MM, "--out", model) == 0
+    assert "no place in front of both photographs: P3" in capsys.readouterr().out
+    written = model.read_text()
+    assert "P3," not in written and "P4," in written

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from pathlib import Path
 from typing import Annotated
 
@@ -52,6 +53,8 @@ def orient_pair(
     absolute` brings the model onto control points.
     """
     with loading():
+        import numpy as np
+
         from sfm.cli.photo_tables import OBJECT, read_pair, write_points
         from sfm.model.errors import SurveyFileError
         from sfm.report.orientations import pair_report
@@ -67,5 +70,6 @@ def orient_pair(
             orientation = orient_independent(pair.first, pair.second)
         model = intersect_pair(orientation, pair.first, pair.second)
     if out is not None:
-        write_points(out, OBJECT, pair.names, model)
+        placed = np.isfinite(model).all(axis=1)
+        write_points(out, OBJECT, list(compress(pair.names, placed)), model[placed])
     print(pair_report(orientation, pair.names, model, c_mm=pair.c_mm, alone=pair.alone).said(as_json))
