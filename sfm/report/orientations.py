@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +19,9 @@ from sfm.products.georeferencing.resampled import MapGrid
 from sfm.products.georeferencing.transformation import MODELS, PlaneTransformation, fit_plane
 from sfm.report.page import Column, Table, plain
 from sfm.textbook.pair import PairOrientation
-from sfm.textbook.photo_coordinates import FiducialTransformation
+from sfm.textbook.photo_coordinates import FiducialTransformation, orient_fiducials
 
+MIRROR = np.array([1.0, 1.0, -1.0])
 FEWEST = 4  # control points from which a similarity without one of them has redundancy
 
 
@@ -45,8 +47,20 @@ def fiducials_report(
     marks: Sequence[str],
     points: Sequence[str],
     photo_mm: FloatArray,
+    *,
+    measured: FloatArray,
+    calibrated: FloatArray,
 ) -> OrientationReport:
-    """Return the transformation by fiducial marks, its residuals, and the points that it transformed."""
+    """Return the transformation by fiducial marks, its residuals, and the points that it transformed.
+
+    Args:
+        transformation: by the fiducial marks.
+        marks: their names, n.
+        points: names of the points, k.
+        photo_mm: their photo coordinates, (k, 2).
+        measured: coordinates of the marks, unit of the comparator or scan, (n, 2).
+        calibrated: their photo coordinates, mm, (n, 2).
+    """
     t = transformation
     scales = " ".join(f"{scale:.9g}" for scale in t.scales)
     reversed_y = np.linalg.det(t.matrix) < 0
@@ -65,7 +79,13 @@ def fiducials_report(
         Column("vy", "vy_mm", "mm", ".4f"),
     )
     moved = [(name, *xy) for name, xy in zip(points, photo_mm.tolist(), strict=True)]
-    after = Table(_photo_columns(), moved).text.rstrip("\n") if moved else ""
+    after = [Table(_photo_columns(), moved).text.rstrip("\n")] if moved else []
+    reversed_axis = orient_fiducials(measured * (1, -1), calibrated, kind=t.kind).sigma0
+    if _fits_better(reversed_axis, t.sigma0, t.redundancy, calibrated):
+        after.append(
+            f"with one axis reversed sigma0 is {1000 * reversed_axis:.6g} um: "
+            "a scan counts rows downwards, --kind affine"
+        )
     values = {
         "kind": t.kind,
         "matrix": t.matrix,
@@ -75,7 +95,7 @@ def fiducials_report(
         "redundancy": t.redundancy,
         "transformed": [{"point": name, "x_mm": x, "y_mm": y} for name, x, y in moved],
     }
-    return OrientationReport(lines, Table(columns, rows), values, (after,) if after else ())
+    return OrientationReport(lines, Table(columns, rows), values, tuple(after))
 
 
 def corrections_report(
@@ -178,11 +198,12 @@ def absolute_report(
         *_sigma0(o.sigma0, "", o.redundancy),
     )
     without = np.full(len(common), np.nan)
-    if len(common) > FEWEST:
+    if len(common) >= FEWEST:
         for k in range(len(common)):
             rest = np.arange(len(common)) != k
             of_rest = None if weights is None else weights[rest]
-            without[k] = orient_absolute(model[rest], control[rest], weights=of_rest).sigma0
+            with suppress(GeometryError):  # the others may be on a line
+                without[k] = orient_absolute(model[rest], control[rest], weights=of_rest).sigma0
     columns = (
         Column("control", "point"),
         *(Column(f"v{axis}", f"v{axis}", "", ".6f") for axis in "XYZ"),
@@ -199,6 +220,12 @@ def absolute_report(
     after = [placed.text.rstrip("\n")]
     if absent:
         after.append(f"control that is not in the model: {listed(absent)}")
+    mirrored = orient_absolute(model * MIRROR, control, weights=weights).sigma0
+    if _fits_better(mirrored, o.sigma0, o.redundancy, control):
+        after.append(
+            f"the mirrored model fits with sigma0 {mirrored:.6g}: "
+            "two columns are exchanged, or one has the other sign"
+        )
     values = {
         "scale": s.scale,
         "rotation": s.rotation,
@@ -206,6 +233,7 @@ def absolute_report(
         "covariance": o.covariance,
         "sigma0": o.sigma0,
         "redundancy": o.redundancy,
+        "sigma0_mirrored": mirrored,
         "moved": [dict(record) for record in placed.records],
     }
     return OrientationReport(lines, Table(columns, rows), values, tuple(after))
@@ -247,7 +275,7 @@ def georeferencing_report(
         lines.append(f"each point predicted from the others, RMS of a coordinate, px: {listing}")
     best = min(known, key=lambda name: known[name], default=t.model)
     after = []
-    if t.model in known and 2 * t.redundancy * np.log(known[t.model] / known[best]) > MARGIN:
+    if t.model in known and _fits_better(known[best], known[t.model], t.redundancy, places):
         after.append(
             f"{best} predicts the points {known[t.model] / known[best]:.2g} times better: --model {best}"
         )
@@ -273,6 +301,12 @@ def _photo_columns() -> tuple[Column, ...]:
         Column("x", "x_mm", "mm", ".4f"),
         Column("y", "y_mm", "mm", ".4f"),
     )
+
+
+def _fits_better(sigma0: float, used: float, redundancy: int, coordinates: FloatArray) -> bool:
+    """Return whether another fit to coordinates is better than the used one, beyond chance and rounding."""
+    rounding = np.finfo(float).eps * coordinates.size * float(np.abs(coordinates).max())
+    return bool(2 * redundancy * np.log(max(used, rounding) / max(sigma0, rounding)) > MARGIN)
 
 
 def _sigma0(value: float, unit: str, redundancy: int) -> tuple[str, ...]:

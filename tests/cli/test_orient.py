@@ -271,3 +271,40 @@ def test_a_model_has_only_points_with_a_place(pair: Pair, capsys: pytest.Capture
     assert "no place in front of both photographs: P3" in capsys.readouterr().out
     written = model.read_text()
     assert "P3," not in written and "P4," in written
+
+
+def test_a_model_of_the_other_hand_is_said(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
+    """Control of which two columns are exchanged; without one point the rest seemed to fit."""
+    model = pair.write("model.csv", "point,X,Y,Z", pair.names, 0.3 * pair.X + 1.0)
+    noisy = pair.X[:6] + 0.05 * seed_of("control").standard_normal((6, 3))
+    control = pair.write("control.csv", "point,Y,X,Z", pair.names[:6], noisy)
+    assert kolinear("orient", "absolute", model, control) == 0
+    assert "the mirrored model fits with sigma0 0.0" in capsys.readouterr().out
+    right = pair.write("right.csv", "point,X,Y,Z", pair.names[:6], noisy)
+    flat = pair.write("flat.csv", "point,X,Y,Z", pair.names, pair.X * [1, 1, 0])
+    for tables in ((model, right), (model, model), (flat, flat)):
+        assert kolinear("orient", "absolute", *tables) == 0
+        assert "mirrored" not in capsys.readouterr().out
+
+
+def test_control_on_a_line_but_for_one_point(pair: Pair, capsys: pytest.CaptureFixture[str]) -> None:
+    """The orientation is determined, that without the one point is not."""
+    X = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 2, 0]])
+    control = pair.write("control.csv", "point,X,Y,Z", "ABCDE", X)
+    placed = said(capsys, "orient", "absolute", control, control)
+    assert [point["sigma0_without"] is None for point in placed["points"]] == [False] * 4 + [True]
+
+
+def test_rows_of_a_scan_need_the_affine_transformation(
+    pair: Pair, capsys: pytest.CaptureFixture[str]
+) -> None:
+    marks = pair.write(
+        "marks.csv", "mark,x,y,x_mm,y_mm", range(6), np.hstack([scanned(FIDUCIALS), FIDUCIALS])
+    )
+    assert kolinear("orient", "fiducials", marks, "--kind", "similarity") == 0
+    assert "with one axis reversed sigma0 is" in capsys.readouterr().out
+    assert kolinear("orient", "fiducials", marks) == 0
+    assert "--kind" not in capsys.readouterr().out
+    out = pair.folder / "mm.csv"
+    assert "expected --points" in refused(capsys, "orient", "fiducials", marks, "--out", out)
+    assert not out.exists()

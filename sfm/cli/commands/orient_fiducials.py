@@ -35,9 +35,12 @@ def orient_fiducials(
     """
     with loading():
         from sfm.cli.photo_tables import PHOTO, read_points, write_points
+        from sfm.model.errors import SurveyFileError
         from sfm.report.orientations import fiducials_report
         from sfm.textbook.photo_coordinates import orient_fiducials as orient
 
+    if out is not None and points is None:
+        raise SurveyFileError(f"--out {out}: expected --points, which are written there")
     with working_on(str(marks)):
         names, coordinates = read_points(marks, ("x", "y", *PHOTO), name="mark")
         transformation = orient(coordinates[:, :2], coordinates[:, 2:], kind=kind)
@@ -49,4 +52,12 @@ def orient_fiducials(
         photo = transformation.apply(measured)
     if out is not None:
         write_points(out, PHOTO, shown, photo)
-    print(fiducials_report(transformation, names, shown, photo).said(as_json))
+    report = fiducials_report(
+        transformation,
+        names,
+        shown,
+        photo,
+        measured=coordinates[:, :2],
+        calibrated=coordinates[:, 2:],
+    )
+    print(report.said(as_json))
