@@ -245,6 +245,8 @@ def georeferencing_report(
     xy: FloatArray,
     places: FloatArray,
     grid: MapGrid,
+    *,
+    is_turned: bool,
 ) -> OrientationReport:
     """Return how well a transformation fits, and how well each one that the points bear predicts them.
 
@@ -254,6 +256,7 @@ def georeferencing_report(
         xy: their coordinates in the plane, (n, 2).
         places: their image points, px, (n, 2).
         grid: squares of the new picture.
+        is_turned: whether EXIF data turn the photograph for display.
     """
     t = transformation
     size = t.pixel_size(xy)
@@ -279,6 +282,10 @@ def georeferencing_report(
         after.append(
             f"{best} predicts the points {known[t.model] / known[best]:.2g} times better: --model {best}"
         )
+    if t.is_mirrored(xy):
+        after.append("the photograph is drawn mirrored: two columns are exchanged, or one has the other sign")
+    if is_turned:
+        after.append("viewers turn this photograph by its EXIF data; x_px, y_px are of the pixels as stored")
     columns = (
         Column("control", "point"),
         Column("vx", "vx_px", "px", ".3f"),

@@ -214,7 +214,7 @@ def _base_frame(base: FloatArray) -> FloatArray:
 def _orient_without_start(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
     """Return base and rotation without start values, and whether another orientation fits as well.
 
-    Of a planar scene two orientations fit the rays. The right one has the points in front of both photographs;
+    Two orientations fit the rays of a plane. The right one has the points in front of both photographs;
     the other one may have them there too.
     """
     if len(first) < SPATIAL_POINTS:

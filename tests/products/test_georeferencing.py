@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.errors import GeometryError
@@ -191,6 +192,9 @@ def test_bad_input_gets_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
         ("the extent is empty", "map.png", "--extent", "5,5,1,1"),
         ("larger pixels or a smaller extent", "map.png", "--pixel", "1e-6"),
         ("the extent is empty", "map.png", "--pixel", "-1"),
+        ("the extent is empty or has no end", "map.png", "--pixel", "inf"),
+        ("the extent is empty or has no end", "map.png", "--extent", "0,0,inf,1"),
+        ("shows nothing of this extent", "map.png", "--extent", "0,0,10,10", "--pixel", "1"),
         ("exists already", "taken.png"),
         ("6 control points, polynomial3 needs at least 10", "map.png", "--model", "polynomial3"),
     ):
@@ -199,3 +203,55 @@ def test_bad_input_gets_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
         )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "control.csv", "taken.pgw"]
     assert taken.read_text() == "mine"
+
+
+def test_a_picture_may_be_wider_than_opencv_resamples(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is resampled in blocks; what a format cannot hold is refused."""
+    cv2.imwrite(str(tmp_path / "a.png"), photograph()[0])
+    table = write_control(tmp_path / "control.csv", *control(10, 0.0))
+    wide = ("--pixel", 0.0005, "--extent", "688999,9120009,689034,9120009.01")
+    assert kolinear("georeference", tmp_path / "a.png", table, "--out", tmp_path / "m.png", *wide) == 0
+    drawn = cv2.imread(str(tmp_path / "m.png"), cv2.IMREAD_UNCHANGED)
+    assert drawn.shape == (20, 70_000, 4)
+    dots = np.flatnonzero(drawn[10, :, 0] > 120)
+    places = [
+        688_999 + 0.0005 * part.mean() for part in np.split(dots, np.flatnonzero(np.diff(dots) > 9) + 1)
+    ]
+    assert places == pytest.approx([689_004.0, 689_010.0, 689_016.0], abs=0.05)
+    capsys.readouterr()
+    told = refused(capsys, "georeference", tmp_path / "a.png", table, "--out", tmp_path / "m.jpg", *wide)
+    assert "cannot be encoded as .jpg, 70000 x 20 pixels" in told and not list(tmp_path.glob("*.jgw"))
+
+
+def test_points_outside_and_mirrored_ones_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), photograph()[0])
+    xy, places = control(10, 0.1)
+    far = write_control(tmp_path / "far.csv", xy, np.add(places, (SIZE[0], 0)))
+    told = refused(capsys, "georeference", tmp_path / "a.png", far, "--out", tmp_path / "f.png")
+    assert "control points outside the photograph of 1200 x 900 pixels: 0, 1" in told
+    right = write_control(tmp_path / "control.csv", xy, places)
+    exchanged = write_control(tmp_path / "exchanged.csv", xy[:, ::-1], places)
+    for table, is_mirrored in ((right, False), (exchanged, True)):
+        out = tmp_path / f"{table.stem}.png"
+        assert kolinear("georeference", tmp_path / "a.png", table, "--out", out) == 0
+        assert ("is drawn mirrored" in capsys.readouterr().out) == is_mirrored
+
+
+def test_a_photograph_that_viewers_turn_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pixels count as stored; points measured in a viewer that turns are often outside."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    path = tmp_path / "a.jpg"
+    Image.fromarray(photograph()[0]).save(path, exif=exif)
+    xy = np.vstack([control(10, 0.0)[0], np.add(ORIGIN, (26.0, 5.0))])
+    places = pixels_of(xy)
+    table = write_control(tmp_path / "control.csv", xy, places)
+    assert kolinear("georeference", path, table, "--out", tmp_path / "m.png") == 0
+    assert "viewers turn this photograph by its EXIF data" in capsys.readouterr().out
+    turned = write_control(tmp_path / "turned.csv", xy, np.column_stack([899 - places[:, 1], places[:, 0]]))
+    told = refused(capsys, "georeference", path, turned, "--out", tmp_path / "n.png")
+    assert "which viewers turn by its EXIF data: " in told

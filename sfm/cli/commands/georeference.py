@@ -49,6 +49,9 @@ def georeference(
     """
     with loading():
         from sfm.cli.photo_tables import parse_extent, read_points
+        from sfm.model.display import listed
+        from sfm.model.errors import GeometryError
+        from sfm.photographs.exif import read_metadata
         from sfm.photographs.reading import read_for_display
         from sfm.products.georeferencing.resampled import (
             map_grid,
@@ -68,7 +71,20 @@ def georeference(
         transformation = fit_plane(xy, places, model=model)
         grid = map_grid(transformation, xy, pixel=pixel, extent=parse_extent(extent))
     with working_on(str(photograph)):
-        drawn, shown = resample_to_map(read_for_display(photograph), transformation, grid)
+        pixels, is_turned = read_for_display(photograph), read_metadata(photograph).orientation != 1
+        height, width = pixels.shape[:2]
+        outside = [
+            name
+            for name, (x, y) in zip(names, places.tolist(), strict=True)
+            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5)
+        ]
+        if outside:
+            raise GeometryError(
+                f"georeferencing: control points outside the photograph of {width} x {height} pixels"
+                f"{', which viewers turn by its EXIF data' if is_turned else ''}: {listed(outside)}"
+            )
+        drawn, shown = resample_to_map(pixels, transformation, grid)
     write_map(out, drawn, shown, grid, projection)
-    print(georeferencing_report(transformation, names, xy, places, grid).said(as_json=False))
+    report = georeferencing_report(transformation, names, xy, places, grid, is_turned=is_turned)
+    print(report.said(as_json=False))
     print(f"Picture: {out}")

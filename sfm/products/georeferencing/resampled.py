@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ from sfm.products.georeferencing.transformation import PlaneTransformation
 WORLD = {".png": ".pgw", ".tif": ".tfw", ".tiff": ".tfw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 OPAQUE = (".jpg", ".jpeg")  # formats without transparent pixels
 MOST_PIXELS = 400_000_000
-BLOCK_ROWS = 256  # rows that are resampled at a time
+BLOCK = 1024  # rows and columns that are resampled at a time
 BEYOND = 0.05  # of the extent of the control, by which the new picture reaches beyond it
 
 
@@ -39,9 +40,9 @@ class MapGrid:
     width: int
     height: int
 
-    def row_centres(self, rows: range) -> FloatArray:
-        """Return the middles of the pixels of some rows, object unit, (rows, width, 2)."""
-        X = self.x0 + (np.arange(self.width) + 0.5) * self.pixel
+    def centres(self, rows: range, columns: range) -> FloatArray:
+        """Return the middles of the pixels of some rows and columns, object unit, (rows, columns, 2)."""
+        X = self.x0 + (np.array(columns) + 0.5) * self.pixel
         Y = self.y1 - (np.array(rows) + 0.5) * self.pixel
         return np.stack(np.broadcast_arrays(X[None, :], Y[:, None]), axis=-1)
 
@@ -77,9 +78,9 @@ def map_grid(
     else:
         low, high = np.array(extent[:2]), np.array(extent[2:])
     side = float(np.median(transformation.pixel_size(control))) if pixel is None else pixel
-    if not ((high > low).all() and side > 0):
+    if not ((high > low).all() and side > 0 and np.isfinite([*low, *high, side]).all()):
         raise GeometryError(
-            "georeferencing: the extent is empty, expected X0 < X1, Y0 < Y1 and a pixel above 0"
+            "georeferencing: the extent is empty or has no end, expected X0 < X1, Y0 < Y1 and a pixel above 0"
         )
     width, height = (max(1, math.ceil(length / side - 1e-9)) for length in (high - low).tolist())
     if width * height > MOST_PIXELS:
@@ -103,26 +104,33 @@ def resample_to_map(
     Returns:
         Blue, green, red, (h, w, 3), black where the photograph shows nothing; and 255 where it shows
         something, (h, w).
+
+    Raises:
+        GeometryError: the photograph shows nothing of the squares.
     """
     height, width = photograph.shape[:2]
     drawn = np.zeros((grid.height, grid.width, 3), np.uint8)
     shown = np.zeros((grid.height, grid.width), np.uint8)
-    for first in range(0, grid.height, BLOCK_ROWS):
-        rows = range(first, min(first + BLOCK_ROWS, grid.height))
-        place = transformation.apply(grid.row_centres(rows))
+    for top_row, first_column in product(range(0, grid.height, BLOCK), range(0, grid.width, BLOCK)):
+        rows = range(top_row, min(top_row + BLOCK, grid.height))
+        columns = range(first_column, min(first_column + BLOCK, grid.width))
+        here = slice(rows.start, rows.stop), slice(columns.start, columns.stop)
+        place = transformation.apply(grid.centres(rows, columns))
         beyond = np.maximum(-0.5 - place, place + 0.5 - np.array([width, height])).max(axis=-1)  # px
         inside = np.asarray(beyond <= 0)  # NaN is not
         if not inside.any():
             continue
-        # remap takes no picture of more than 32,767 rows or columns: the part that these rows show
+        # remap takes no picture of more than 32,767 rows or columns: the part that this block shows
         left, top = (max(math.floor(v) - 4, 0) for v in place[inside].min(axis=0).tolist())
         right, bottom = (math.ceil(v) + 5 for v in place[inside].max(axis=0).tolist())
         part = photograph[top:bottom, left:right]
         x, y = (np.where(inside, place[..., k] - (left, top)[k], -9.0).astype(np.float32) for k in (0, 1))
-        drawn[rows.start : rows.stop] = np.where(
+        drawn[here] = np.where(
             inside[..., None], cv2.remap(part, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), 0
         )
-        shown[rows.start : rows.stop] = np.where(inside, 255, 0)
+        shown[here] = np.where(inside, 255, 0)
+    if not shown.any():
+        raise GeometryError("georeferencing: the photograph shows nothing of this extent")
     return drawn, shown
 
 
@@ -154,9 +162,14 @@ def write_map(path: Path, drawn: AnyArray, shown: AnyArray, grid: MapGrid, proje
     """
     ending = path.suffix.lower()
     pixels = drawn if ending in OPAQUE else np.dstack([drawn, shown])
-    done, encoded = cv2.imencode(ending, pixels)
+    try:
+        done, encoded = cv2.imencode(ending, pixels)
+    except cv2.error:  # as a JPEG of more than 65,535 columns
+        done = False
     if not done:
-        raise OutputError(f"{path}: the picture cannot be encoded as {ending}")
+        raise OutputError(
+            f"{path}: the picture cannot be encoded as {ending}, {grid.width} x {grid.height} pixels"
+        )
     texts = {WORLD[ending]: grid.world} | ({} if projection is None else {".prj": projection})
     for suffix, text in texts.items():
         with whole_file(path.with_suffix(suffix)) as file:

@@ -53,12 +53,20 @@ class PlaneTransformation:
 
     def pixel_size(self, xy: FloatArray) -> FloatArray:
         """Return the side of a pixel at places, by the area that it covers, object unit, (n,)."""
+        return np.asarray(1 / np.sqrt(np.abs(self._determinant(xy))))
+
+    def is_mirrored(self, xy: FloatArray) -> bool:
+        """Return whether the plane is seen from behind at places, (n, 2): rows count downwards, Y upwards."""
+        return bool(np.median(self._determinant(xy)) > 0)
+
+    def _determinant(self, xy: FloatArray) -> FloatArray:
+        """Return the determinant of the derivatives at places, px^2 per square of the object unit, (n,)."""
         step = 1e-4 * self.to_unit[1]
         at = np.asarray(xy, dtype=float)
         J = np.stack(
             [(self.apply(at + e) - self.apply(at - e)) / (2 * step) for e in step * np.eye(2)], axis=-1
         )
-        return np.asarray(1 / np.sqrt(np.abs(np.linalg.det(J))))
+        return np.asarray(np.linalg.det(J))
 
 
 @dataclass(frozen=True)
