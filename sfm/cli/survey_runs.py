@@ -214,7 +214,7 @@ def stated_or_drafted(
     frames: int | None = None,
     overwrite: bool = False,
     edit: Callable[[str], str] | None = None,
-) -> tuple[Path, Path | None, Path | None]:
+) -> tuple[Path, Path | None, Path | None, tuple[Path, ...]]:
     """Return the survey file of what a command is given: survey file, folder of photographs, or video.
 
     Args:
@@ -227,7 +227,8 @@ def stated_or_drafted(
         edit: see `drafted_beside`.
 
     Returns:
-        The survey file, the result folder, and the folder of the photographs of a draft, else None.
+        The survey file, the result folder, the folder of the photographs of a draft, else None, and the files
+        that were drafted now.
 
     Raises:
         KolinearError: a pitch, or another number of frames, is given though the survey file exists, or see
@@ -244,7 +245,7 @@ def stated_or_drafted(
     if place.is_file():
         refuse_pitch(pitch, place)
         refuse_frames(frames, frames_beside(place), place)
-    return place, out, None
+    return place, out, None, ()
 
 
 class Drafted(NamedTuple):
@@ -253,6 +254,7 @@ class Drafted(NamedTuple):
     file: Path  # survey file
     out: Path  # result folder
     photographs: Path  # their folder
+    written: tuple[Path, ...] = ()  # by this draft, the survey file first; none if it exists
 
 
 def drafted_beside(
@@ -313,8 +315,8 @@ def drafted_beside(
         print(f"Running {file}, which exists; remove it to draft a new one", file=sys.stderr)
         return Drafted(file, out, photographs)
     draft = draft_folder(photographs, file, pitch, name)
-    write_draft(draft if edit is None else replace(draft, text=edit(draft.text)), photographs, file)
-    return Drafted(file, out, photographs)
+    draft = draft if edit is None else replace(draft, text=edit(draft.text))
+    return Drafted(file, out, photographs, write_draft(draft, photographs, file))
 
 
 def _name_of_result(photographs: Path, within: Path) -> tuple[str, Path]:
@@ -450,13 +452,16 @@ def draft_folder(photographs: Path, file: Path, pitch: float | None = None, name
     return replace(draft, remarks=(*draft.remarks, *unknown))
 
 
-def write_draft(draft: Draft, photographs: Path, file: Path) -> None:
+def write_draft(draft: Draft, photographs: Path, file: Path) -> tuple[Path, ...]:
     """Write a drafted survey file, note the folder of its photographs, and report findings on stderr.
 
     Args:
         draft: the draft.
         photographs: folder of the photographs.
         file: the file to write.
+
+    Returns:
+        The survey file, and the picture of rings if there is one.
 
     Raises:
         OutputError: a name in the draft cannot be encoded.
@@ -486,3 +491,4 @@ def write_draft(draft: Draft, photographs: Path, file: Path) -> None:
     if draft.rings:
         print(f"Rings that were not read: {picture}", file=sys.stderr)
     print(f"Survey file: {file}", file=sys.stderr)
+    return (file, picture) if draft.rings else (file,)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,7 @@ class WatchedSurvey:
     until: float = 0.0  # uncertainty at which watching ends
     result: SurveyResult | None = None  # of the last run; None if there was none
     drafted: bool = False  # whether the survey file of this run was drafted just now
-    own_draft: Path | None = None  # survey file that was drafted here
+    own: dict[Path, bytes] = field(default_factory=dict)  # files drafted here, the survey file first
     is_dependable: bool = False  # the last result
 
     def so_far(self) -> Iterator[str]:
@@ -42,12 +43,26 @@ class WatchedSurvey:
     def begin(self) -> bool:
         """Prepare a run; return whether its survey file was drafted here before, and stays.
 
-        A draft whose result was not dependable is of photographs that did not suffice; it is removed.
+        A draft whose result was not dependable is of photographs that did not suffice; it is removed, unless
+        somebody changed it.
         """
-        if self.own_draft is not None and not self.is_dependable:
-            self.own_draft.unlink(missing_ok=True)
+        file = next(iter(self.own), None)
+        if file is not None and (not file.exists() or not (self.is_dependable or self._is_changed(file))):
+            for path in self.own:
+                if path.exists() and not self._is_changed(path):
+                    path.unlink()
+            self.own.clear()
         self.result, self.is_dependable, self.drafted = None, False, False
-        return self.own_draft is not None and self.own_draft.is_file()
+        return bool(self.own)
+
+    def note_drafted(self, written: tuple[Path, ...]) -> None:
+        """Note the files that were drafted for this run, the survey file first."""
+        self.drafted = bool(written)
+        if written:
+            self.own = {path: path.read_bytes() for path in written}
+
+    def _is_changed(self, path: Path) -> bool:
+        return path.read_bytes() != self.own[path]
 
 
 def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) -> None:
@@ -66,8 +81,10 @@ def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) ->
         raise KolinearError(f"{photographs}: --watch needs a folder of photographs")
     print(f"Watching {photographs}; Ctrl-C ends it", file=sys.stderr)
     code: str | int | None = FAILED  # until a round succeeds
+    waiting: tuple[str, ...] = ()  # photographs of rounds that gave no result
     try:
         for new in arrivals(photographs):
+            waiting = tuple(dict.fromkeys((*waiting, *new)))
             try:
                 run()
                 code = 0
@@ -77,8 +94,11 @@ def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) ->
                 continue
             except SystemExit as end:
                 code = end.code
+            new = tuple(name for name in waiting if (photographs / name).exists())
             for line in _brought(new, product):
                 print(line, flush=True)
+            if product.result is not None:
+                waiting = ()
             if product.is_dependable and product.uncertainty() <= product.until:
                 return
     except KeyboardInterrupt:
@@ -105,9 +125,10 @@ def _photographs_in(folder: Path) -> State:
 
     state = State()
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in SUFFIXES and path.is_file():
-            stat = path.stat()
-            state[path] = stat.st_size, stat.st_mtime_ns
+        with suppress(FileNotFoundError):  # it may be removed meanwhile
+            if path.suffix.lower() in SUFFIXES and path.is_file():
+                stat = path.stat()
+                state[path] = stat.st_size, stat.st_mtime_ns
     return state
 
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from sfm.cli import watching
-from sfm.cli.watching import arrivals
+from sfm.cli.watching import WatchedSurvey, arrivals
+from sfm.model.errors import KolinearError
 from tests.commands import kolinear, refused
 from tests.plates import BOARD, plate_pictures
 from tests.surveys import pictures
 from tests.synthetic import seed_of
 
-Step = Callable[[], None]
+Step = Callable[[], object]
 
 
 @pytest.fixture
@@ -144,6 +145,69 @@ def test_a_survey_file_that_exists_is_never_removed(
     events += [*adds(Path("photos"), boards, 0, 1), *adds(Path("photos"), boards, 2, 3)]
     assert kolinear("calibrate", "photos", "--watch") != 0
     assert own.read_text("utf-8") == "[survey]\nname = 'mine'\n"
+
+
+def test_a_draft_that_somebody_changed_is_never_removed(
+    tmp_path: Path,
+    boards: Path,
+    events: list[Step],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two photographs give no camera; the draft that is changed then is run with the next ones."""
+    monkeypatch.chdir(tmp_path)
+    Path("photos").mkdir()
+    draft = Path("out/photos.toml")
+
+    def change() -> None:
+        draft.write_text(draft.read_text("utf-8") + "# mine\n", "utf-8")
+
+    events += [*adds(Path("photos"), boards, 0, 1), change, *adds(Path("photos"), boards, 2, 5)]
+    kolinear("calibrate", "photos", "--watch", "--pitch", 12)
+    assert draft.read_text("utf-8").endswith("# mine\n")
+    shown = capsys.readouterr()
+    assert shown.err.count("Survey file: ") == 1 and "5.png: used, " in shown.out
+
+
+def test_what_is_drafted_here_is_removed_with_its_picture(tmp_path: Path) -> None:
+    """A draft is replaced whole, but for what was changed; that of a dependable result stays."""
+    file, picture, rounds = tmp_path / "a.toml", tmp_path / "a-rings.png", WatchedSurvey()
+
+    def draft() -> None:
+        for path in (file, picture):
+            path.write_bytes(b"drafted")
+        rounds.note_drafted((file, picture))
+
+    draft()
+    assert not rounds.begin() and not file.exists() and not picture.exists()
+    draft()
+    rounds.is_dependable = True
+    assert rounds.begin() and file.exists() and picture.exists()
+    file.unlink()  # by the user, to draft it anew
+    assert not rounds.begin() and not picture.exists()
+    draft()
+    file.write_bytes(b"mine")
+    assert rounds.begin() and file.read_bytes() == b"mine"
+
+
+def test_photographs_of_rounds_without_a_result_are_reported_later(
+    tmp_path: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also one that was removed meanwhile is not called unused."""
+    rounds, failed = WatchedSurvey(), [KolinearError("too few")]
+
+    def run() -> None:
+        if failed:
+            raise failed.pop()
+
+    events += [
+        lambda: [(tmp_path / f"{name}.png").touch() for name in "ab"],
+        nothing,
+        lambda: [(tmp_path / "a.png").unlink(), (tmp_path / "c.png").touch()],
+        nothing,
+    ]
+    watching.watch(tmp_path, run, rounds)
+    assert "2 new photographs: b.png, c.png" in capsys.readouterr().out
 
 
 def test_a_photograph_that_is_still_written_is_waited_for(tmp_path: Path, events: list[Step]) -> None:

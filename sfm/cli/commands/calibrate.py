@@ -91,16 +91,14 @@ def calibrate(
     product = _Product(distances=distances, until=until, is_watched=watched)
 
     def edit(text: str) -> str:
-        product.drafted = True
         return _for_calibration(text, model)
 
     def run_once() -> None:
         stays = product.begin()
-        survey_file, folder, images = stated_or_drafted(
+        survey_file, folder, images, written = stated_or_drafted(
             photographs, out, None if stays else pitch, overwrite=overwrite, edit=edit
         )
-        if product.drafted:
-            product.own_draft = survey_file
+        product.note_drafted(written)
         _refuse_model(survey_file, model)
         options = RunOptions(
             images=images,
@@ -164,6 +162,7 @@ class _Product(WatchedSurvey):
 
         with whole_file(survey_file, replaces=True) as part:
             part.write_text(added, encoding="utf-8")
+        self.own[survey_file] = survey_file.read_bytes()
         print(f"{survey_file}: {shape.text} {row} was added.", file=sys.stderr)
         return True
 

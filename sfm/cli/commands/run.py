@@ -80,22 +80,16 @@ def run(
 
     rounds = SurveySoFar(is_watched=watched, until=until)
 
-    def edit(text: str) -> str:
-        rounds.drafted = True
-        return text
-
     def run_once() -> None:
         stays = rounds.begin()
-        file, folder, photographs = stated_or_drafted(
+        file, folder, photographs, written = stated_or_drafted(
             survey_file,
             out,
             None if stays else pitch,
             frames=None if stays else frames,
             overwrite=overwrite,
-            edit=edit,
         )
-        if rounds.drafted:
-            rounds.own_draft = file
+        rounds.note_drafted(written)
         options = RunOptions(
             images=photographs or images,
             out=folder,
