@@ -6,6 +6,7 @@ The cameras come from EXIF data, and the targets from a trial on a few photograp
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 from collections import Counter
@@ -107,7 +108,7 @@ def draft_survey(
         SurveyFileError: the folder does not exist or has no photographs.
         GeometryError: fewer than two readable photographs.
     """
-    metadata, unreadable = metadata_of_folder(folder)
+    metadata, unreadable = metadata_of_folder(folder, stated)
     masks, masked = find_masks(folder, tuple(metadata))
     unused = "" if masked == MASKS else OUTSIDE
     try:
@@ -181,10 +182,22 @@ def names_of_folder(folder: Path) -> Iterator[str]:
         yield " ".join(parts[-k:])
 
 
-def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
-    """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason."""
+def metadata_of_folder(
+    folder: Path, stated: str | None = None
+) -> tuple[dict[str, Metadata], tuple[tuple[str, str], ...]]:
+    """Return size and EXIF data of the photographs of a folder, and the unreadable ones with the reason.
+
+    Args:
+        folder: contains the photographs.
+        stated: the folder as the survey file states it. Below the folder of that file, links may lead to all
+            files that are there too, as when it is run.
+    """
     if not folder.is_dir():
         raise SurveyFileError(f"{folder}: {conversion_of(folder) or why_no_folder(folder)}")
+    levels = () if stated is None or Path(stated).is_absolute() else Path(stated).parts
+    home = folder.resolve()
+    if levels and os.pardir not in levels:
+        home = Path(os.path.abspath(folder)).parents[len(levels) - 1].resolve()
     files = _files_of(folder)
     files = [path for path in files if not path.is_relative_to(folder / MASKS)] or files
     if all(conversion_of(path) for path in files):
@@ -196,7 +209,7 @@ def metadata_of_folder(folder: Path) -> tuple[dict[str, Metadata], tuple[tuple[s
         if not is_plain(name):
             unreadable.append((as_plain(name), "its name has control or invisible characters"))
             continue
-        if not (path.resolve().is_relative_to(folder.resolve()) or is_home_file(path)):
+        if not (path.resolve().is_relative_to(home) or is_home_file(path)):
             unreadable.append((name, "a link out of the folder, and not to a file in your home folder"))
             continue
         other = developed.get(path.with_suffix(""))
