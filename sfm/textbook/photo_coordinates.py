@@ -218,7 +218,7 @@ def refraction_coefficient(flying_height_km: float, terrain_height_km: float) ->
         GeometryError: the photograph is not above the terrain.
     """
     H, h = flying_height_km, terrain_height_km
-    if h >= H or H <= 0:
+    if not (max(h, 0.0) < H < np.inf):
         raise GeometryError(f"refraction: flying height {H:g} km, it must be above the terrain at {h:g} km")
     return (2410 * H / (H**2 - 6 * H + 250) - 2410 * h**2 / ((h**2 - 6 * h + 250) * H)) * 1e-6
 

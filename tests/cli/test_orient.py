@@ -170,6 +170,7 @@ def test_bad_input_gets_one_line(pair: Pair, capsys: pytest.CaptureFixture[str])
         ("2 control points of the model, at least 3 are needed", "absolute", few, few),
         ("expected ascending radii from 0", "correct", left, "--c", C_MM, "--radial", table),
         ("--curvature needs --flying-height", "correct", left, "--c", C_MM, "--curvature"),
+        ("flying height nan km", "correct", left, "--c", C_MM, "--flying-height", "nan"),
         ("unknown parameter", "correct", left, "--camera", few),
         (
             "kind 'projective'",

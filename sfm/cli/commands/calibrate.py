@@ -59,6 +59,7 @@ def calibrate(
         typer.Option(
             "--until",
             metavar="PX",
+            min=0.0,
             help="Uncertainty of the worst corner, far points, 1 sigma, at which --watch ends.",
         ),
     ] = 0.0,

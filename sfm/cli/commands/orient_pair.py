@@ -71,5 +71,5 @@ def orient_pair(
         model = intersect_pair(orientation, pair.first, pair.second)
     if out is not None:
         placed = np.isfinite(model).all(axis=1)
-        write_points(out, OBJECT, list(compress(pair.names, placed)), model[placed])
+        write_points(out, OBJECT, list(compress(pair.names, placed.tolist())), model[placed])
     print(pair_report(orientation, pair.names, model, c_mm=pair.c_mm, alone=pair.alone).said(as_json))

@@ -47,6 +47,7 @@ def run(
         typer.Option(
             "--until",
             metavar="SIGMA",
+            min=0.0,
             help="Standard deviation of the worst point, unit of the survey, at which --watch ends.",
         ),
     ] = 0.0,

@@ -237,7 +237,7 @@ def find_damage(h: FloatArray, weight: FloatArray, sound: BoolArray, skirt: Floa
         places = (hit & ~np.roll(hit, 1, axis=1) & ~np.roll(hit, 2, axis=1)).sum(axis=1)
         hit[places > MAX_PLACES] = False
     damaged = hit.copy()
-    for i in range(1, min(RAYS // 2, int(skirt[hit.any(axis=1)].max(initial=0)) + 1)):
+    for i in range(1, int(min(RAYS // 2, skirt[hit.any(axis=1)].max(initial=0) + 1))):
         damaged |= (np.roll(hit, i, axis=1) | np.roll(hit, -i, axis=1)) & (i <= skirt[:, None])
     return damaged
 
