@@ -74,11 +74,15 @@ def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) ->
         product: what is made of it.
 
     Raises:
-        KolinearError: there is no such folder.
+        KolinearError: there is no such folder, or it has videos in place of photographs.
         SystemExit: with the exit code of the last round, if it is stopped before.
     """
     if not photographs.is_dir():
         raise KolinearError(f"{photographs}: --watch needs a folder of photographs")
+    from sfm.products.drafting.frames_folder import videos_of
+
+    if videos_of(photographs):
+        raise KolinearError(f"{photographs}: --watch needs a folder of photographs, this one has videos")
     print(f"Watching {photographs}; Ctrl-C ends it", file=sys.stderr)
     code: str | int | None = FAILED  # until a round succeeds
     waiting: tuple[str, ...] = ()  # photographs of rounds that gave no result

@@ -221,6 +221,8 @@ def test_a_photograph_that_is_still_written_is_waited_for(tmp_path: Path, events
 
 def test_bad_input_gets_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "--watch needs a folder" in refused(capsys, "run", tmp_path / "a.toml", "--watch")
+    (tmp_path / "a.mp4").touch()
+    assert "this one has videos" in refused(capsys, "run", tmp_path, "--watch")
     assert "--until 3 is for --watch" in refused(capsys, "run", tmp_path, "--until", 3)
     assert "--until" in refused(capsys, "run", tmp_path, "--watch", "--until", -1)
     assert "--until 3 is for --watch" in refused(capsys, "calibrate", tmp_path, "--until", 3)
