@@ -135,6 +135,24 @@ def test_a_survey_says_which_photographs_are_next(
     assert " from where " in shown and "azimuth" in shown
 
 
+def test_a_camera_of_targets_without_scale_has_no_mm(
+    tmp_path: Path,
+    events: list[Step],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source = tmp_path / "camera"
+    for folder in (source, Path("photos")):
+        folder.mkdir()
+    for k, picture in enumerate(pictures()):
+        cv2.imwrite(str(source / f"{k}.png"), picture)
+    events += adds(Path("photos"), source, 0, len(pictures()) - 1)
+    assert kolinear("calibrate", "photos", "--watch") == 0
+    following = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  next: ")]
+    assert len(following) == 1 and "network units; worst corner then" in following[0]
+
+
 def test_a_survey_file_that_exists_is_never_removed(
     tmp_path: Path, boards: Path, events: list[Step], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -215,5 +215,5 @@ class _Product(WatchedSurvey):
             wanted = f", wanted {significant(self.until)} px" if self.until else ""
             yield f"{camera.name}: worst corner {significant(camera.next.before)} px{wanted}"
             for pose, after in zip(camera.next.poses[:1], camera.next.after, strict=False):
-                words = pose_words(pose, self.result.unit)
+                words = pose_words(pose, self.result.length_unit)
                 yield f"  next: {words}; worst corner then {significant(after)} px"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import compress
 from pathlib import Path
 from typing import Annotated
 
@@ -70,6 +69,6 @@ def orient_pair(
             orientation = orient_independent(pair.first, pair.second)
         model = intersect_pair(orientation, pair.first, pair.second)
     if out is not None:
-        placed = np.isfinite(model).all(axis=1)
-        write_points(out, OBJECT, list(compress(pair.names, placed.tolist())), model[placed])
+        placed = np.flatnonzero(np.isfinite(model).all(axis=1))
+        write_points(out, OBJECT, [pair.names[k] for k in placed.tolist()], model[placed])
     print(pair_report(orientation, pair.names, model, c_mm=pair.c_mm, alone=pair.alone).said(as_json))
