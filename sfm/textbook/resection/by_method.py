@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.conventions import FloatArray, rotation_from_angles
+from sfm.model.conventions import FloatArray, IntArray, rotation_from_angles
 from sfm.model.display import listed
 from sfm.model.distributions import MARGIN
 from sfm.model.errors import GeometryError
@@ -20,11 +20,13 @@ from sfm.orientation.resection.least_squares import (
     choose_by_line,
     resect_least_squares,
     rotation_from_position,
+    solution_of,
+    thickness,
 )
 from sfm.orientation.resection.ransac import resect_robust
 from sfm.textbook.resection.church import resect_church
 from sfm.textbook.resection.dlt import DirectLinearTransformation, resect_dlt
-from sfm.textbook.resection.p4p import MIN_POINTS, coplanar_points, resect_p4p
+from sfm.textbook.resection.p4p import MAX_COPLANAR_THICKNESS, MIN_POINTS, coplanar_sets, resect_p4p
 from sfm.textbook.resection.unknown_noise import resect_unknown_noise
 from sfm.textbook.resection.zeng_wang import resect_rampal, resect_zeng_wang
 
@@ -130,14 +132,27 @@ def _closed_form(
 
 
 def _p4p(task: Task) -> ResectionResult:
-    """Return the result of the points in one plane; if others are given, those in one are named."""
-    rows = coplanar_points(task.points)
-    if len(rows) < MIN_POINTS:
-        rows = np.arange(len(task.points))  # refused with the reason
-    solutions = resect_p4p(task.tangents[rows], task.points[rows])
-    named = listed(task.names[k] for k in rows.tolist())
-    warning = "" if len(rows) == len(task.points) else f"only {named} were used, which are in one plane"
-    return ResectionResult("p4p", len(rows), solutions, warning=warning)
+    """Return the result of all points, or of those in the plane by which all are imaged best."""
+    checked_points("p4p", task.tangents, task.points, needed=MIN_POINTS)
+    if thickness(task.points) <= MAX_COPLANAR_THICKNESS:
+        return ResectionResult("p4p", len(task.points), resect_p4p(task.tangents, task.points))
+    best: tuple[ResectionSolution, IntArray] | None = None
+    for rows in coplanar_sets(task.points):
+        try:
+            (of_plane,) = resect_p4p(task.tangents[rows], task.points[rows])
+        except GeometryError:  # three of them are on a line
+            continue
+        of_all = solution_of(of_plane.position, of_plane.rotation, task.tangents, task.points)
+        if best is None or np.nan_to_num(of_all.rms, nan=np.inf) < np.nan_to_num(best[0].rms, nan=np.inf):
+            best = of_all, rows
+    if best is None:
+        raise GeometryError(
+            "p4p: no four of the points are in one plane, use robust, or dlt from six points on"
+        )
+    solution, rows = best
+    named = listed((task.names[k] for k in rows.tolist()), most=len(rows))
+    warning = f"only {named} were used, which are in one plane"
+    return ResectionResult("p4p", len(rows), (solution,), warning=warning)
 
 
 def _church(task: Task) -> ResectionResult:

@@ -5,7 +5,9 @@ A collineation maps the object plane to the image. Its two vanishing lines give 
 
 from __future__ import annotations
 
-from itertools import combinations, islice
+import math
+from collections.abc import Iterable, Iterator
+from itertools import combinations
 
 import numpy as np
 
@@ -25,7 +27,9 @@ MIN_POINTS = 4
 MAX_COPLANAR_THICKNESS = 0.01
 # |(a1, a2)| over |a3| of the vanishing line below which image and object plane are parallel.
 MAX_PARALLEL_RATIO = 1e-12
-MOST_PLANES = 20_000  # all planes of 50 points
+# The same for some of the points: what belongs to a plane is not known from that, but from their image.
+MAX_THICKNESS_OF_SOME = 0.002
+MOST_PLANES = 2000  # of points in space that are tried, all of 23 points
 
 
 @checked_arguments(tangents="k 2", points="n 3")
@@ -68,26 +72,31 @@ def resect_p4p(tangents: FloatArray, points: FloatArray) -> tuple[ResectionSolut
     return (solution_of(position, R, uv, xyz),)
 
 
-def coplanar_points(points: FloatArray) -> IntArray:
-    """Return the indices of the most points that are in one plane, (k,); of equally many, the thinnest.
+def coplanar_sets(points: FloatArray, *, seed: int = 0) -> Iterator[IntArray]:
+    """Yield the indices of four or more points that are in one plane, (k,), each set once.
 
-    Planes are those through three points each, of which at most MOST_PLANES are tried.
+    Planes are those through three points each; of many points, MOST_PLANES of them at random are tried.
 
     Args:
         points: object points, shape (n, 3), object unit.
+        seed: of the random choice.
     """
-    xyz = np.asarray(points, dtype=float)
-    best, rank = np.zeros(0, dtype=np.int64), (0, 0.0)
-    for chosen in islice(combinations(range(len(xyz)), 3), MOST_PLANES):
+    xyz, found = np.asarray(points, dtype=float), set[tuple[int, ...]]()
+    for chosen in _triples(len(xyz), seed):
         origin, p, q = xyz[list(chosen)]
         normal = np.cross(p - origin, q - origin)
-        off = np.abs((xyz - origin) @ normal)
         extent = np.linalg.norm(xyz - origin, axis=1).max() * np.linalg.norm(normal)
-        near = np.flatnonzero(off <= MAX_COPLANAR_THICKNESS / 2 * extent)
-        flatness = thickness(xyz[near])
-        if extent > 0 and flatness <= MAX_COPLANAR_THICKNESS and (len(near), -flatness) > rank:
-            best, rank = near, (len(near), -flatness)
-    return best
+        near = np.flatnonzero(np.abs((xyz - origin) @ normal) <= MAX_THICKNESS_OF_SOME * extent)
+        if extent > 0 and len(near) >= MIN_POINTS and tuple(near) not in found:
+            found.add(tuple(near))
+            yield near
+
+
+def _triples(n: int, seed: int) -> Iterable[tuple[int, ...]]:
+    if math.comb(n, 3) <= MOST_PLANES:
+        return combinations(range(n), 3)
+    rng = np.random.default_rng(seed)
+    return [tuple(rng.choice(n, 3, replace=False)) for _ in range(MOST_PLANES)]
 
 
 def _collineation(Q: FloatArray, uv: FloatArray) -> FloatArray:
