@@ -111,6 +111,12 @@ def _determined(content: Content) -> FloatArray:
     return np.flatnonzero(content.result.estimate.determined)[:, None].astype(float)
 
 
+@_kind("image points", "image points")
+def _image_points(content: Content) -> FloatArray:
+    """Return the photograph of each, (k, 1); some formats number the points anew."""
+    return np.sort(content.result.network.image_points.image)[:, None].astype(float)
+
+
 @_kind("control", "control points")
 def _control(content: Content) -> FloatArray:
     return _points_of(content.result.network.control.complete)

@@ -21,6 +21,7 @@ import numpy as np
 from adapters.colmap.camera_models import SIDE_FILE, read_model, write_model
 from adapters.colmap.database import read_database, write_database
 from adapters.colmap.reconstruction import COLMAP_NAMES
+from adapters.formats.alicevision import read_alicevision, write_alicevision
 from adapters.formats.bal import read_bal, write_bal
 from adapters.formats.bundle_text import (
     INTERIOR,
@@ -30,9 +31,17 @@ from adapters.formats.bundle_text import (
     write_bundle_csharp,
     write_bundle_matlab_folder,
 )
+from adapters.formats.bundler import PLACES as BUNDLER_PLACES
+from adapters.formats.bundler import read_bundler, write_bundler
 from adapters.formats.cameras.rig_folder import write_rig_files
 from adapters.formats.content import ALL, Content, losses, refuse_not_finite, select_placed
 from adapters.formats.metashape import read_metashape, write_metashape
+from adapters.formats.nerfstudio import read_nerfstudio_poses, write_nerfstudio_poses
+from adapters.formats.nvm import HEADER as NVM_HEADER
+from adapters.formats.nvm import read_nvm, write_nvm
+from adapters.formats.openmvg import read_openmvg, write_openmvg
+from adapters.formats.opensfm import PLACES as OPENSFM_PLACES
+from adapters.formats.opensfm import read_opensfm, write_opensfm
 from adapters.formats.photomodeler import FREE as PHOTOMODELER_FREE
 from adapters.formats.photomodeler import MODELS as PHOTOMODELER_MODELS
 from adapters.formats.photomodeler import read_export, write_export
@@ -42,6 +51,7 @@ from adapters.formats.result_tables import write_content as write_content_tables
 from adapters.formats.sba_text import read_sba, write_sba_folder
 from adapters.formats.survey_file import write_survey_file
 from adapters.reading.text_lines import Lines
+from adapters.reading.trees import head_of
 from sfm.files.csv_tables import write_ply
 from sfm.files.open_folders import refuse_links, refuse_links_out
 from sfm.files.whole_files import whole_file, whole_folder
@@ -88,6 +98,8 @@ class FileFormat:
     write_all: Callable[[Path, Content], None] | None = None  # likewise for `write`
     control: bool = False  # whether `read_all` accepts a control file as keyword
     adjusts: bool = False  # whether it is the input of an adjustment with the standard deviations in it
+    recognises: Callable[[str], bool] = lambda head: False  # whether a file is of it, by its beginning
+    marks: tuple[str, ...] = ()  # files in a folder of it, of which one is enough
 
     def held(self, content: Content) -> frozenset[str]:
         """Return the kinds of content that are unchanged when a survey is read again."""
@@ -127,8 +139,9 @@ def _write_ply(path: Path, content: Content) -> None:
 _COLMAP = ("full_opencv", *(name for name in COLMAP_NAMES if name != "full_opencv"))
 _OPENCV_DISTORTION = ("k1", "k2", "p1", "p2")
 _BROWN_DISTORTION = MODELS["brown"].names[3:]
+_FRACTION = ("k4", "k5", "k6")  # of full_opencv, in its denominator
 NUMBERS = (False, False)
-_SOLVED = frozenset({"exterior orientations", "object points", "uncoded"})
+_SOLVED = frozenset({"exterior orientations", "object points", "image points", "uncoded"})
 _NAMED = _SOLVED | {"point names", "image names"}
 _SIDE = _NAMED | {"free", "rigs", "moments"}  # stored beside a COLMAP model
 FORMATS = (
@@ -155,7 +168,7 @@ FORMATS = (
         models=_COLMAP,
         read=_read_database,
         write=lambda path, network, estimate: write_database(path, network, estimate.cameras),
-        keeps=frozenset({"image names", "uncoded"}),
+        keeps=frozenset({"image points", "image names", "uncoded"}),
         names=(False, True),
     ),
     FileFormat(
@@ -173,7 +186,7 @@ FORMATS = (
         read=read_metashape,
         write=write_metashape,
         keeps=_NAMED | {"control", "unplaced"},
-        lacks=("k4", "k5", "k6"),
+        lacks=_FRACTION,
     ),
     FileFormat(
         name="photomodeler",
@@ -229,6 +242,76 @@ FORMATS = (
         adjusts=True,
     ),
     FileFormat(
+        name="opensfm",
+        models=("full_opencv", "opencv", "opencv_fisheye", "radial", "radial_fisheye"),
+        read_all=read_opensfm,
+        write_all=write_opensfm,
+        keeps=_SOLVED | {"image names"},
+        folder=True,
+        placed=True,
+        lacks=_FRACTION,
+        names=(False, True),
+        recognises=lambda head: head.startswith("[") and '"projection_type"' in head,
+        marks=OPENSFM_PLACES,
+    ),
+    FileFormat(
+        name="nerfstudio",
+        models=("brown_forward_affine", "full_opencv", "opencv", "opencv_fisheye"),
+        read_all=read_nerfstudio_poses,
+        write_all=write_nerfstudio_poses,
+        keeps=frozenset({"exterior orientations", "image names"}),
+        placed=True,
+        lacks=("b2", *_FRACTION),
+        names=(False, True),
+        recognises=lambda head: head.startswith("{") and '"transform_matrix"' in head,
+    ),
+    FileFormat(
+        name="bundler",
+        models=("radial",),
+        read_all=read_bundler,
+        write_all=write_bundler,
+        keeps=_SOLVED | {"image names"},
+        folder=True,
+        placed=True,
+        names=(False, True),
+        recognises=lambda head: head.startswith("# Bundle file"),
+        marks=BUNDLER_PLACES,
+    ),
+    FileFormat(
+        name="nvm",
+        models=("brown",),
+        read_all=read_nvm,
+        write_all=write_nvm,
+        keeps=_SOLVED | {"image names"},
+        placed=True,
+        lacks=("K2", "K3", "P1", "P2", "b1", "b2"),
+        names=(False, True),
+        recognises=lambda head: head.startswith(NVM_HEADER),
+    ),
+    FileFormat(
+        name="alicevision",
+        models=("full_opencv", "opencv", "opencv_fisheye"),
+        read_all=read_alicevision,
+        write_all=write_alicevision,
+        keeps=_SOLVED | {"image names"},
+        placed=True,
+        lacks=_FRACTION,
+        names=(False, True),
+        recognises=lambda head: head.startswith("{") and '"viewId"' in head,
+    ),
+    FileFormat(
+        name="openmvg",
+        models=("brown_forward", "opencv_fisheye"),
+        read_all=read_openmvg,
+        write_all=write_openmvg,
+        keeps=_SOLVED | {"image names"},
+        placed=True,
+        lacks=("K4", "b1", "b2"),
+        one_focal=True,
+        names=(False, True),
+        recognises=lambda head: head.startswith("{") and '"sfm_data_version"' in head,
+    ),
+    FileFormat(
         name="rig",
         models=("opencv",),
         write_all=write_rig_files,
@@ -243,7 +326,13 @@ FORMATS = (
         placed=True,
     ),
 )
-ENDINGS = {".xml": "metashape", ".ply": "ply", ".db": "colmap-database"}
+ENDINGS = {
+    ".xml": "metashape",
+    ".ply": "ply",
+    ".db": "colmap-database",
+    ".nvm": "nvm",
+    ".sfm": "alicevision",
+}
 
 
 def format_named(name: str) -> FileFormat:
@@ -291,10 +380,16 @@ def format_of(path: Path) -> FileFormat:
             return format_named("bundle-matlab")
         if any(path.glob("*cams*.txt")):
             return format_named("sba")
+        for form in FORMATS:
+            if any((path / mark).is_file() for mark in form.marks):
+                return form
         raise SurveyFileError(
             f"{path}: neither a COLMAP model, nor tables of a result, nor files of a bundle program are in "
             "this folder"
         )
+    recognised = recognised_format(path)
+    if recognised is not None:
+        return recognised
     if path.suffix.lower() in ENDINGS:
         return format_named(ENDINGS[path.suffix.lower()])
     text = Lines.of(path)
@@ -310,6 +405,16 @@ def format_of(path: Path) -> FileFormat:
     raise SurveyFileError(
         f"{path}, line 1: the format is not known, name it with --from (compare: --from-a, --from-b)"
     )
+
+
+def recognised_format(path: Path) -> FileFormat | None:
+    """Return the format of a file whose beginning names it; None of any other.
+
+    Raises:
+        SurveyFileError: the file cannot be read.
+    """
+    head = head_of(path).lstrip("\ufeff \t\r\n")
+    return next((form for form in FORMATS if form.recognises(head)), None)
 
 
 def read_any(path: Path, name: str | None = None) -> tuple[Network, Estimate]:
@@ -398,17 +503,27 @@ def write_content(path: Path, name: str, content: Content) -> None:
     refuse_not_finite(path, content)
     _refuse_cameras(form, estimate.cameras)
     if form.placed:
-        points_only = not form.models
-        if not (estimate.determined.any() and (points_only or estimate.oriented.any())):
-            raise OutputError(
-                f"{path}: format {name} needs coordinates in the object, but no "
-                f"{'point' if points_only else 'photograph or no point'} has coordinates"
-            )
+        _refuse_unplaced(path, form, content)
     with whole_folder(path) if form.folder else nullcontext(path) as target:
         if form.write_all is not None:
             form.write_all(target, content)
         elif form.write is not None:
             form.write(target, content.result.network, estimate)
+
+
+def _refuse_unplaced(path: Path, form: FileFormat, content: Content) -> None:
+    """Raise OutputError if nothing that was measured has coordinates; any part of a model may be missing."""
+    network, estimate = content.result.network, content.result.estimate
+    if not form.models and not estimate.determined.any():
+        raise OutputError(
+            f"{path}: format {form.name} needs coordinates in the object, but no point has coordinates"
+        )
+    measured = len(network.images) + len(network.points)
+    if measured and not (estimate.oriented.any() or estimate.determined.any()):
+        raise OutputError(
+            f"{path}: format {form.name} needs coordinates in the object, but no photograph and no point has "
+            "coordinates"
+        )
 
 
 def losses_in_words(name: str, content: Content, gone: frozenset[str] = frozenset()) -> tuple[str, ...]:
@@ -440,9 +555,8 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
                 f"camera {camera.name}: format {form.name} has models {', '.join(form.models)}, "
                 f"not {camera.model}"
             )
-        left = [
-            name for name in (*form.lacks, *form.straight) if name in camera.names and camera.value(name) != 0
-        ]
+        held = () if camera.wide_angle else (*form.lacks, *form.straight)  # they are of other models
+        left = [name for name in held if name in camera.names and camera.value(name) != 0]
         if form.one_focal and np.ptp(camera.parameters[camera.plays(Role.FOCAL)]):
             left.append("fx other than fy")
         if left:

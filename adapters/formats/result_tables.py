@@ -68,7 +68,8 @@ def read_result(folder: Path) -> Solution:
     names = [camera.name for camera in cameras]
     table = tables.IMAGES.read(folder)
     images, camera = table.keys("image"), table.places("camera", names, "cameras.csv")
-    rotation = np.array([rotation_from_angles(*np.deg2rad(row)) for row in table.values[:, 3:6]])
+    angles = np.deg2rad(table.values[:, 3:6])
+    rotation = np.array([rotation_from_angles(*row) for row in angles]).reshape(-1, 3, 3)
     position, position_covariance = table.values[:, :3].copy(), _covariance(table, table.values[:, 6:])
     table = tables.POINTS.read(folder)
     points = table.keys("id")

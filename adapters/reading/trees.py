@@ -66,6 +66,33 @@ class Tree:
             raise self.error(f"{self.place}{name} is '{shorten(str(value))}', needed keys and values")
         return Tree(self.path, value, f"{self.place}{name}.")
 
+    def items(self, name: str) -> list[Tree]:
+        """Return the trees in the list of a key; none if it is missing or empty.
+
+        Raises:
+            SurveyFileError: it is no list, or something in it has no keys.
+        """
+        values = self.values.get(name) or []  # Boost writes "" for an empty list
+        if not isinstance(values, list):
+            raise self.error(f"{self.place}{name} is '{shorten(str(values))}', needed a list")
+        for k, value in enumerate(values):
+            if not isinstance(value, Mapping):
+                raise self.error(
+                    f"{self.place}{name}[{k}] is '{shorten(str(value))}', needed keys and values"
+                )
+        return [Tree(self.path, value, f"{self.place}{name}[{k}].") for k, value in enumerate(values)]
+
+    def entries(self, name: str) -> dict[str, Tree]:
+        """Return the trees below a key by their own keys; none if it is missing.
+
+        Raises:
+            SurveyFileError: it has no keys, or something below it has none.
+        """
+        if self.key(name) is None:
+            return {}
+        tree = self.below(name)
+        return {key: tree.below(key) for key in tree.values}
+
     def text(self, name: str, default: str | None = None) -> str:
         """Return a text.
 
@@ -226,7 +253,31 @@ def text_of(path: Path, most: int, what: str) -> str:
 
 
 def read_tree(path: Path, what: str) -> Tree:
-    """Read a file of YAML or JSON, which begins with a brace.
+    """Read a file of YAML or JSON, which begins with a brace; see `read_trees`."""
+    values = _parsed(path, what)
+    if not isinstance(values, dict):
+        raise SurveyFileError(f"{path}: not {what}, no keys and values are in it")
+    return Tree(path, values)
+
+
+def read_trees(path: Path, what: str) -> list[Tree]:
+    """Read a file with a list of trees, which is JSON if it begins with a bracket.
+
+    Args:
+        path: the file.
+        what: name of such a file with its article, for error messages.
+
+    Raises:
+        SurveyFileError: it cannot be read, is too large, or is no list of trees; with the line.
+    """
+    values = _parsed(path, what)
+    if not (isinstance(values, list) and values and all(isinstance(value, dict) for value in values)):
+        raise SurveyFileError(f"{path}: not {what}, no list of keys and values is in it")
+    return [Tree(path, value, f"[{k}].") for k, value in enumerate(values)]
+
+
+def _parsed(path: Path, what: str) -> Any:
+    """Return what is in a file of YAML or JSON.
 
     Args:
         path: the file.
@@ -237,14 +288,13 @@ def read_tree(path: Path, what: str) -> Tree:
     """
     text = text_of(path, MAX_JSON_BYTES, what)
     try:
-        if text.lstrip().startswith("{"):
-            values = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
-        else:
-            if len(text) > MAX_YAML_BYTES:
-                raise SurveyFileError(f"{path}: {len(text)} characters, at most {MAX_YAML_BYTES} are read")
-            # OpenCV begins with %YAML:1.0, which is no directive of YAML
-            version, _, rest = text.partition("\n")
-            values = yaml.load(f"\n{rest}" if version.startswith("%YAML") else text, _Texts)
+        if text.lstrip().startswith(("{", "[")):
+            return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+        if len(text) > MAX_YAML_BYTES:
+            raise SurveyFileError(f"{path}: {len(text)} characters, at most {MAX_YAML_BYTES} are read")
+        # OpenCV begins with %YAML:1.0, which is no directive of YAML
+        version, _, rest = text.partition("\n")
+        return yaml.load(f"\n{rest}" if version.startswith("%YAML") else text, _Texts)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         raise SurveyFileError(
@@ -258,6 +308,3 @@ def read_tree(path: Path, what: str) -> Tree:
         raise SurveyFileError(
             f"{path}: not {what} (lists nested too deeply, or a number too long)"
         ) from error
-    if not isinstance(values, dict):
-        raise SurveyFileError(f"{path}: not {what}, no keys and values are in it")
-    return Tree(path, values)

@@ -157,8 +157,11 @@ def convert_cameras(
 
 
 def needs_less(camera: Camera, held: tuple[str, ...]) -> bool:
-    """Return whether a camera has a held parameter other than 0."""
-    return any(camera.value(name) != 0 for name in held if name in camera.names)
+    """Return whether a camera has a held parameter other than 0.
+
+    Models of wide-angle lenses have other parameters by the same names.
+    """
+    return not camera.wide_angle and any(camera.value(name) != 0 for name in held if name in camera.names)
 
 
 def _affinity_in_pixels(camera: Camera) -> Camera:

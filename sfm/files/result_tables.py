@@ -92,6 +92,7 @@ class ResultTable:
             tuple(name for names in optional for name in names),
             ignored=None,
             blank=blank,
+            may_be_empty=True,  # photographs, points or both may be missing, see `adapters.formats`
         )
 
     def write(self, folder: Path, *values: Any) -> None:

@@ -480,7 +480,7 @@ def without_given(network: Network) -> Network:
 def rows_of(index: IntArray, count: int) -> list[IntArray]:
     """Return, for each value from 0 to count - 1, the rows of `index` with that value, in order."""
     order = np.argsort(index, kind="stable")
-    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))[:count]
 
 
 def sum_rows(index: IntArray, values: FloatArray, count: int) -> FloatArray:

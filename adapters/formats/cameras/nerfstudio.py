@@ -39,29 +39,40 @@ def read_nerfstudio(path: Path) -> CameraFile:
         SurveyFileError: no focal length, or a model that is not read.
     """
     tree = read_tree(path, WHAT)
-    if tree.key("fl_x"):
-        return CameraFile(path.name, (_camera(tree, path.stem),), (None,))
+    if tree.key("fl_x", "camera_angle_x"):
+        return CameraFile(path.name, (camera_of(tree, path.stem),), (None,))
     stated = {name: tree.values[name] for name in OF_CAMERA if tree.key(name)}
     frames = tree.values.get("frames")
     of_frames: dict[tuple[str, ...], Tree] = {}
     for k, frame in enumerate((frames if isinstance(frames, list) else [])[:MAX_CAMERAS]):
-        if isinstance(frame, Mapping) and frame.get("fl_x") is not None:
+        if isinstance(frame, Mapping) and (frame.get("fl_x") or frame.get("camera_angle_x")) is not None:
             # what the file states is so of every frame
             entry = Tree(path, {**frame, **stated}, f"frames[{k}].")
             of_frames.setdefault(tuple(str(entry.values.get(name)) for name in OF_CAMERA), entry)
     if not of_frames:
         raise tree.error("fl_x is missing, of the file and of its frames: no camera is stated")
-    cameras = tuple(_camera(entry, f"camera {k}") for k, entry in enumerate(of_frames.values(), 1))
+    cameras = tuple(camera_of(entry, f"camera {k}") for k, entry in enumerate(of_frames.values(), 1))
     return CameraFile(path.name, cameras, (None,) * len(cameras))
 
 
-def _camera(entry: Tree, name: str) -> Camera:
+def camera_of(entry: Tree, name: str) -> Camera:
+    """Return the camera of a file or frame; a pixel is 1 mm.
+
+    Raises:
+        SurveyFileError: no focal length or size, or a model that is not read.
+    """
     model = entry.text("camera_model", "OPENCV")
     fisheye = model == "OPENCV_FISHEYE" or entry.truth("is_fisheye")
     if model not in MODELS:
         raise entry.error(f"{entry.place}camera_model {model}, expected one of {', '.join(MODELS)}")
     size = entry.sides(("w",), ("h",))
-    fx = entry.number("fl_x")
+    if entry.key("fl_x", "camera_angle_x") == "camera_angle_x":
+        angle = entry.number("camera_angle_x")
+        if not 0 < angle < np.pi:
+            raise entry.error(f"{entry.place}camera_angle_x is {angle:g} rad, needed 0 to pi")
+        fx = size[0] / 2 / float(np.tan(angle / 2))
+    else:
+        fx = entry.number("fl_x")
     fy = entry.number("fl_y") if entry.key("fl_y") else fx
     middle = {"cx": size[0] / 2, "cy": size[1] / 2}
     centre = [(entry.number(axis) if entry.key(axis) else middle[axis]) - HALF_PIXEL for axis in ("cx", "cy")]
@@ -84,7 +95,16 @@ def write_nerfstudio(path: Path, file: CameraFile) -> str:
     Raises:
         OutputError: nerfstudio has no equivalent of its model.
     """
-    camera = file.cameras[0]
+    content = keys_of(file.cameras[0])
+    return json.dumps(content | {"frames": []}, indent=1, allow_nan=False) + "\n"
+
+
+def keys_of(camera: Camera) -> dict[str, object]:
+    """Return the keys of a camera.
+
+    Raises:
+        OutputError: nerfstudio has no equivalent of its model.
+    """
     width, height = camera.size_px
     content: dict[str, object] = {"w": width, "h": height}
     if camera.model == "opencv_fisheye":
@@ -97,4 +117,4 @@ def write_nerfstudio(path: Path, file: CameraFile) -> str:
         content |= {"camera_model": "OPENCV", "fl_x": p["f"] + p["b1"], "fl_y": p["f"]}
         content |= {"cx": width / 2 + p["cx"], "cy": height / 2 + p["cy"]}
         content |= {name: p[name] for name in ("k1", "k2", "k3", "k4")} | {"p1": p["p2"], "p2": p["p1"]}
-    return json.dumps(content | {"frames": []}, indent=1, allow_nan=False) + "\n"
+    return content

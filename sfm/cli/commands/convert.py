@@ -22,7 +22,7 @@ def convert(
             "--to",
             metavar="F",
             help="Format to write.  [default: by the ending of OUT: .xml metashape, .ply ply, .db "
-            "colmap-database, none tables]",
+            "colmap-database, .nvm nvm, .sfm alicevision, none tables]",
         ),
     ] = None,
     from_format: Annotated[
@@ -53,8 +53,10 @@ def convert(
     """Convert a survey or cameras between formats of programs.
 
     A camera whose model the format lacks is converted to one that it has. Formats of surveys: colmap,
-    colmap-text, colmap-database, tables, metashape, photomodeler, bal, sba, bundle-matlab, bundle-csharp, rig
-    (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal) and ply.
+    colmap-text, colmap-database, tables, metashape, photomodeler, opensfm (also projects of OpenDroneMap),
+    openmvg, alicevision (Meshroom), nerfstudio, bundler, nvm (VisualSFM), bal, sba, bundle-matlab,
+    bundle-csharp, rig (calibration files of rigs for OpenCV, COLMAP, DICe, MatchID, Kalibr, ROS and mrcal)
+    and ply.
 
     Formats of cameras, to read and write: opencv-camera, ros-camera, kalibr-camera, mrcal-camera,
     colmap-camera, metashape-camera, australis-camera, nerfstudio-camera and blender-camera. A camera of a
@@ -70,6 +72,7 @@ def convert(
             format_named,
             losses_in_words,
             read_content,
+            recognised_format,
             refuse_taken,
             write_content,
         )
@@ -94,7 +97,8 @@ def convert(
         )
     form = format_named(to_format or ENDINGS.get(ending, "tables"))
     refuse_taken(target, form)
-    if from_format is None and source.is_file() and camera_format_of(source) is not None:
+    survey = not source.is_file() or from_format is not None or recognised_format(source) is not None
+    if not survey and camera_format_of(source) is not None:
         raise SurveyFileError(
             f"{source}: a file of cameras, without a survey; --to needs one of {', '.join(NAMES)}"
         )

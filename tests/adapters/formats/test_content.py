@@ -29,6 +29,8 @@ from tests.synthetic import make_network, seed_of
 
 READABLE = tuple(form.name for form in FORMATS if form.readable)
 MODEL_OF = {"bal": "radial", "photomodeler": "brown_dbat", "metashape": "opencv", "sba": "opencv"}
+MODEL_OF |= {"opensfm": "opencv", "nerfstudio": "opencv", "alicevision": "opencv", "bundler": "radial"}
+MODEL_OF |= {"nvm": "brown", "openmvg": "brown_forward"}
 IMAGES, POINTS = 5, 12
 
 
@@ -64,6 +66,9 @@ def survey(form: str, rng: np.random.Generator) -> Content:
         camera = camera.with_parameters(
             np.where([n in ("b1", "b2") for n in camera.names], 0.0, camera.parameters)
         )
+    if form in ("nvm", "openmvg"):
+        left_out = [n in format_named(form).lacks for n in camera.names]
+        camera = camera.with_parameters(np.where(left_out, 0.0, camera.parameters))
     camera = replace(camera, free=camera.free & (rng.random() < 0.5))
     if form == "photomodeler" and chance(rng):  # a calibration project
         camera = replace(camera, free=np.array([name != "b2" for name in camera.names]))

@@ -30,7 +30,11 @@ pycolmap = pytest.importorskip("pycolmap")
 
 # In every format: nan, inf, 1.#INF and their spellings, as a number and not as a part of a name
 NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(nan|inf|infinity|1\.#\w+)(?![\w.])", re.IGNORECASE)
-OPENCV = ("colmap", "colmap-text", "colmap-database", "metashape", "bal", "sba", "rig")
+OPENCV = (
+    *("colmap", "colmap-text", "colmap-database", "metashape", "bal", "sba", "rig"),
+    *("opensfm", "nerfstudio", "alicevision"),
+)
+MODEL_OF = dict.fromkeys(OPENCV, "opencv") | {"bundler": "radial", "openmvg": "brown_forward"}
 
 
 def _content(model: str, *, calibrated: bool = False) -> Content:
@@ -121,8 +125,7 @@ def _refuse_not_finite(path: Path) -> None:
 
 @pytest.mark.parametrize("form", [form.name for form in FORMATS])
 def test_no_format_writes_a_number_that_is_not_finite(form: str, tmp_path: Path) -> None:
-    model = "opencv" if form in OPENCV else "brown"
-    content = _content(model, calibrated=form in ("bal", "sba"))  # fx and fy stay equal
+    content = _content(MODEL_OF.get(form, "brown"), calibrated=form in ("bal", "sba"))  # fx and fy stay equal
     rng = np.random.default_rng(len(form))
     refused = written = 0
     places = list(_places(content))

@@ -498,7 +498,7 @@ def test_what_was_written_is_reported(tmp_path: Path) -> None:
 )
 def test_formats_are_recognised_and_go_round_by_name(name: str, tmp_path: Path) -> None:
     """From brown through any format: converted where it must be, read back by what is there."""
-    values = () if name.startswith("bundle") or name == "sba" else _no_affinity()
+    values = () if name.startswith("bundle-") or name == "sba" else _no_affinity()
     network, truth = network_in("brown", values=values, full=True)
     if name == "bal":  # one focal length, no decentring
         network, truth = network_in("opencv", values=(("k1", -0.08), ("k2", 0.04)))

@@ -1,0 +1,270 @@
+"""Scenes of AliceVision and Meshroom (.sfm, and .json of the node ConvertSfMFormat).
+
+    version      three numbers; files from 1.2.2 on are read, as Meshroom 2021 and later write them
+    views        photographs: viewId, poseId, intrinsicId, path, of a rig also rigId and subPoseId
+    intrinsics   width, height, sensorWidth, focalLength (mm), pixelRatio, principalPoint, distortionParams
+    poses        rotation (3 x 3, by columns) and center, x = R (X - center)
+    structure    points: X, and observations of them (observationId is a viewId) at x
+
+All leaves are texts. Axes are x right, y down, z forward. The principal point counts from the middle of the
+photograph, as w/2 and h/2 state it, and pixels from the centre of the first, where its features are measured.
+fx = width focalLength / sensorWidth; fy = fx pixelRatio, before 1.2.5 fx / pixelRatio. A ray (a, b) with
+r2 = a2 + b2 is distorted to
+
+    radialk1, radialk3   (1 + k1 r2 + k2 r4 + k3 r6) a
+    brown                (1 + k1 r2 + k2 r4 + k3 r6) a + 2 t1 a b + t2 (r2 + 2 a2)
+    fisheye4             theta (1 + k1 theta2 + ... + k4 theta8) a / r, theta = atan(r)
+
+The view of a rig has the pose x = R_sub (R_rig (X - center_rig) - center_sub).
+
+Source: AliceVision, scenes in src/aliceVision/sfmDataIO/compatibilityData and their documentation there.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapters.formats.content import Content, select_placed
+from adapters.formats.stated_model import (
+    StatedModel,
+    content_of,
+    from_vision_axes,
+    numbers_of_slots,
+    to_vision_axes,
+)
+from adapters.reading.trees import Tree, read_tree
+from sfm.files.plain_text import MAX_PIXEL_MM, shorten
+from sfm.files.whole_files import whole_file
+from sfm.model.camera import Camera, camera_from_values
+from sfm.model.conventions import FloatArray
+from sfm.model.network import rows_of
+
+WHAT = "a scene of AliceVision"
+OLDEST, LARGER_RATIO = (1, 2, 2), (1, 2, 5)  # versions
+WRITTEN = ("1", "2", "8")
+SENSOR_MM = 36.0  # AliceVision's width of a sensor that is not stated
+# the model here and the parameters by distortionType, or by type in files without it
+LENSES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "none": ("opencv", ()),
+    "pinhole": ("opencv", ()),
+    "radialk1": ("opencv", ("k1",)),
+    "radial1": ("opencv", ("k1",)),
+    "radialk3": ("full_opencv", ("k1", "k2", "k3")),
+    "radial3": ("full_opencv", ("k1", "k2", "k3")),
+    "brown": ("full_opencv", ("k1", "k2", "k3", "p1", "p2")),
+    "fisheye4": ("opencv_fisheye", ("k1", "k2", "k3", "k4")),
+}
+
+
+def read_alicevision(path: Path) -> Content:
+    """Read a scene; views without a pose have no orientation.
+
+    Raises:
+        SurveyFileError: with the file and its key.
+    """
+    tree = read_tree(path, WHAT)
+    version = tuple(int(number) for number in tree.numbers(("version",), 3))
+    if version < OLDEST:
+        raise tree.error(
+            f"version {'.'.join(map(str, version))}, needed {'.'.join(map(str, OLDEST))} or later: "
+            "convert it with Meshroom's ConvertSfMFormat"
+        )
+    stated = StatedModel(path)
+    cameras: dict[str, int] = {}
+    for intrinsic in tree.items("intrinsics"):
+        name = intrinsic.text("intrinsicId")
+        cameras[name] = len(cameras)
+        stated.cameras.append(_camera(name, intrinsic, version))
+    poses = {
+        pose.text("poseId"): _pose(pose.below("pose").below("transform")) for pose in tree.items("poses")
+    }
+    rigs = {rig.text("rigId"): rig.items("subPoses") for rig in tree.items("rigs")}
+    images: dict[str, int] = {}
+    for view in tree.items("views"):
+        of = view.text("intrinsicId")
+        if of not in cameras:
+            raise view.error(f"{view.place}intrinsicId is {of}, which is not among the intrinsics")
+        pose = poses.get(view.text("poseId", view.text("viewId")))
+        own = view.key("isPoseIndependant") is None or view.truth("isPoseIndependant")
+        if pose is not None and view.key("rigId") and not own:
+            pose = _of_rig(view, pose, rigs)
+        images[view.text("viewId")] = len(images)
+        name = view.text("path", f"{view.text('viewId')}.jpg")
+        if pose is None:
+            stated.add_image(name, cameras[of])
+        else:
+            stated.add_image(name, cameras[of], pose[1], from_vision_axes(pose[0]))
+    for landmark in tree.items("structure"):
+        X = landmark.numbers(("X",), 3).tolist()
+        j = stated.add_point(f"u{_number(landmark, 'landmarkId')}", X)
+        for seen in landmark.items("observations"):
+            view_id = seen.text("observationId")
+            if view_id not in images:
+                raise seen.error(f"{seen.place}observationId is {view_id}, which is not among the views")
+            if seen.key("x"):
+                x, y = seen.numbers(("x",), 2).tolist()
+                stated.add_image_point(images[view_id], j, x, y)
+    if stated.points and not len(stated.image):
+        stated.notes.append("its structure has no observations: the points are without image points")
+    return content_of(stated)
+
+
+def write_alicevision(path: Path, content: Content) -> None:
+    """Write what has coordinates as a scene.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    result = select_placed(content).result
+    network, estimate = result.network, result.estimate
+    R = to_vision_axes(estimate.rotation)
+    size = [estimate.cameras[a].size_px for a in network.camera.tolist()]
+    seen = network.image_points
+    slot, image, xy = numbers_of_slots(seen.image).tolist(), seen.image.tolist(), seen.xy.tolist()
+    points = zip(estimate.points.tolist(), rows_of(seen.point, len(network.points)), strict=True)
+    scene: dict[str, Any] = {
+        "version": list(WRITTEN),
+        "views": [
+            {
+                "viewId": f"{i}",
+                "poseId": f"{i}",
+                "intrinsicId": f"{network.camera[i]}",
+                "path": name,
+                "width": f"{size[i][0]}",
+                "height": f"{size[i][1]}",
+                "metadata": "",
+            }
+            for i, name in enumerate(network.images)
+        ],
+        "intrinsics": [_intrinsic(a, camera) for a, camera in enumerate(estimate.cameras)],
+        "poses": [
+            {
+                "poseId": f"{i}",
+                "pose": {
+                    "transform": {"rotation": _texts(R[i].T), "center": _texts(estimate.position[i])},
+                    "locked": "0",
+                },
+            }
+            for i in range(len(network.images))
+        ],
+        "structure": [
+            {
+                "landmarkId": f"{j}",
+                "descType": "unknown",
+                "color": ["0", "0", "0"],
+                "X": _texts(xyz),
+                "observations": [
+                    {
+                        "observationId": f"{image[r]}",
+                        "featureId": f"{slot[r]}",
+                        "x": _texts(xy[r]),
+                        "scale": "0",
+                    }
+                    for r in rows.tolist()
+                ],
+            }
+            for j, (xyz, rows) in enumerate(points)
+        ],
+    }
+    with whole_file(path) as part:
+        part.write_text(json.dumps(scene, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _camera(name: str, tree: Tree, version: tuple[int, ...]) -> Camera:
+    """Return the camera of an intrinsic."""
+    kind, lens = tree.text("type"), tree.text("distortionType", tree.text("type"))
+    if lens not in LENSES or kind == "equidistant":
+        raise tree.error(
+            f"{tree.place}type is {shorten(kind)} with distortion {shorten(lens)}, which no model here has; "
+            f"expected one of {', '.join(LENSES)}"
+        )
+    size = tree.sides(("width",), ("height",))
+    sensor = tree.number("sensorWidth") if tree.key("sensorWidth") else SENSOR_MM
+    pixel, c = sensor / size[0], tree.number("focalLength")
+    ratio = tree.number("pixelRatio") if tree.key("pixelRatio") else 1.0
+    if not (0 < pixel <= MAX_PIXEL_MM and c > 0 and ratio > 0):
+        raise tree.error(
+            f"{tree.place}sensorWidth {sensor:g} mm, focalLength {c:g} mm, pixelRatio {ratio:g}: all must be "
+            "more than 0"
+        )
+    fx = c / pixel
+    fy = fx * ratio if version >= LARGER_RATIO else fx / ratio
+    model, names = LENSES[lens]
+    stated = tree.values.get("distortionParams") or []  # Boost writes "" for an empty list
+    values = tree.numbers(("distortionParams",), len(names)).tolist() if stated or names else []
+    offset = tree.numbers(("principalPoint",), 2) if tree.key("principalPoint") else np.zeros(2)
+    p = dict(zip(names, values, strict=True))
+    if model == "full_opencv" and not p.get("k3"):
+        model = "opencv"
+        p.pop("k3", None)
+    p |= {"fx": fx, "fy": fy, "cx": size[0] / 2 + offset[0], "cy": size[1] / 2 + offset[1]}
+    return camera_from_values(
+        name, model, size, (pixel, pixel), c_mm=c, values=tuple((k, float(v)) for k, v in p.items())
+    )
+
+
+def _intrinsic(number: int, camera: Camera) -> dict[str, Any]:
+    """Return the intrinsic of a camera in model opencv, full_opencv or opencv_fisheye."""
+    p = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+    width, height = camera.size_px
+    pixel = float(camera.pixel_mm[0])
+    lens = "fisheye4" if camera.model == "opencv_fisheye" else "brown" if p["p1"] or p["p2"] else "radialk3"
+    values = [p.get(name, 0.0) for name in LENSES[lens][1]]
+    return {
+        "intrinsicId": f"{number}",
+        "width": f"{width}",
+        "height": f"{height}",
+        "sensorWidth": repr(width * pixel),
+        "sensorHeight": repr(height * float(camera.pixel_mm[1])),
+        "serialNumber": camera.name,
+        "type": "pinhole",
+        "initializationMode": "estimated",
+        "initialFocalLength": "-1",
+        "focalLength": repr(p["fx"] * pixel),
+        "pixelRatio": repr(p["fy"] / p["fx"]),
+        "pixelRatioLocked": "false",
+        "principalPoint": _texts([p["cx"] - width / 2, p["cy"] - height / 2]),
+        "distortionInitializationMode": "none",
+        "distortionParams": _texts(values),
+        "undistortionOffset": ["0", "0"],
+        "undistortionParams": "",
+        "distortionType": lens,
+        "undistortionType": "none",
+        "locked": "false",
+    }
+
+
+def _pose(tree: Tree) -> tuple[FloatArray, FloatArray]:
+    """Return R (3, 3), object to camera axes, and centre (3,) of a transform."""
+    return tree.numbers(("rotation",), 9).reshape(3, 3).T, tree.numbers(("center",), 3)
+
+
+def _of_rig(
+    view: Tree, pose: tuple[FloatArray, FloatArray], rigs: dict[str, list[Tree]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the pose of a view whose rig has a pose."""
+    sub = rigs.get(view.text("rigId"), [])
+    number = _number(view, "subPoseId")
+    if number >= len(sub):
+        raise view.error(
+            f"{view.place}subPoseId is {number}, which is not in rig {shorten(view.text('rigId'))}"
+        )
+    place = sub[number].below("pose")
+    R, centre = _pose(place.below("transform") if place.key("transform") else place)
+    R_rig, centre_rig = pose
+    return R @ R_rig, centre_rig + R_rig.T @ centre
+
+
+def _number(tree: Tree, name: str) -> int:
+    text = tree.text(name)
+    if not (text.isascii() and text.isdecimal()):
+        raise tree.error(f"{tree.place}{name} is '{shorten(text)}', needed a whole number")
+    return int(text)
+
+
+def _texts(values: Any) -> list[str]:
+    return [repr(float(value)) for value in np.ravel(values)]

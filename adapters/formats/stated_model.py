@@ -1,0 +1,223 @@
+"""A model as a file of another program states it: cameras, photographs, points, each of which may be missing.
+
+A reader states what its file holds in its own numbering; `content_of` checks it and makes it a survey. All
+formats thus refuse the same mistakes: names that are no names or leave their folder, mirrored rotations,
+numbers of photographs, cameras or points that are not there, and image points that are no pixels.
+
+Source: named in the module of each format.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from adapters.colmap.reconstruction import AXES
+from adapters.formats.cameras.lens_terms import is_rotation, nearest
+from adapters.formats.content import Content
+from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, Lines
+from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
+from sfm.model.camera import Camera
+from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.display import counted
+from sfm.model.errors import SurveyFileError
+from sfm.model.estimate import Estimate
+from sfm.model.network import ImagePoints, Network
+from sfm.model.solution import Solution
+
+
+@dataclass
+class StatedModel:
+    """What a file of another program states of a model; lists may be empty, poses and points may be NaN."""
+
+    path: Path
+    cameras: list[Camera] = field(default_factory=list)
+    images: list[str] = field(default_factory=list)  # m names of photographs
+    camera: list[int] = field(default_factory=list)  # index of the camera of each photograph
+    position: list[FloatArray] = field(default_factory=list)  # projection centres, (3,) each
+    rotation: list[FloatArray] = field(default_factory=list)  # image axes (y up) to object axes, (3, 3) each
+    points: list[str] = field(default_factory=list)  # n names of points
+    xyz: array[float] = field(default_factory=lambda: array("d"))  # of all points one after another
+    image: array[int] = field(default_factory=lambda: array("q"))  # photograph of each image point
+    point: array[int] = field(default_factory=lambda: array("q"))  # point of each image point
+    xy: array[float] = field(default_factory=lambda: array("d"))  # px in Kolinear's frame, one after another
+    notes: list[str] = field(default_factory=list)  # on what is read but not used unchanged
+    images_named: bool = True  # whether the photographs have names; else they are numbered
+    text: Lines | None = None  # the lines being read, for the place of an error
+
+    def error(self, message: str) -> SurveyFileError:
+        """Return an error in this file, at the line being read if it has lines."""
+        if self.text is not None:
+            return self.text.error(message)
+        return SurveyFileError(f"{self.path}: {message}")
+
+    def add_image(
+        self, name: str, camera: int, position: FloatArray | None = None, rotation: FloatArray | None = None
+    ) -> None:
+        """Add a photograph.
+
+        Args:
+            name: its name, a path below the folder of the photographs.
+            camera: index of its camera.
+            position: projection centre, (3,); None without orientation.
+            rotation: image axes (x right, y up, looking along -z) to object axes, (3, 3).
+
+        Raises:
+            SurveyFileError: no name, one photograph too many, or a matrix that is no rotation.
+        """
+        if len(self.images) == MAX_PHOTOGRAPHS:
+            raise self.error(f"more than {MAX_PHOTOGRAPHS} photographs, no more are read")
+        if not is_name(name):
+            raise self.error(
+                f"the name of a photograph is '{shorten(name)}', needed plain text of 1 to {MAX_NAME} "
+                "characters"
+            )
+        if position is None or rotation is None:
+            position, rotation = np.full(3, np.nan), np.full((3, 3), np.nan)
+        elif not is_rotation(rotation):
+            raise self.error(f"photograph {shorten(name)}: its matrix is no rotation, or a reflection")
+        else:
+            rotation = (
+                rotation if np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-14) else nearest(rotation)
+            )
+        self.images.append(name)
+        self.camera.append(camera)
+        self.position.append(position)
+        self.rotation.append(rotation)
+
+    def add_point(self, name: str, xyz: FloatArray | list[float]) -> int:
+        """Add a point and return its index.
+
+        Raises:
+            SurveyFileError: one point too many.
+        """
+        if len(self.points) == MAX_POINTS:
+            raise self.error(f"more than {MAX_POINTS} points, no more are read")
+        self.points.append(name)
+        self.xyz.extend(xyz)
+        return len(self.points) - 1
+
+    def add_image_point(self, image: int, point: int, x: float, y: float) -> None:
+        """Add an image point, px in Kolinear's frame.
+
+        Raises:
+            SurveyFileError: one image point too many, or beyond the largest photographs.
+        """
+        if len(self.image) == MAX_IMAGE_POINTS:
+            raise self.error(f"more than {MAX_IMAGE_POINTS} image points, no more are read")
+        if abs(x) > MAX_SIDE_PX or abs(y) > MAX_SIDE_PX:
+            raise self.error(
+                f"photograph {shorten(self.images[image])}: an image point at ({x:g}, {y:g}) px, needed "
+                f"coordinates of at most {MAX_SIDE_PX}"
+            )
+        self.image.append(image)
+        self.point.append(point)
+        self.xy.extend((x, y))
+
+
+def content_of(stated: StatedModel) -> Content:
+    """Return a stated model as a survey; points are uncoded, since these programs number them.
+
+    The same point twice in one photograph is read once, as the first of both, and noted.
+
+    Raises:
+        SurveyFileError: two photographs or points have one name, a name leaves the folder of the photographs,
+            or nothing is in the file.
+    """
+    images = _names_below(stated)
+    for what, names in (("photograph", images), ("point", stated.points)):
+        for name, count in Counter(names).most_common(1):
+            if count > 1:
+                raise stated.error(f"{counted(count, what)} with the name '{shorten(name)}', needed one")
+    if not (stated.cameras or stated.points):
+        raise stated.error("neither a camera nor a point is in it")
+    image, point = np.array(stated.image, dtype=np.int64), np.array(stated.point, dtype=np.int64)
+    _, first = np.unique(image * max(len(stated.points), 1) + point, return_index=True)
+    first.sort()
+    notes = list(stated.notes)
+    if len(first) < len(image):
+        notes.append(
+            f"{counted(len(image) - len(first), 'image point')} of points that their photograph shows twice "
+            "left out"
+        )
+    k = len(first)
+    seen = ImagePoints(
+        image[first],
+        point[first],
+        np.array(stated.xy, dtype=float).reshape(-1, 2)[first],
+        np.tile(np.eye(2), (k, 1, 1)),
+        np.zeros(k, dtype=bool),
+    )
+    network = Network(images, np.array(stated.camera, dtype=np.int64), tuple(stated.points), seen)
+    estimate = Estimate(
+        tuple(stated.cameras),
+        np.array(stated.position, dtype=float).reshape(-1, 3),
+        np.array(stated.rotation, dtype=float).reshape(-1, 3, 3),
+        np.array(stated.xyz, dtype=float).reshape(-1, 3),
+    )
+    solution = Solution(
+        stated.path.name, network, estimate, points_named=False, images_named=stated.images_named
+    )
+    return Content(solution, notes=tuple(notes))
+
+
+def from_vision_axes(R: FloatArray) -> FloatArray:
+    """Return rotations from image to object axes of those from object axes to x right, y down, z forward.
+
+    Args:
+        R: rotations of computer vision, object to camera axes, (..., 3, 3).
+    """
+    return np.asarray(np.swapaxes(R, -1, -2) @ AXES)
+
+
+def to_vision_axes(rotation: FloatArray) -> FloatArray:
+    """Return the inverse of `from_vision_axes`, (..., 3, 3)."""
+    return np.asarray(AXES @ np.swapaxes(rotation, -1, -2))
+
+
+def numbers_of_slots(index: IntArray) -> IntArray:
+    """Return the number of each image point among those of its photograph, from 0, (k,)."""
+    order = np.argsort(index, kind="stable")
+    ordered = index[order]
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]])) if len(index) else ordered
+    slot = np.empty(len(index), dtype=np.int64)
+    slot[order] = np.arange(len(index)) - np.repeat(starts, np.diff(np.append(starts, len(index))))
+    return slot
+
+
+def nominal_size(xy: FloatArray) -> tuple[int, int]:
+    """Return width and height of the smallest photograph with its origin in the middle that has all points.
+
+    Args:
+        xy: image points from the middle, px, (k, 2).
+    """
+    half = np.abs(xy).max(axis=0) if len(xy) else np.zeros(2)
+    width, height = (2 * int(np.ceil(side + 1)) for side in half)
+    return width, height
+
+
+def _names_below(stated: StatedModel) -> tuple[str, ...]:
+    """Return the names of photographs as paths below a folder, the common one of absolute paths."""
+    paths = [PurePosixPath(name.replace("\\", "/")) for name in stated.images]
+    for name, path in zip(stated.images, paths, strict=True):
+        if ".." in path.parts or not path.name:
+            raise stated.error(
+                f"photograph '{shorten(name)}': a path that leaves the folder of the photographs"
+            )
+    absolute = [path.is_absolute() or ":" in path.parts[0] for path in paths]
+    if not any(absolute):
+        return tuple(stated.images)
+    folders = [path.parts[:-1] for path, on in zip(paths, absolute, strict=True) if on]
+    common = 0
+    for parts in zip(*folders, strict=False):
+        if len(set(parts)) > 1:
+            break
+        common += 1
+    return tuple(
+        "/".join(path.parts[common:]) if on else name
+        for name, path, on in zip(stated.images, paths, absolute, strict=True)
+    )
