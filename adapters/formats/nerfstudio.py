@@ -64,13 +64,18 @@ def write_nerfstudio_poses(path: Path, content: Content) -> None:
     """Write the photographs that have an orientation, and their cameras.
 
     Raises:
-        OutputError: fisheye lenses beside others, which need another file, or it cannot be written.
+        OutputError: several cameras without photographs, fisheye lenses beside others, or the file cannot be
+            written.
     """
     result = select_placed(content).result
     network, estimate = result.network, result.estimate
     used = sorted(set(network.camera.tolist())) or list(range(len(estimate.cameras)))
     keys = {a: keys_of(estimate.cameras[a]) for a in used}
     kinds = {str(keys[a]["camera_model"]) for a in used}
+    if not network.images and len(used) > 1:
+        raise OutputError(
+            f"{path}: a file of format nerfstudio without photographs has one camera, not {len(used)}"
+        )
     if len(kinds) > 1:
         raise OutputError(
             f"{path}: a file of format nerfstudio has one camera_model, the cameras are "

@@ -33,10 +33,9 @@ from adapters.formats.stated_model import (
     to_vision_axes,
 )
 from adapters.reading.text_lines import MAX_LINES, MAX_PHOTOGRAPHS, MAX_POINTS, Lines, write_lines
-from sfm.files.plain_text import MAX_SIDE_PX
+from sfm.files.plain_text import MAX_SIDE_PX, shorten
 from sfm.model.camera import camera_from_values
 from sfm.model.conventions import FloatArray, IntArray
-from sfm.model.errors import OutputError
 from sfm.model.network import rows_of
 
 HEADER = "NVM_V3"
@@ -54,7 +53,7 @@ def read_nvm(path: Path) -> Content:
     text = Lines.of(path)
     head = text.due_row("NVM_V3")
     if head[0] != HEADER:
-        raise text.error(f"'{' '.join(head)[:20]}' at the start, needed {HEADER}")
+        raise text.error(f"'{shorten(' '.join(head))}' at the start, needed {HEADER}")
     if len(head) > 1:
         fixed = [text.number_of(word) for word in head[2:]]
         if head[1] != "FixedK" or len(fixed) not in (4, 5) or fixed[0] != fixed[2]:
@@ -97,19 +96,13 @@ def write_nvm(path: Path, content: Content) -> None:
 
     Args:
         path: new file.
-        content: cameras in model brown with c, x0, y0 and K1.
+        content: cameras in model brown with c, x0, y0, K1 and square pixels.
 
     Raises:
-        OutputError: pixels are not square, or the file cannot be written.
+        OutputError: the file cannot be written.
     """
     result = select_placed(content).result
     network, estimate = result.network, result.estimate
-    for camera in estimate.cameras:
-        if np.ptp(camera.pixel_mm):
-            raise OutputError(
-                f"{path}: camera {camera.name}: format nvm cannot store pixels that are not square; "
-                "--undistort corrects the image points for it"
-            )
     lines = [HEADER, "", f"{len(network.images)}"]
     R = to_vision_axes(estimate.rotation)
     quaternions = Rotation.from_matrix(R).as_quat(scalar_first=True) if len(R) else np.zeros((0, 4))

@@ -24,8 +24,6 @@ import json
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
 from adapters.formats.content import Content, select_placed
 from adapters.formats.stated_model import (
     StatedModel,
@@ -38,7 +36,6 @@ from adapters.reading.trees import Tree, read_tree
 from sfm.files.plain_text import shorten
 from sfm.files.whole_files import whole_file
 from sfm.model.camera import Camera, camera_from_values
-from sfm.model.errors import OutputError
 from sfm.model.network import rows_of
 
 WHAT = "a sfm_data.json of OpenMVG"
@@ -115,10 +112,11 @@ def write_openmvg(path: Path, content: Content) -> None:
 
     Args:
         path: new file.
-        content: cameras in model brown_forward without K4, b1, b2, or opencv_fisheye with fx = fy.
+        content: cameras in model brown_forward with square pixels, without K4, b1 and b2, or opencv_fisheye
+            with fx = fy.
 
     Raises:
-        OutputError: pixels are not square, or the file cannot be written.
+        OutputError: the file cannot be written.
     """
     result = select_placed(content).result
     network, estimate = result.network, result.estimate
@@ -147,7 +145,7 @@ def write_openmvg(path: Path, content: Content) -> None:
         "root_path": "",
         "views": views,
         "intrinsics": [
-            _entry(a, _intrinsic(path, camera, kinds, first + a)) for a, camera in enumerate(estimate.cameras)
+            _entry(a, _intrinsic(camera, kinds, first + a)) for a, camera in enumerate(estimate.cameras)
         ],
         "extrinsics": [
             _entry(i, {"rotation": R[i].tolist(), "center": estimate.position[i].tolist()})
@@ -209,23 +207,14 @@ def _camera(name: str, value: Tree) -> Camera:
     return camera_from_values(name, "brown_forward", size, (1.0, 1.0), c_mm=f, values=tuple(of.items()))
 
 
-def _intrinsic(path: Path, camera: Camera, kinds: dict[str, int], number: int) -> dict[str, Any]:
+def _intrinsic(camera: Camera, kinds: dict[str, int], number: int) -> dict[str, Any]:
     """Return the value of an intrinsic.
 
     Args:
-        path: of the file, for the error.
         camera: the camera.
         kinds: numbers of the kinds that were stated already; the new one is added.
         number: of the object, from 2^31.
-
-    Raises:
-        OutputError: pixels are not square.
     """
-    if camera.in_mm and np.ptp(camera.pixel_mm):
-        raise OutputError(
-            f"{path}: camera {camera.name}: format openmvg cannot store pixels that are not square; "
-            "--undistort corrects the image points for it"
-        )
     p = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
     width, height = camera.size_px
     principal = camera.principal_point_px - 0.5

@@ -89,9 +89,9 @@ def read_opensfm(path: Path) -> Content:
     number = {name: a for a, name in enumerate(cameras)}
     rigs = _rig_poses(part)
     for name, shot in part.entries("shots").items():
-        of = shot.values[shot.due("camera")]
+        of = shot.text("camera")
         if of not in number:
-            raise shot.error(f"{shot.place}camera is '{shorten(str(of))}', which is not among its cameras")
+            raise shot.error(f"{shot.place}camera is '{shorten(of)}', which is not among its cameras")
         R, t = rigs[name] if name in rigs and shot.key("rotation") is None else _pose(shot)
         stated.add_image(name, number[of], -R.T @ t, from_vision_axes(R))
     points: dict[str, int] = {}
@@ -211,10 +211,12 @@ def _rig_poses(part: Tree) -> dict[str, tuple[FloatArray, FloatArray]]:
     poses = {}
     for instance in part.entries("rig_instances").values():
         R, t = _pose(instance)
-        for shot, mount in instance.below("rig_camera_ids").values.items():
+        of_shots = instance.below("rig_camera_ids")
+        for shot in of_shots.values:
+            mount = of_shots.text(shot)
             if mount not in mounts:
                 raise instance.error(
-                    f"{instance.place}rig_camera_ids: '{shorten(str(mount))}' is not among the rig_cameras"
+                    f"{instance.place}rig_camera_ids: '{shorten(mount)}' is not among the rig_cameras"
                 )
             R_mount, t_mount = mounts[mount]
             poses[shot] = (R_mount @ R, R_mount @ t + t_mount)

@@ -93,6 +93,7 @@ class FileFormat:
     frees: tuple[str, ...] = ()  # parameters that become free when read, if it does not state which are
     straight: tuple[str, ...] = ()  # parameters that it can neither store nor approximate
     one_focal: bool = False  # whether fx and fy must be equal
+    square: bool = False  # whether pixels must be square
     names: tuple[bool, bool] = (True, True)  # whether it names points and photographs; else it numbers them
     read_all: Callable[..., Content] | None = None  # for a format with more content than `read` returns
     write_all: Callable[[Path, Content], None] | None = None  # likewise for `write`
@@ -285,6 +286,7 @@ FORMATS = (
         keeps=_SOLVED | {"image names"},
         placed=True,
         lacks=("K2", "K3", "P1", "P2", "b1", "b2"),
+        square=True,
         names=(False, True),
         recognises=lambda head: head.startswith(NVM_HEADER),
     ),
@@ -308,6 +310,7 @@ FORMATS = (
         placed=True,
         lacks=("K4", "b1", "b2"),
         one_focal=True,
+        square=True,
         names=(False, True),
         recognises=lambda head: head.startswith("{") and '"sfm_data_version"' in head,
     ),
@@ -559,8 +562,11 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
         left = [name for name in held if name in camera.names and camera.value(name) != 0]
         if form.one_focal and np.ptp(camera.parameters[camera.plays(Role.FOCAL)]):
             left.append("fx other than fy")
+        if form.square and camera.in_mm and np.ptp(camera.pixel_mm):
+            left.append("pixels that are not square")
         if left:
-            remedy = "; --undistort corrects the image points for it" if form.straight else ""
+            corrected = form.straight or form.square
+            remedy = "; --undistort corrects the image points for it" if corrected else ""
             raise KolinearError(
                 f"camera {camera.name}: format {form.name} cannot store {', '.join(left)} of "
                 f"{camera.model}{remedy}"

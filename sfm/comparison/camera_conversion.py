@@ -54,7 +54,12 @@ class Conversion:
 
 
 def convert_camera(
-    camera: Camera, model: str, *, region_px: FloatArray | None = None, held: tuple[str, ...] = ()
+    camera: Camera,
+    model: str,
+    *,
+    region_px: FloatArray | None = None,
+    held: tuple[str, ...] = (),
+    square: bool = False,
 ) -> Conversion:
     """Return the camera in another model, fitted over the photograph or a region of it.
 
@@ -65,6 +70,7 @@ def convert_camera(
             given.
         held: parameters of the model that must be 0; others compensate as far as possible. If b1 is held,
             affinity becomes the ratio of the sides of a pixel.
+        square: whether pixels of a model in mm must be square; then held affinity is part of the misfit.
 
     Raises:
         SurveyFileError: unknown model.
@@ -73,7 +79,7 @@ def convert_camera(
     Source: start values by series reversal, Luhmann et al., Close-Range Photogrammetry and 3D Imaging
     (2020), sec. 3.3; the fit is by least squares.
     """
-    if model == camera.model and not needs_less(camera, held):
+    if model == camera.model and not needs_less(camera, held, square=square):
         return Conversion(camera, model, 0.0, 0.0)
     if model not in CONVERTIBLE:
         raise SurveyFileError(
@@ -93,7 +99,14 @@ def convert_camera(
             f"camera {camera.name}: its {camera.model} distortion cannot be inverted at "
             f"{(~np.isfinite(uv[:, 0])).sum()} of {len(uv)} places of the photograph"
         )
-    start = start_values(_affinity_in_pixels(camera) if "b1" in held else camera, model)
+    if square and camera.in_mm:
+        sx, sy = camera.pixel_mm
+        start = start_values(camera, model)
+        across = start.plays(Role.X0) & start.in_mm
+        start = start.with_parameters(np.where(across, sy / sx, 1.0) * start.parameters)
+        start = replace(start, pixel_mm=np.array([sy, sy]))
+    else:
+        start = start_values(_affinity_in_pixels(camera) if "b1" in held and not square else camera, model)
     fitted = np.array([name not in held for name in start.names])
     start = start.with_parameters(np.where(fitted, start.parameters, 0.0))
     from scipy.optimize import least_squares  # importing takes half a second, and most commands never need it
@@ -133,7 +146,7 @@ def convert_camera(
 
 
 def convert_cameras(
-    estimate: Estimate, models: tuple[str, ...], *, held: tuple[str, ...] = ()
+    estimate: Estimate, models: tuple[str, ...], *, held: tuple[str, ...] = (), square: bool = False
 ) -> tuple[Estimate, tuple[Conversion, ...]]:
     """Return the estimate with every camera in one of the given models, and the conversions.
 
@@ -144,23 +157,29 @@ def convert_cameras(
         estimate: a solution.
         models: accepted models, the best first.
         held: parameters of these models that must be 0.
+        square: whether pixels must be square, see `convert_camera`.
     """
     conversions = tuple(
         convert_camera(
             camera,
-            camera.model if camera.model in models and not needs_less(camera, held) else models[0],
+            camera.model
+            if camera.model in models and not needs_less(camera, held, square=square)
+            else models[0],
             held=held,
+            square=square,
         )
         for camera in estimate.cameras
     )
     return replace(estimate, cameras=tuple(conversion.camera for conversion in conversions)), conversions
 
 
-def needs_less(camera: Camera, held: tuple[str, ...]) -> bool:
-    """Return whether a camera has a held parameter other than 0.
+def needs_less(camera: Camera, held: tuple[str, ...], *, square: bool = False) -> bool:
+    """Return whether a camera has a held parameter other than 0, or pixels that are not square.
 
     Models of wide-angle lenses have other parameters by the same names.
     """
+    if square and camera.in_mm and np.ptp(camera.pixel_mm):
+        return True
     return not camera.wide_angle and any(camera.value(name) != 0 for name in held if name in camera.names)
 
 
