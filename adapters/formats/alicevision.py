@@ -1,15 +1,15 @@
 """Scenes of AliceVision and Meshroom (.sfm, and .json of the node ConvertSfMFormat).
 
-    version      three numbers; files from 1.2.2 on are read, as Meshroom 2021 and later write them
+    version      three numbers
     views        photographs: viewId, poseId, intrinsicId, path, of a rig also rigId and subPoseId
     intrinsics   width, height, sensorWidth, focalLength (mm), pixelRatio, principalPoint, distortionParams
     poses        rotation (3 x 3, by columns) and center, x = R (X - center)
     structure    points: X, and observations of them (observationId is a viewId) at x
 
 All leaves are texts. Axes are x right, y down, z forward. The principal point counts from the middle of the
-photograph, as w/2 and h/2 state it, and pixels from the centre of the first, where its features are measured.
-fx = width focalLength / sensorWidth; fy = fx pixelRatio, before 1.2.5 fx / pixelRatio. A ray (a, b) with
-r2 = a2 + b2 is distorted to
+photograph (w/2, h/2), before version 1.2.1 from its corner; pixels count from the centre of the first, where
+its features are measured. fx = width focalLength / sensorWidth and fy = fx pixelRatio, before 1.2.5
+fx / pixelRatio; before 1.2.2 both are pxFocalLength. A ray (a, b) with r2 = a2 + b2 is distorted to
 
     radialk1, radialk3   (1 + k1 r2 + k2 r4 + k3 r6) a
     brown                (1 + k1 r2 + k2 r4 + k3 r6) a + 2 t1 a b + t2 (r2 + 2 a2)
@@ -44,7 +44,8 @@ from sfm.model.conventions import FloatArray
 from sfm.model.network import rows_of
 
 WHAT = "a scene of AliceVision"
-OLDEST, LARGER_RATIO = (1, 2, 2), (1, 2, 5)  # versions
+# versions since which principal points, focal lengths and ratios are as described
+FROM_MIDDLE, IN_MM, LARGER_RATIO = (1, 2, 1), (1, 2, 2), (1, 2, 5)
 WRITTEN = ("1", "2", "8")
 SENSOR_MM = 36.0  # AliceVision's width of a sensor that is not stated
 # the model here and the parameters by distortionType, or by type in files without it
@@ -68,11 +69,6 @@ def read_alicevision(path: Path) -> Content:
     """
     tree = read_tree(path, WHAT)
     version = tuple(int(number) for number in tree.numbers(("version",), 3))
-    if version < OLDEST:
-        raise tree.error(
-            f"version {'.'.join(map(str, version))}, needed {'.'.join(map(str, OLDEST))} or later: "
-            "convert it with Meshroom's ConvertSfMFormat"
-        )
     stated = StatedModel(path)
     cameras: dict[str, int] = {}
     for intrinsic in tree.items("intrinsics"):
@@ -184,15 +180,18 @@ def _camera(name: str, tree: Tree, version: tuple[int, ...]) -> Camera:
         )
     size = tree.sides(("width",), ("height",))
     sensor = tree.number("sensorWidth") if tree.key("sensorWidth") else SENSOR_MM
-    pixel, c = sensor / size[0], tree.number("focalLength")
-    ratio = tree.number("pixelRatio") if tree.key("pixelRatio") else 1.0
-    if not (0 < pixel <= MAX_PIXEL_MM and c > 0 and ratio > 0):
+    pixel = sensor / size[0]
+    if version < IN_MM:
+        fx, fy = tree.numbers(("pxFocalLength",), 1, 2)[[0, -1]].tolist()
+    else:
+        ratio = tree.number("pixelRatio") if tree.key("pixelRatio") else 1.0
+        fx = tree.number("focalLength") / pixel if pixel > 0 else 0.0
+        fy = fx * ratio if version >= LARGER_RATIO or not ratio else fx / ratio
+    if not (0 < pixel <= MAX_PIXEL_MM and fx > 0 and fy > 0):
         raise tree.error(
-            f"{tree.place}sensorWidth {sensor:g} mm, focalLength {c:g} mm, pixelRatio {ratio:g}: all must be "
-            "more than 0"
+            f"{tree.place}sensorWidth {sensor:g} mm and focal lengths {fx:g} and {fy:g} px: all must be more "
+            "than 0"
         )
-    fx = c / pixel
-    fy = fx * ratio if version >= LARGER_RATIO else fx / ratio
     model, names = LENSES[lens]
     stated = tree.values.get("distortionParams") or []  # Boost writes "" for an empty list
     values = tree.numbers(("distortionParams",), len(names)).tolist() if stated or names else []
@@ -201,9 +200,10 @@ def _camera(name: str, tree: Tree, version: tuple[int, ...]) -> Camera:
     if model == "full_opencv" and not p.get("k3"):
         model = "opencv"
         p.pop("k3", None)
-    p |= {"fx": fx, "fy": fy, "cx": size[0] / 2 + offset[0], "cy": size[1] / 2 + offset[1]}
+    middle = np.array(size) / 2 if version >= FROM_MIDDLE else np.zeros(2)
+    p |= {"fx": fx, "fy": fy, "cx": middle[0] + offset[0], "cy": middle[1] + offset[1]}
     return camera_from_values(
-        name, model, size, (pixel, pixel), c_mm=c, values=tuple((k, float(v)) for k, v in p.items())
+        name, model, size, (pixel, pixel), c_mm=fx * pixel, values=tuple((k, float(v)) for k, v in p.items())
     )
 
 

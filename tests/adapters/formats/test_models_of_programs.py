@@ -531,10 +531,17 @@ def test_older_scenes_of_alicevision(tmp_path: Path) -> None:
     assert camera.value("fy") / camera.value("fx") == pytest.approx(ratio)
     assert [camera.value(name) for name in ("k1", "k2", "k3", "p1")] == [0.1, -0.2, 0.05, 0.0]
     assert result.network.images[:2] == ("IMG 1.jpg", "IMG 2.jpg")
-    scene["version"] = ["1", "1", "0"]
+    # Meshroom 2021: one focal length in px, the principal point from the corner
+    scene["version"] = ["1", "0", "0"]
+    for every in scene["intrinsics"]:
+        every |= {"pxFocalLength": "1900", "principalPoint": ["1003", "748"]}
     path.write_text(json.dumps(scene))
-    with pytest.raises(SurveyFileError, match=r"version 1\.1\.0, needed 1\.2\.2 or later"):
-        read_content(path)
+    camera = read_content(path).result.estimate.cameras[0]
+    assert [camera.value(name) for name in ("fx", "fy", "cx", "cy")] == pytest.approx([1900, 1900, 1003, 748])
+    for wrong in ("0", "-3", "nan"):
+        intrinsic["pxFocalLength"] = wrong
+        path.write_text(json.dumps(scene))
+        assert assert_one_line(path, "alicevision")
 
 
 def test_older_scenes_of_openmvg(tmp_path: Path) -> None:
