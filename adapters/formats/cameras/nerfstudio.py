@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,13 +40,13 @@ def read_nerfstudio(path: Path) -> CameraFile:
         SurveyFileError: no focal length, or a model that is not read.
     """
     tree = read_tree(path, WHAT)
-    if tree.key("fl_x", "camera_angle_x"):
+    if _has_focal_length(tree.values):
         return CameraFile(path.name, (camera_of(tree, path.stem),), (None,))
     stated = {name: tree.values[name] for name in OF_CAMERA if tree.key(name)}
     frames = tree.values.get("frames")
     of_frames: dict[tuple[str, ...], Tree] = {}
     for k, frame in enumerate((frames if isinstance(frames, list) else [])[:MAX_CAMERAS]):
-        if isinstance(frame, Mapping) and (frame.get("fl_x") or frame.get("camera_angle_x")) is not None:
+        if isinstance(frame, Mapping) and _has_focal_length({**frame, **stated}):
             # what the file states is so of every frame
             entry = Tree(path, {**frame, **stated}, f"frames[{k}].")
             of_frames.setdefault(tuple(str(entry.values.get(name)) for name in OF_CAMERA), entry)
@@ -53,6 +54,12 @@ def read_nerfstudio(path: Path) -> CameraFile:
         raise tree.error("fl_x is missing, of the file and of its frames: no camera is stated")
     cameras = tuple(camera_of(entry, f"camera {k}") for k, entry in enumerate(of_frames.values(), 1))
     return CameraFile(path.name, cameras, (None,) * len(cameras))
+
+
+def _has_focal_length(values: Mapping[str, Any]) -> bool:
+    """Return whether a file or frame states it, or the angle of view of a width."""
+    angle = values.get("camera_angle_x") is not None and values.get("w") is not None
+    return angle or values.get("fl_x") is not None
 
 
 def camera_of(entry: Tree, name: str) -> Camera:
