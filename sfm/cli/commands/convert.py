@@ -115,9 +115,7 @@ def convert(
     elif form.models:
         if straighten:
             network, estimate = undistort(network, estimate, form.models)
-        estimate, conversions = convert_cameras(
-            estimate, form.models, held=form.lacks, square=form.square
-        )
+        estimate, conversions = convert_cameras(estimate, form.models, held=form.lacks, square=form.square)
     changed, gone = with_cameras(content, network, estimate)
     changed = replace(changed, result=replace(changed.result, name=target.name))
     write_content(target, form.name, changed)

@@ -189,6 +189,9 @@ def full_disk(limit_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+MODEL_OF = {"bundler": "radial", "nvm": "brown", "openmvg": "brown_forward"}
+
+
 @pytest.mark.parametrize("name", [form.name for form in FORMATS])
 def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> None:
     model = "brown" if name in ("photomodeler", "bundle-csharp", "bundle-matlab") else "opencv"
@@ -204,8 +207,10 @@ def test_a_full_disk_leaves_nothing_and_says_why(name: str, tmp_path: Path) -> N
     if name == "rig":
         network, estimate = make_rig(seed_of("full"), moments=3, points=12)
         estimate = convert_cameras(estimate, ("opencv",))[0]
+    if name in ("bundler", "nvm", "openmvg"):
+        estimate = convert_cameras(estimate, (MODEL_OF[name],))[0]
     with (
-        full_disk(256 if name == "rig" else 8192),
+        full_disk(256 if name in ("rig", "nerfstudio") else 8192),
         pytest.raises(OutputError, match=r"out.*: .*cannot be written: File too large$"),
     ):
         write_any(tmp_path / "out", name, network, estimate)
