@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from adapters.formats.content import Content, select_placed
-from adapters.formats.stated_model import StatedModel, content_of, nominal_size, numbers_of_slots
+from adapters.formats.stated_model import StatedModel, content_of, file_in, nominal_size, numbers_of_slots
 from adapters.reading.text_lines import MAX_PHOTOGRAPHS, MAX_POINTS, Lines, write_lines
 from sfm.model.camera import camera_from_values
 from sfm.model.display import counted
@@ -43,7 +43,7 @@ def read_bundler(path: Path) -> Content:
     Raises:
         SurveyFileError: with file and line number.
     """
-    file = next((path / name for name in PLACES if (path / name).is_file()), path) if path.is_dir() else path
+    file = file_in(path, *PLACES) or path
     text = Lines.of(file)
     head = text.due_row("the numbers of cameras and points")
     if len(head) != 2:
@@ -122,8 +122,8 @@ def write_bundler(folder: Path, content: Content) -> None:
 def _names(file: Path, m: int) -> list[str] | None:
     """Return the names of the photographs in list.txt; None without such a list of as many."""
     for folder in (file.parent, file.parent.parent):
-        path = folder / LIST
-        if path.is_file() and not path.is_symlink():
+        path = file_in(folder, LIST)
+        if path is not None:
             text, names = Lines.of(path), []
             while (line := text.maybe_line()) is not None:
                 if not line.strip():

@@ -34,6 +34,7 @@ from adapters.formats.content import Content, select_placed
 from adapters.formats.stated_model import (
     StatedModel,
     content_of,
+    file_in,
     from_vision_axes,
     numbers_of_slots,
     to_vision_axes,
@@ -73,7 +74,7 @@ def read_opensfm(path: Path) -> Content:
     Raises:
         SurveyFileError: with the file and its key or line.
     """
-    file = next((path / name for name in PLACES if (path / name).is_file()), path) if path.is_dir() else path
+    file = file_in(path, *PLACES) or path
     parts = read_trees(file, WHAT)
     sizes = [len(part.entries("shots")) for part in parts]
     part = parts[int(np.argmax(sizes))]
@@ -103,8 +104,8 @@ def read_opensfm(path: Path) -> Content:
         points[name] = stated.add_point(
             f"u{name}" if name.isdecimal() else name, tree.numbers(("coordinates",), 3).tolist()
         )
-    tracks = file.with_name(TRACKS)
-    if tracks.is_file():
+    tracks = file_in(file.parent, TRACKS)
+    if tracks is not None:
         _read_tracks(tracks, stated, points)
     elif stated.images and points:
         stated.notes.append(f"no {TRACKS} is beside it: the points are without image points")

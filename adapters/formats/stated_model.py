@@ -165,6 +165,23 @@ def content_of(stated: StatedModel) -> Content:
     return Content(solution, notes=tuple(notes))
 
 
+def file_in(folder: Path, *names: str) -> Path | None:
+    """Return the first of some files that is in a folder or its subfolders; None if none is.
+
+    Raises:
+        SurveyFileError: it is a link that leaves the folder.
+    """
+    for name in names:
+        path = folder / name
+        if path.is_file():
+            if not path.resolve().is_relative_to(folder.resolve()):
+                raise SurveyFileError(
+                    f"{path}: a link that leaves its folder; the file itself is needed there"
+                )
+            return path
+    return None
+
+
 def from_vision_axes(R: FloatArray) -> FloatArray:
     """Return rotations from image to object axes of those from object axes to x right, y down, z forward.
 

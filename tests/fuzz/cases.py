@@ -152,6 +152,12 @@ def _results(folder: Path) -> list[Seed]:
     write_any(folder / "bundle", "bundle-matlab", network, replace(truth, cameras=(brown,)))
     write_any(folder / "8pts.txt", "bundle-csharp", network, replace(truth, cameras=(brown,)))
     write_any(folder / "pm", "photomodeler", network, replace(truth, cameras=(brown,)))
+    lens = camera_from_values("camera", "radial", camera.size_px, (1.0, 1.0), c_mm=2000.0)
+    forward = camera_from_values("camera", "brown_forward", camera.size_px, (1.0, 1.0), c_mm=2000.0)
+    models = {"opensfm": camera, "nerfstudio": camera, "alicevision": camera}
+    models |= {"bundler": lens, "nvm": brown, "openmvg": forward}
+    for form, of_form in models.items():
+        write_any(folder / form, form, network, replace(truth, cameras=(of_form,)))
     write_any(folder / "scene.db", "colmap-database", network, truth)
     shutil.copy(folder / "scene.db", folder / "good.db")
     found: list[Seed] = []
@@ -165,6 +171,9 @@ def _results(folder: Path) -> list[Seed]:
         (f"bundle/{name}", "bundle", "bundle-matlab")
         for name in ("cams.txt", "pts.txt", "sigmas.txt", "interior.txt")
     ]
+    files += [(name, name, name) for name in ("nerfstudio", "alicevision", "nvm", "openmvg")]
+    files += [(f"opensfm/{name}", "opensfm", "opensfm") for name in ("reconstruction.json", "tracks.csv")]
+    files += [(f"bundler/{name}", "bundler", "bundler") for name in ("bundle.out", "list.txt")]
     for name, whole, form in files:
         text = (folder / name).read_text("utf-8")
         found.append(Seed("results", name, text, _reader_of(whole, form)))

@@ -717,6 +717,17 @@ def test_what_is_refused_is_named(form: str, change: tuple[str, str], message: s
         read_content(path, form)
 
 
+@pytest.mark.parametrize(("form", "name"), [("opensfm", "tracks.csv"), ("bundler", "list.txt")])
+def test_links_out_of_the_folder_are_refused(form: str, name: str, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text("secret\n" * 20)
+    path = written(random_model(form, "links"), form, tmp_path)
+    (path / name).unlink()
+    (path / name).symlink_to(tmp_path / "secret")
+    for source in (path, path / format_named(form).marks[0]):
+        with pytest.raises(SurveyFileError, match=f"{name}: a link that leaves its folder"):
+            read_content(source)
+
+
 @pytest.mark.parametrize("name", ["../a.jpg", "a/../../b.jpg", "..\\x.jpg"])
 def test_names_stay_below_the_folder_of_the_photographs(name: str, tmp_path: Path) -> None:
     path = written(random_model("nerfstudio", "names"), "nerfstudio", tmp_path)
