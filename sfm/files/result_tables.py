@@ -50,14 +50,16 @@ KINDS = (
 class ResultTable:
     """A table of a result: groups of columns that are either all known or all unknown."""
 
-    def __init__(self, stem: str, *groups: str) -> None:
+    def __init__(self, stem: str, *groups: str, may_be_empty: bool = False) -> None:
         """Declare the columns of a table.
 
         Args:
             stem: name of its file without the ending.
             *groups: kind and names of each group, such as "number: X Y Z"; other optional groups are only
                 read if the first optional group is present.
+            may_be_empty: whether it may have no rows, as that of a model of poses, cameras or points alone.
         """
+        self.may_be_empty = may_be_empty
         self.file = f"{stem}.csv"
         declared = []
         for text in groups:
@@ -92,7 +94,7 @@ class ResultTable:
             tuple(name for names in optional for name in names),
             ignored=None,
             blank=blank,
-            may_be_empty=True,  # photographs, points or both may be missing, see `adapters.formats`
+            may_be_empty=self.may_be_empty,
         )
 
     def write(self, folder: Path, *values: Any) -> None:
@@ -142,6 +144,7 @@ POINTS = ResultTable(
     "number: X Y Z",
     "optional: sX sY sZ",
     "further: rays code angle_deg rms_px limiting_sX limiting_sY limiting_sZ",
+    may_be_empty=True,
 )
 IMAGES = ResultTable(
     "images",
@@ -151,6 +154,7 @@ IMAGES = ResultTable(
     "further: somega_deg sphi_deg skappa_deg",
     "name: camera",
     "further: points rms_px coverage",
+    may_be_empty=True,
 )
 CAMERAS = ResultTable(
     "cameras", "name: camera parameter", "number: value", "optional: sigma", "further: unit"
@@ -164,6 +168,7 @@ IMAGE_POINTS = ResultTable(
     "further: vx_px vy_px",
     "flag: rejected",
     "label: source",
+    may_be_empty=True,
 )
 CAMERAS_BALANCED = ResultTable("cameras_balanced", "further: camera parameter value sigma unit")
 TARGETS = ResultTable(
