@@ -6,8 +6,8 @@
   instead of rays. `resect` and `resect_by_all` select a method by name.
 - Steps of the resection: `distance_quartic` and its `positive_roots`, `trilaterate` with `direction_test`,
   `pope_hinsken`. `cylinder_distance` states how well three points determine the position.
-- Pairs: `orient_dependent`, `orient_independent` with the five classical parameters, `orient_direct` onto
-  control in one step, `make_normal_images`.
+- Pairs: `orient_dependent`, `orient_independent` with the five classical parameters, whose model
+  `intersect_pair` computes, `orient_direct` onto control in one step, `make_normal_images`.
 - Scanned and aerial photographs: `orient_fiducials`, `photo_from_pixel`, `pixel_from_photo`.
   `correct_photo_coordinates` applies `radial_from_table`, `refraction_coefficient` and
   `curvature_displacement`; `distort_photo_coordinates` reverses them. `compute_photo_coordinates` simulates a

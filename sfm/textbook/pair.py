@@ -175,6 +175,7 @@ def orient_independent(
     )
 
 
+@checked_arguments(first="n 2", second="n 2")
 def intersect_pair(orientation: PairOrientation, first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the model coordinates of the conjugate rays of an oriented pair, unit of its base, (n, 3).
 
