@@ -45,7 +45,7 @@ def accept(
         Path, typer.Option("--out", metavar="DIR", help="Folder for the table and the page.")
     ] = Path("out/acceptance"),
 ) -> None:
-    """Test a result against calibrated lengths (VDI/VDE 2634 part 1).
+    """Test a result against calibrated lengths (VDI/VDE 2634).
 
     The scale must come from other bars than the tested ones. Exit code 1 if an error of a length provably
     exceeds the limit, or simply exceeds it where the calibration has no standard deviation.

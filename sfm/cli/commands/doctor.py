@@ -99,7 +99,7 @@ CHECKS: tuple[tuple[str, Callable[[], str]], ...] = (
 
 
 def doctor() -> None:
-    """Check this installation by a short measurement and adjustment.
+    """Check this installation by a short measurement.
 
     Also prints versions, cores and folders. Exit code 1 if a check fails; its line states the remedy.
     """
