@@ -65,14 +65,16 @@ def read_pair(
     """
     interior = [read_interior("orient pair", c_mm, path) for path in (camera, camera_right or camera)]
     (first, xy), (second, xy_right) = (read_points(path, PHOTO) for path in (left, right))
-    names = tuple(name for name in first if name in set(second))
+    common = set(first) & set(second)
+    names = tuple(name for name in first if name in common)
     if not names:
         raise SurveyFileError(f"{left} and {right}: no point has the same name in both")
 
     def rays(every: tuple[str, ...], xy_mm: FloatArray, values: dict[str, float]) -> FloatArray:
-        return tangents_of_photo(xy_mm[[every.index(name) for name in names]], values)
+        row = {name: k for k, name in enumerate(every)}
+        return tangents_of_photo(xy_mm[[row[name] for name in names]], values)
 
-    alone = tuple(dict.fromkeys(name for name in (*first, *second) if name not in set(names)))
+    alone = tuple(name for name in (*first, *second) if name not in common)
     return ConjugateRays(
         names,
         rays(first, xy, interior[0]),
@@ -93,8 +95,9 @@ def read_control(
     """
     table = read_table(path, ("point",), OBJECT, ("sigma",), aliases=METRES, ignored=None)
     given = table.keys("point")
-    rows = [k for k, name in enumerate(given) if name in set(names)]
-    absent = tuple(name for name in given if name not in set(names))
+    known = set(names)
+    rows = [k for k, name in enumerate(given) if name in known]
+    absent = tuple(name for name in given if name not in known)
     if len(rows) < 3:
         raise SurveyFileError(
             f"{path}: {counted(len(rows), 'control point')} of the model, at least 3 are needed"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,17 +29,12 @@ class SurveySoFar(WatchedSurvey):
 
     def write(self, result: SurveyResult, _: Path, __: Path) -> None:
         """Take the result, and plan the next photographs."""
-        from sfm.products.planning.plan import further_photographs
+        from sfm.products.planning.plan import further_photographs, with_image_sigma
 
-        adjustment, self.result = result.adjustment, result
-        factor = (adjustment.sigma0_px / adjustment.stated_px) ** 2
-        seen = result.solution.network.image_points
-        network = replace(
-            result.solution.network, image_points=replace(seen, covariance=factor * seen.covariance)
-        )
+        self.result, sigma, solution = result, result.adjustment.sigma0_px, result.solution
         try:
             self.further = further_photographs(
-                network, result.solution.estimate, sigma_px=adjustment.sigma0_px
+                with_image_sigma(solution.network, sigma), solution.estimate, sigma_px=sigma
             )
         except GeometryError:
             self.further = None

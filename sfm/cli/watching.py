@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -33,12 +34,12 @@ class WatchedSurvey:
     is_dependable: bool = False  # the last result
 
     def so_far(self) -> Iterator[str]:
-        """Yield what is known so far, and what to photograph next."""
-        raise NotImplementedError
+        """Yield what is known so far, and what to photograph next; nothing of a survey that plans nothing."""
+        yield from ()
 
     def uncertainty(self) -> float:
-        """Return the uncertainty that is compared with `until`, NaN if it is not known."""
-        raise NotImplementedError
+        """Return the uncertainty that is compared with `until`; NaN, which none reaches, if not known."""
+        return math.nan
 
     def begin(self) -> bool:
         """Prepare a run; return whether its survey file was drafted here before, and stays.
@@ -63,6 +64,16 @@ class WatchedSurvey:
 
     def _is_changed(self, path: Path) -> bool:
         return path.read_bytes() != self.own[path]
+
+
+def run_or_watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) -> None:
+    """Run a survey once, or whenever photographs are added if it is watched; see `watch`."""
+    if product.is_watched:
+        watch(photographs, run, product)
+    elif product.until:
+        raise KolinearError(f"--until {product.until:g} is for --watch")
+    else:
+        run()
 
 
 def watch(photographs: Path, run: Callable[[], None], product: WatchedSurvey) -> None:

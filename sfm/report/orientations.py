@@ -266,13 +266,11 @@ def georeferencing_report(
         f"picture of {grid.width} x {grid.height} pixels of {grid.pixel:.6g}; "
         f"a pixel of the photograph covers {size.min():.4g} to {size.max():.4g} at the control",
     ]
-    rms = {}
-    for name in MODELS:
-        try:
+    rms = {t.model: t.predicted_rms}
+    for name in MODELS.keys() - rms.keys():
+        with suppress(GeometryError):  # the points are too few for it
             rms[name] = fit_plane(xy, places, model=name).predicted_rms
-        except GeometryError:
-            continue  # the points are too few for it
-    known = {name: value for name, value in rms.items() if np.isfinite(value)}
+    known = {name: rms[name] for name in MODELS if np.isfinite(rms.get(name, np.nan))}
     if known:
         listing = ", ".join(f"{name} {value:.3g}" for name, value in known.items())
         lines.append(f"each point predicted from the others, RMS of a coordinate, px: {listing}")

@@ -35,6 +35,15 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
     return steps
 
 
+@pytest.fixture
+def photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in the current one."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("photos")
+    folder.mkdir()
+    return folder
+
+
 def nothing() -> None:
     """Let a pause go by."""
 
@@ -57,26 +66,30 @@ def boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def targets(tmp_path: Path) -> Path:
+    """Photographs of coded targets, which come from here."""
+    folder = tmp_path / "camera"
+    folder.mkdir()
+    for k, picture in enumerate(pictures()):
+        cv2.imwrite(str(folder / f"{k}.png"), picture)
+    return folder
+
+
 def test_a_camera_is_calibrated_until_it_is_known(
-    tmp_path: Path,
-    boards: Path,
-    events: list[Step],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    photos: Path, boards: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each photograph is reported, the camera becomes better known, and the wanted uncertainty ends it."""
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
     black = np.zeros((600, 800), np.uint8)
 
     def empty() -> None:
         cv2.imwrite("photos/z.png", black)
 
     events += [
-        *adds(Path("photos"), boards, 0, 3),
+        *adds(photos, boards, 0, 3),
         empty,
         nothing,
-        *adds(Path("photos"), boards, 4, 8),
+        *adds(photos, boards, 4, 8),
         nothing,
     ]
     assert kolinear("calibrate", "photos", "--watch", "--until", 0.08, "--pitch", 12) == 0
@@ -92,17 +105,11 @@ def test_a_camera_is_calibrated_until_it_is_known(
 
 
 def test_too_few_photographs_are_waited_for(
-    tmp_path: Path,
-    boards: Path,
-    events: list[Step],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    photos: Path, boards: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The draft of two photographs, which give no camera, is replaced; Ctrl-C ends with the last code."""
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
-    few, one = adds(Path("photos"), boards, 1, 1), adds(Path("photos"), boards, 0, 0)
-    events += [*one, *few, *adds(Path("photos"), boards, 2, 5)]
+    few, one = adds(photos, boards, 1, 1), adds(photos, boards, 0, 0)
+    events += [*one, *few, *adds(photos, boards, 2, 5)]
     assert kolinear("calibrate", "photos", "--watch", "--pitch", 12) == 0
     shown = capsys.readouterr()
     assert "not yet: photos: 1 photograph of one camera" in shown.out
@@ -111,21 +118,12 @@ def test_too_few_photographs_are_waited_for(
 
 
 def test_a_survey_says_which_photographs_are_next(
-    tmp_path: Path,
-    events: list[Step],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    photos: Path, targets: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    source = tmp_path / "camera"
-    for folder in (source, Path("photos")):
-        folder.mkdir()
-    for k, picture in enumerate(pictures()):
-        cv2.imwrite(str(source / f"{k}.png"), picture)
     count = len(pictures())
     events += [
-        *adds(Path("photos"), source, 0, count - 2),
-        *adds(Path("photos"), source, count - 1, count - 1),
+        *adds(photos, targets, 0, count - 2),
+        *adds(photos, targets, count - 1, count - 1),
     ]
     assert kolinear("run", "photos", "--watch") == 0
     shown = capsys.readouterr().out
@@ -136,51 +134,32 @@ def test_a_survey_says_which_photographs_are_next(
 
 
 def test_a_camera_of_targets_without_scale_has_no_mm(
-    tmp_path: Path,
-    events: list[Step],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    photos: Path, targets: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    source = tmp_path / "camera"
-    for folder in (source, Path("photos")):
-        folder.mkdir()
-    for k, picture in enumerate(pictures()):
-        cv2.imwrite(str(source / f"{k}.png"), picture)
-    events += adds(Path("photos"), source, 0, len(pictures()) - 1)
+    events += adds(photos, targets, 0, len(pictures()) - 1)
     assert kolinear("calibrate", "photos", "--watch") == 0
     following = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  next: ")]
     assert len(following) == 1 and "network units; worst corner then" in following[0]
 
 
-def test_a_survey_file_that_exists_is_never_removed(
-    tmp_path: Path, boards: Path, events: list[Step], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
+def test_a_survey_file_that_exists_is_never_removed(photos: Path, boards: Path, events: list[Step]) -> None:
     own = Path("photos/survey.toml")
     own.write_text("[survey]\nname = 'mine'\n", "utf-8")
-    events += [*adds(Path("photos"), boards, 0, 1), *adds(Path("photos"), boards, 2, 3)]
+    events += [*adds(photos, boards, 0, 1), *adds(photos, boards, 2, 3)]
     assert kolinear("calibrate", "photos", "--watch") != 0
     assert own.read_text("utf-8") == "[survey]\nname = 'mine'\n"
 
 
 def test_a_draft_that_somebody_changed_is_never_removed(
-    tmp_path: Path,
-    boards: Path,
-    events: list[Step],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    photos: Path, boards: Path, events: list[Step], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two photographs give no camera; the draft that is changed then is run with the next ones."""
-    monkeypatch.chdir(tmp_path)
-    Path("photos").mkdir()
     draft = Path("out/photos.toml")
 
     def change() -> None:
         draft.write_text(draft.read_text("utf-8") + "# mine\n", "utf-8")
 
-    events += [*adds(Path("photos"), boards, 0, 1), change, *adds(Path("photos"), boards, 2, 5)]
+    events += [*adds(photos, boards, 0, 1), change, *adds(photos, boards, 2, 5)]
     kolinear("calibrate", "photos", "--watch", "--pitch", 12)
     assert draft.read_text("utf-8").endswith("# mine\n")
     shown = capsys.readouterr()

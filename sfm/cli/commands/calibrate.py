@@ -14,7 +14,7 @@ import typer
 
 from sfm.cli.options import Jobs, Out, Overwrite, Pitch, SurveyOrPhotographs
 from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
-from sfm.cli.watching import WatchedSurvey, watch
+from sfm.cli.watching import WatchedSurvey, run_or_watch
 from sfm.model.errors import KolinearError
 
 if TYPE_CHECKING:
@@ -87,8 +87,6 @@ def calibrate(
 
         if model not in MODELS:
             raise KolinearError(f"--model '{model}', expected one of {', '.join(MODELS)}")
-    if until and not watched:
-        raise KolinearError(f"--until {until:g} is for --watch")
     product = _Product(distances=distances, until=until, is_watched=watched)
 
     def edit(text: str) -> str:
@@ -112,10 +110,7 @@ def calibrate(
         )
         run_survey_file(survey_file, options)
 
-    if watched:
-        watch(photographs, run_once, product)
-    else:
-        run_once()
+    run_or_watch(photographs, run_once, product)
 
 
 def _refuse_model(survey_file: Path, model: str | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -35,13 +34,11 @@ def plan_more(
     from there are not known.
     """
     with loading():
-        import numpy as np
-
         from adapters.formats.control_tables import read_given
         from adapters.formats.result_tables import read_result
         from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
-        from sfm.products.planning.plan import further_photographs
+        from sfm.products.planning.plan import further_photographs, image_sigma, with_image_sigma
         from sfm.report.pages import page_of, write_declared
         from sfm.runtime.progress import StageClock
         from sfm.runtime.progress_bar import drawn_progress
@@ -50,14 +47,10 @@ def plan_more(
     with working_on(str(result)), drawn_progress() as drawn, StageClock(drawn).stage("plan"):
         stored = read_result(result)
         given = read_given(result, stored.network)
-        seen = stored.network.image_points
-        stated = float(np.median(np.sqrt(np.trace(seen.covariance, axis1=1, axis2=2) / 2)))
-        sigma = given.sigma0_px or stated
+        sigma = given.sigma0_px or image_sigma(stored.network)
         if not sigma > 0:
             raise GeometryError("the standard deviation of its image points is not known")
-        network = replace(
-            stored.network, image_points=replace(seen, covariance=seen.covariance * (sigma / stated) ** 2)
-        ).with_given(given.bars)
+        network = with_image_sigma(stored.network, sigma).with_given(given.bars)
         further = further_photographs(
             network, stored.estimate, sigma_px=sigma, count=count, max_incidence_deg=incidence
         )

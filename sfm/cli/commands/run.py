@@ -21,7 +21,7 @@ from sfm.cli.options import (
     Weighted,
 )
 from sfm.cli.survey_runs import RunOptions, run_survey_file, stated_or_drafted
-from sfm.cli.watching import watch
+from sfm.cli.watching import run_or_watch
 from sfm.model.errors import KolinearError
 
 
@@ -75,8 +75,6 @@ def run(
 
     if images is not None and (survey_file.is_dir() or is_video(survey_file)):
         raise KolinearError(f"{survey_file}: photographs and videos need no --images {images}")
-    if until and not watched:
-        raise KolinearError(f"--until {until:g} is for --watch")
     from sfm.cli.watched_survey import SurveySoFar
 
     rounds = SurveySoFar(is_watched=watched, until=until)
@@ -106,7 +104,4 @@ def run(
         )
         run_survey_file(file, options)
 
-    if watched:
-        watch(survey_file, run_once, rounds)
-    else:
-        run_once()
+    run_or_watch(survey_file, run_once, rounds)

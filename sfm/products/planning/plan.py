@@ -222,6 +222,18 @@ class Further:
     adjustment: Adjustment  # predicted, of the survey together with the further photographs
 
 
+def image_sigma(network: Network) -> float:
+    """Return the standard deviation of a usual image coordinate of a network, px; NaN without any."""
+    C = network.image_points.covariance
+    return float(np.median(np.sqrt(np.trace(C, axis1=1, axis2=2) / 2))) if len(C) else math.nan
+
+
+def with_image_sigma(network: Network, sigma_px: float) -> Network:
+    """Return a network whose image points are as precise as stated, in the same ratios to one another."""
+    seen, factor = network.image_points, (sigma_px / image_sigma(network)) ** 2
+    return replace(network, image_points=replace(seen, covariance=seen.covariance * factor))
+
+
 @checked_arguments()
 def further_photographs(
     network: Network,
