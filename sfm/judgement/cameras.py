@@ -74,7 +74,15 @@ def _principal_points(result: SurveyResult) -> tuple[Remark, ...]:
         sigma_px = float(sigmas.max()) / (float(np.mean(camera.pixel_mm)) if camera.in_mm else 1.0)
         sigma = sigma_px / diagonal
         surely = away - EXPECTED_SIGMAS * sigma
-        off = remark("principal_point_far", camera=camera.name, share=away, sigma=sigma, surely=surely)
+        off_lenses = away / float(np.hypot(sigma, DECENTRING_FRACTION))
+        off = remark(
+            "principal_point_far",
+            camera=camera.name,
+            share=away,
+            sigma=sigma,
+            surely=surely,
+            off_lenses=off_lenses if sigma > DECENTRING_FRACTION else None,
+        )
         far = unless_note(off)
         remarks += far
         other = _format_around(at, width, height) if far else None

@@ -70,6 +70,24 @@ def test_a_principal_point_far_from_the_centre_is_reported(share: float, severit
     assert all(one.severity == "warning" for one in far)
 
 
+@pytest.mark.parametrize(
+    ("sigma", "severity"), [(0.01, "warning"), (0.019, "warning"), (0.022, "error"), (0.1, "warning")]
+)
+def test_a_principal_point_that_no_lens_has_is_an_error_where_photographs_know_less(
+    sigma: float, severity: str
+) -> None:
+    """0.2 of the diagonal: cropped photographs, where they determine it better than lenses in general do."""
+    network, truth = make_network(seed_of("outside"), images=8, points=40)
+    moved = with_parameter(adjust(network, truth, datum=Datum("free")), "x0", 0.2 * np.hypot(10.0, 7.5))
+    factor = (
+        sigma * np.hypot(10.0, 7.5) / moved.interior_sigma(0)[moved.estimate.cameras[0].parts[1]].max()
+    ) ** 2
+    weak = replace(moved.covariance, interior=tuple(factor * block for block in moved.covariance.interior))
+    (off,) = of_kind(verdict_of(replace(moved, covariance=weak)).remarks, "principal_point_far")
+    assert off.severity == severity
+    assert ("contradicts what lenses have" in off.text) == (sigma > 0.02)
+
+
 @pytest.mark.parametrize("name", ["b1", "b2"])
 def test_pixels_that_no_sensor_has_are_reported(name: str) -> None:
     network, truth = make_network(seed_of("no such pixels"), images=8, points=40, free=("c", "b1", "b2"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sfm.model.remarks.row import WRONG_SIGMAS, Grade, Kind, Unless
+from sfm.model.remarks.row import EXPECTED_SIGMAS, WRONG_SIGMAS, Grade, Kind, Unless
 
 # A warning if the 95 % value reaches one pixel, which no one expects of a calibrated camera. An error if the
 # standard deviation reaches one pixel and is large compared with the image points of the calibration, so that
@@ -125,9 +125,15 @@ ROWS = (
     Kind(
         "principal_point_far",
         # Of the diagonal; a decentred lens or sensor has 0.01 or 0.02. Half way to a corner there is none.
-        Grade("share", warning=0.1, also=Grade("surely", warning=0.25, error=0.25)),
+        # Where lenses in general tell more of it than these photographs, it must agree with them.
+        Grade(
+            "share",
+            warning=0.1,
+            also=Grade("surely", 0.25, 0.25, also=Grade("off_lenses", error=EXPECTED_SIGMAS)),
+        ),
         "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
-        "photograph (standard deviation {sigma:%}).",
+        "photograph (standard deviation {sigma:%})[[; that contradicts what lenses have by {off_lenses} "
+        "standard deviations]].",
         "a camera that the photographs hardly determine, wrong matches, or cropped photographs",
         "Hold it fixed, give uncropped photographs, or add photographs turned by 90 degrees.",
     ),
