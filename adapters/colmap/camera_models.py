@@ -26,7 +26,7 @@ from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shorten
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
-from sfm.model.conventions import BoolArray
+from sfm.model.conventions import AnyArray, BoolArray
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import ImagePoints, Network
@@ -40,6 +40,7 @@ def write_model(
     estimate: Estimate,
     *,
     rejected: BoolArray | None = None,
+    colours: AnyArray | None = None,
     text: bool = False,
 ) -> None:
     """Write a network and its solution as a COLMAP model: cameras, rigs, frames, images and points.
@@ -51,6 +52,7 @@ def write_model(
         network: the measured network.
         estimate: cameras in a model that COLMAP has; photographs without orientation are left out.
         rejected: image points that are not linked to their point, (k,).
+        colours: red, green and blue of the points, uint8, (n, 3); black if None.
         text: whether to write text files instead of binary ones.
 
     Raises:
@@ -59,7 +61,7 @@ def write_model(
     """
     pycolmap = load_pycolmap()
     with quiet(pycolmap):
-        scene = reconstruction(pycolmap, network, estimate, rejected=rejected)
+        scene = reconstruction(pycolmap, network, estimate, rejected=rejected, colours=colours)
     write_scene(folder, scene, text=text)
     with disk_errors(f"{folder}: the COLMAP model cannot be written"):
         as_read = replace(estimate, cameras=tuple(as_opencv(camera) for camera in estimate.cameras))

@@ -23,7 +23,7 @@ import numpy as np
 
 from adapters.colmap.model_files import MODELS as COLMAP_MODELS
 from sfm.model.camera import Camera
-from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
 from sfm.model.distortion.models import MODELS, Role
 from sfm.model.errors import BackendError
 from sfm.model.estimate import Estimate, Mounts
@@ -38,9 +38,17 @@ PARTS_OF_OPENCV = ("simple_pinhole", "pinhole", "simple_radial", "radial")
 
 
 def reconstruction(
-    pycolmap: ModuleType, network: Network, estimate: Estimate, *, rejected: BoolArray | None = None
+    pycolmap: ModuleType,
+    network: Network,
+    estimate: Estimate,
+    *,
+    rejected: BoolArray | None = None,
+    colours: AnyArray | None = None,
 ) -> Any:
-    """Return a network as a pycolmap.Reconstruction, with cameras, photographs and points numbered from 1."""
+    """Return a network as a pycolmap.Reconstruction, with cameras, photographs and points numbered from 1.
+
+    rejected: image points that are not linked to their point, (k,). colours: of points, uint8, (n, 3).
+    """
     scene = pycolmap.Reconstruction()
     rigged = _add_cameras(pycolmap, scene, estimate, None if network.moment is None else estimate.mounts)
     frames: dict[int, Any] = {}
@@ -71,6 +79,8 @@ def reconstruction(
             [pycolmap.TrackElement(int(seen.image[r]) + 1, int(slot[r])) for r in rows if claimed[r]]
         )
         point = pycolmap.Point3D(xyz=estimate.points[j], track=pycolmap.Track())
+        if colours is not None:
+            point.color = colours[j]
         scene.add_point3D_with_id(j + 1, point)
         for element in track.elements:
             scene.add_observation(j + 1, element)

@@ -10,11 +10,11 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sfm.adjustment.result import Adjustment
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.arguments import checked_arguments
+from sfm.model.conventions import AnyArray
 from sfm.model.errors import BackendError, SurveyFileError
 from sfm.model.remarks.remark import Remark, remark
 from sfm.model.solution import Solution, solution_of
@@ -171,11 +171,22 @@ def sensor_widths(note: Callable[[Remark], None]) -> Callable[[str, str], float 
     return width
 
 
-def colmap_writer(result: SurveyResult) -> Callable[[Path], Any] | None:
-    """Return a function that writes the compared solution as a COLMAP model; None without a comparison."""
+def colmap_writer(result: SurveyResult) -> Callable[[Path, AnyArray | None], None] | None:
+    """Return a function that writes the compared solution as a COLMAP model; None without a comparison.
+
+    The function receives a folder, and the colours of the points of the result, uint8, (n, 3), if known.
+    """
     comparison = result.comparison
     if comparison is None:
         return None
     from adapters.colmap.camera_models import write_model
 
-    return lambda folder: write_model(folder, comparison.network, comparison.adjustment.estimate)
+    network = comparison.network
+    numbers = {name: j for j, name in enumerate(result.adjustment.network.points)}
+    order = [numbers[name] for name in network.points]
+
+    def write(folder: Path, colours: AnyArray | None) -> None:
+        own = None if colours is None else colours[order]
+        write_model(folder, network, comparison.adjustment.estimate, colours=own)
+
+    return write

@@ -40,12 +40,14 @@ from sfm.files.whole_files import whole_folder
 from sfm.judgement.calibrated_cameras import projection_of
 from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import StageTime, SurveyResult
+from sfm.model.conventions import AnyArray
 from sfm.model.display import counted, listed
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.remarks.remark import remark
 from sfm.report.figures.overlays import Overlay, draw_overlays
 from sfm.report.figures.plot_data import EpipolarMap, PlotCamera, PlotData, ProjectionMap
 from sfm.report.figures.plot_process import PlotProcess, draw_plots
+from sfm.report.figures.point_colours import photographed_colours
 from sfm.report.findings import Findings, with_remark
 from sfm.report.pages import html_of, page_of, text, texts_of
 from sfm.report.phrases import finer_unit
@@ -68,7 +70,7 @@ def write_result(
     findings: Findings,
     out: Path,
     *,
-    write_colmap: Callable[[Path], None] | None = None,
+    write_colmap: Callable[[Path, AnyArray | None], None] | None = None,
     finish: Callable[[Path], None] | None = None,
     jobs: int = 1,
     budget_mb: float = BUDGET_MB,
@@ -80,7 +82,8 @@ def write_result(
     Args:
         findings: the result and the remarks on it.
         out: the folder; an unchanged earlier result in it is replaced, anything else in it is an error.
-        write_colmap: fills the folder `colmap`, whose path it receives; None omits that folder.
+        write_colmap: fills the folder `colmap`, whose path it receives, with the colours of the points,
+            uint8, (n, 3), None if unknown; None omits that folder.
         finish: receives the folder when everything else is written, and may add log.jsonl.
         jobs: photographs drawn at the same time.
         budget_mb: maximum size of the pictures inside report.html, 10^6 bytes.
@@ -95,13 +98,14 @@ def write_result(
     """
     out, started, result = Path(out), time.perf_counter(), findings.result
     with _result_folder(out, finish, progress, steps=2 * len(result.photographs)) as folder:
-        if write_colmap is not None:
-            (folder / "colmap").mkdir()
-            write_colmap(folder / "colmap")
         shown = plot_data(findings)
         if plot_process is not None:
             plot_process.begin(shown)
-        scene = scene_of_result(findings)
+        colours = photographed_colours(result.photographs, result.adjustment, jobs=jobs)
+        if write_colmap is not None:
+            (folder / "colmap").mkdir()
+            write_colmap(folder / "colmap", colours)
+        scene = scene_of_result(findings, colours)
         give_back_memory()
         # One after another: while Python works, threads with short calls wait for their turn each time.
         overlays = draw_overlays(result.photographs, result.adjustment, jobs=jobs, progress=progress)
@@ -114,7 +118,7 @@ def write_result(
         if lost:
             findings = with_remark(findings, remark("photographs_not_drawn", photographs=lost))
             result = findings.result
-        write_tables(findings, folder)
+        write_tables(findings, folder, colours)
         _write_overlays(overlays, folder)
         if pictures.beside:
             (folder / "pictures").mkdir()

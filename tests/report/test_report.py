@@ -590,7 +590,7 @@ def test_overlays_have_different_names() -> None:
 def test_result_appears_whole_and_replaces_an_earlier_one(result: SurveyResult, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "out"
     page = write_result(
-        findings_of(result), out, write_colmap=lambda folder: (folder / "x.bin").touch(), jobs=2
+        findings_of(result), out, write_colmap=lambda folder, _: (folder / "x.bin").touch(), jobs=2
     )
     assert page == out / "report.html"
     # the run itself adds the log; only of many points a sample has its covariance kept
@@ -618,7 +618,7 @@ def test_a_failure_leaves_nothing_and_the_earlier_result(result: SurveyResult, t
     small = replace(result, photographs=())
     write_result(findings_of(small), out)
 
-    def fail(folder: Path) -> None:
+    def fail(folder: Path, colours: object) -> None:
         raise OSError(28, "No space left on device")
 
     with pytest.raises(OutputError, match="out: the result cannot be written: No space left on device"):

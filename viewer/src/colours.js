@@ -64,6 +64,18 @@ export class Scale {
   }
 }
 
+/** The colours that the photographs show, in place of a scale: the value of a point is its number. */
+class Photographed {
+  constructor(colours) {
+    this.name = "colours of the photographs"
+    this.colours = colours
+  }
+
+  colour(j) {
+    return this.colours.subarray(3 * j, 3 * j + 3)
+  }
+}
+
 /** Scales of the points. */
 export function pointScales(model) {
   const sigma = Float64Array.from({ length: model.pointCount }, (_, j) => model.sigma(j))
@@ -91,6 +103,11 @@ export function pointScales(model) {
     const options = { factor: model.fine.factor, signed: true }
     const first = new Scale("deviation of a point", model.fine.unit, -most, most, options)
     return { scales: { deviation: first, ...scales }, values: { deviation, ...values } }
+  }
+  const colours = model.a["point.colour"]
+  if (colours) {
+    const numbers = Uint32Array.from({ length: model.pointCount }, (_, j) => j)
+    return { scales: { photographed: new Photographed(colours), ...scales }, values: { photographed: numbers, ...values } }
   }
   return { scales, values }
 }
@@ -125,6 +142,10 @@ function ends(values, others) {
 
 /** Draw a scale with its labels and with fields for its limits. */
 export function drawLegend(scale, element, make, onchange) {
+  if (scale instanceof Photographed) {
+    element.replaceChildren(make("div", { className: "v-legend-name" }, scale.name))
+    return
+  }
   const bar = make("canvas", { width: 240, height: 1, className: "v-bar" })
   const context = bar.getContext("2d")
   for (let x = 0; x < bar.width; x++) {

@@ -80,7 +80,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const own = make("div", { className: "v-legend" })
   const other = make("div", { className: "v-legend" })
   legends.append(own, other)
-  let by = ["displacement", "deviation", "sigma", "rms", "rays"].find((key) => scales[key])
+  let by = ["displacement", "deviation", "photographed", "sigma", "rms", "rays"].find((key) => scales[key])
   let byPhoto = photos ? "rms" : ""
   const paint = () => {
     for (const scale of [...Object.values(scales), ...(photos ? [photos] : [])]) scale.dark = scene.dark
@@ -98,7 +98,7 @@ function toolbar(model, scene, hub, tools, legends) {
   const names = make("datalist", { id: "viewer-names" })
   find.addEventListener("input", () => suggest(model, find.value, names))
   find.addEventListener("change", () => findName(model, scene, hub, find))
-  const words = { sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
+  const words = { photographed: "photographs", sigma: "sigma", rays: "rays", rms: "RMS", angle: "intersection angle", deviation: "deviation", displacement: "displacement" }
   const options = Object.keys(scales).map((key) => [key, words[key]])
   const views = [["", "view\u2026"], ["home", "object only"], ["all", "object and photographs"], ...["+X", "-X", "+Y", "-Y", "+Z", "-Z"].map((v) => [v, `from ${v}`])]
   const standard = choice("", views, (name) => {

@@ -24,6 +24,7 @@ from sfm.files.plain_text import as_plain
 from sfm.files.user_cache import make_user_folder, remove_unused, user_folder
 from sfm.files.whole_files import whole_file
 from sfm.judgement.survey_result import SurveyResult
+from sfm.model.conventions import AnyArray
 from sfm.model.errors import FolderInUseError, OutputError
 from sfm.pipeline import run_survey
 from sfm.report.findings import Findings, findings_of
@@ -74,7 +75,8 @@ class Comparers:
     """Programs to compare surveys with, as functions of a module, which can be sent to workers."""
 
     others_of: Callable[[Survey], OtherPrograms]  # returns the programs that a survey requests
-    writer_of: Callable[[SurveyResult], Callable[[Path], None] | None]  # returns the writer of its model
+    # returns the writer of its model, which receives a folder and the colours of the points
+    writer_of: Callable[[SurveyResult], Callable[[Path, AnyArray | None], None] | None]
 
 
 @dataclass(frozen=True)

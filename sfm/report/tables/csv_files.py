@@ -18,6 +18,7 @@ from sfm.files.result_tables import MOMENTS, MOUNTS, write_rigs
 from sfm.judgement.bundle_statistics import Statistics
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import base_name
+from sfm.model.conventions import AnyArray
 from sfm.model.distortion.brown import (
     BALANCED,
     BALANCED_MODEL,
@@ -35,8 +36,11 @@ CODED_COLOUR, UNCODED_COLOUR = (20, 140, 60), (120, 120, 120)  # in points.ply
 USUAL_R0 = 2 / 3  # usual R0 over the largest image radius
 
 
-def write_tables(findings: Findings, folder: Path) -> None:
-    """Write all tables of a result into an existing folder; `summary.write_summary` adds the key figures."""
+def write_tables(findings: Findings, folder: Path, colours: AnyArray | None = None) -> None:
+    """Write all tables of a result into an existing folder; `summary.write_summary` adds the key figures.
+
+    colours: red, green and blue of the points in the photographs, uint8, (n, 3), for those of texture.
+    """
     result, statistics = findings.result, findings.statistics
     a = result.adjustment
     g, codes = findings.geometry, [None if code < 0 else code for code in result.code.tolist()]
@@ -64,9 +68,13 @@ def write_tables(findings: Findings, folder: Path) -> None:
         tables.CAMERAS_BALANCED.write_rows(folder, balanced_rows(findings))
     if len(result.seen_targets.image):
         tables.TARGETS.write_rows(folder, target_rows(findings))
-    colours = [UNCODED_COLOUR if code is None else CODED_COLOUR for code in codes]
+    shades = [UNCODED_COLOUR if code is None else CODED_COLOUR for code in codes]
+    if colours is not None:
+        of_texture = a.network.windows
+        for j, (name, colour) in enumerate(zip(a.network.points, colours.tolist(), strict=True)):
+            shades[j] = tuple(colour) if name in of_texture else shades[j]
     unit = result.length_unit
-    write_ply(folder / "points.ply", a.estimate.points, colours=colours, unit=unit)
+    write_ply(folder / "points.ply", a.estimate.points, colours=shades, unit=unit)
 
 
 def table_stems(findings: Findings) -> tuple[str, ...]:

@@ -115,6 +115,8 @@ def packed_scene(scene: ViewerScene, pictures: Pictures) -> str:
         states = sorted(set(scene.state))
         arrays["point.displacement"] = ("f4", scene.displacement)
         arrays["point.state"] = ("u1", np.array([states.index(state) for state in scene.state]))
+    if scene.colour is not None:
+        arrays["point.colour"] = ("u1", scene.colour)
     if scene.deviation is not None:
         arrays["point.deviation"] = ("f4", scene.deviation)
     return _packed(_header(scene, pictures), arrays)
@@ -194,8 +196,11 @@ def _packed(header: dict[str, Any], arrays: dict[str, tuple[str, AnyArray]]) -> 
     return base64.b64encode(gzip.compress(data, compresslevel=6, mtime=0)).decode()
 
 
-def scene_of_result(findings: Findings) -> ViewerScene:
-    """Return the scene of a survey, with the measured and rejected candidates in its photographs."""
+def scene_of_result(findings: Findings, colours: AnyArray | None = None) -> ViewerScene:
+    """Return the scene of a survey, with the measured and rejected candidates in its photographs.
+
+    colours: red, green and blue of the points in the photographs, uint8, (n, 3); None if unknown.
+    """
     result, a = findings.result, findings.result.adjustment
     names, check = a.network.points, result.control_check
     scene = scene_of_stored(
@@ -206,7 +211,12 @@ def scene_of_result(findings: Findings) -> ViewerScene:
         residuals=a.residuals,
     )
     checked = () if check is None else tuple(names.index(name) for name in check.points if name in names)
-    return replace(scene, exterior_sigma=findings.precision.exterior_deg, control=scene.control or checked)
+    return replace(
+        scene,
+        exterior_sigma=findings.precision.exterior_deg,
+        control=scene.control or checked,
+        colour=None if colours is None else colours[a.estimate.determined],
+    )
 
 
 def scene_of_stored(

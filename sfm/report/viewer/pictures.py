@@ -368,6 +368,7 @@ class ViewerScene:
         None  # of points since an earlier epoch, object unit; NaN likewise, (n, 3)
     )
     state: tuple[str, ...] = ()  # outcome of the test of each displacement, (n,)
+    colour: AnyArray | None = None  # red, green and blue of points in the photographs, 0 to 255, (n, 3)
 
 
 def distance_sigmas(xyz: FloatArray, covariance: FloatArray) -> FloatArray:
