@@ -24,6 +24,7 @@ from sfm.report.phrases import (
     describe_rigs,
     describe_sigma0,
     describe_test,
+    describe_view,
     finer_unit,
     significant,
     words_left_out,
@@ -215,6 +216,8 @@ def _cameras(findings: Findings) -> Iterator[tuple[str, str]]:
         values, sigmas, within, projection = describe_calibration(camera)
         yield f"camera {camera.name}", f"{values}; 1 sigma {sigmas}; 95 % {within}"
         yield "  projection", projection
+        if view := describe_view(findings, camera.name):
+            yield "  view", view
     if len(findings.calibrated) > MAX_LISTED:
         yield "cameras", f"{len(findings.calibrated) - MAX_LISTED} more, in the report"
 

@@ -181,6 +181,22 @@ def describe_calibration(camera: CalibratedCamera) -> tuple[str, str, str, str]:
     return ", ".join(values), ", ".join(sigmas), ", ".join(within), projection
 
 
+def describe_view(findings: Findings, name: str) -> str:
+    """Return f, cx and cy of a camera in px if it has mm, and its field of view; empty without such a camera.
+
+    cx and cy count from the centre of the upper left pixel, as in OpenCV.
+    """
+    cameras = {camera.name: camera for camera in findings.result.adjustment.estimate.cameras}
+    for lens in findings.protocol.lenses:
+        if lens.camera == name:
+            cx, cy = (fixed(place, 1) for place in cameras[name].principal_point_px - 0.5)
+            f = fixed(cameras[name].c_px, 1)
+            in_px = f"f {f} px, cx {cx} px, cy {cy} px; " if cameras[name].in_mm else ""
+            across, up, _ = (fixed(angle, 1) for angle in lens.field_of_view_deg)
+            return f"{in_px}field of view {across} x {up} deg"
+    return ""
+
+
 def describe_fixed(precision: Precision) -> str:
     """Return a note that fixed coordinates do not count; empty if there are none."""
     count = precision.fixed_points

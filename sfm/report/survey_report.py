@@ -48,11 +48,13 @@ from sfm.report.phrases import (
     describe_calibration,
     describe_fixed,
     describe_sigma0,
+    describe_view,
     finer_unit,
     fixed,
     or_fixed,
     significant,
     to_precision,
+    with_exponent,
     words_left_out,
 )
 from sfm.report.survey_comparison import adjuster_parts, pipeline_parts
@@ -129,9 +131,16 @@ def _tiles(f: Findings) -> Iterator[Tile]:
     result, a = f.result, f.result.adjustment
     for camera in f.calibrated[:2]:
         values, sigmas, within, projection = describe_calibration(camera)
-        yield Tile(f"Camera {camera.name}", values, f"1 sigma {sigmas}; 95 % {within}", wide=True)
+        note = "; ".join(filter(None, (f"1 sigma {sigmas}; 95 % {within}", describe_view(f, camera.name))))
+        yield Tile(f"Camera {camera.name}", values, note, wide=True)
         rms = f"{significant(camera.projection_rms_px)} px"
         yield Tile(f"Projection uncertainty of {camera.name}", rms, projection)
+    for rig in f.rigs[:1]:
+        for mount in rig.mounts[:2]:
+            base, sigma = with_exponent(mount.base, mount.base_sigma)
+            unit = result.length_unit
+            at = f"{mount.camera} from {rig.reference}, 1 sigma {sigma} {unit}"
+            yield Tile(f"Base of rig {rig.name}", f"{base} {unit}", at)
     yield Tile("Photographs oriented", f"{len(a.network.images)} of {result.images_total}")
     yield Tile("Object points", len(result.code), result.point_counts)
     if not f.calibrated:
@@ -235,6 +244,7 @@ def _calibrated(f: Findings) -> Iterator[Part]:
         for camera in f.calibrated:
             values, sigmas, within, projection = describe_calibration(camera)
             rows += [(camera.name, f"{values}; 1 sigma {sigmas}; 95 % {within}"), ("projection", projection)]
+            rows += [(f"view of {camera.name}", view)] if (view := describe_view(f, camera.name)) else []
         yield Heading("Calibrated cameras")
         yield facts(rows)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,16 @@ from sfm.adjustment.solve import adjust
 from sfm.judgement import cameras as camera_remarks
 from sfm.judgement.calibrated_cameras import camera_is_result
 from sfm.judgement.survey_result import SeenPlate, SurveyResult
+from sfm.model.camera import project
 from sfm.model.conventions import rotation_from_vector
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.model.remarks.remark import kinds_of, of_kind, remark
 from sfm.model.remarks.verdict import Verdict
 from sfm.pipeline import run_survey
-from sfm.report.phrases import describe_calibration
+from sfm.report.pages import html_of
+from sfm.report.phrases import describe_calibration, describe_view
+from sfm.report.survey_report import text_report
 from tests.findings import findings_of
 from tests.surveys import survey_of
 from tests.synthetic import make_network, observed_anew, seed_of
@@ -213,6 +217,23 @@ def test_a_parameter_that_a_null_vector_leaves_open_has_no_standard_deviation() 
     assert "camera_not_calibrated" not in kinds_of(found.verdict.remarks)
     _, sigmas, _, projection = describe_calibration(found.calibrated[0])
     assert sigmas.startswith("not determined") and projection == "not determined"
+
+
+def test_the_head_of_a_calibration_has_f_and_the_principal_point_in_px() -> None:
+    """A ray at half the field of view ends at the edge of the photograph."""
+    known, truth = plate_photographs("frontal 3", 0.3)
+    a = adjust(known, truth, datum=Datum("control"))
+    findings = findings_of(SurveyResult("view", "m", 6, (), a, np.full(60, -1), None))
+    (camera,) = findings.result.adjustment.estimate.cameras
+    view = describe_view(findings, camera.name)
+    f, cx, cy, across, up = map(float, re.findall(r"-?\d+\.\d", view))
+    assert f == pytest.approx(camera.value("c") / 0.005, abs=0.06)
+    assert cx == pytest.approx(999.5 + camera.value("x0") / 0.005, abs=0.06)
+    assert cy == pytest.approx(749.5 - camera.value("y0") / 0.005, abs=0.06)
+    edges = project(camera, np.zeros(3), np.eye(3), np.array([[np.tan(np.radians(across / 2)), 0, -1]]))
+    assert abs(edges[0, 0] - cx) == pytest.approx(1000, rel=0.02) and up < across
+    assert view in text_report(findings) and view in " ".join(html_of(findings).split())
+    assert describe_view(findings, "another camera") == ""
 
 
 def test_the_camera_is_the_result_of_a_survey_of_known_points() -> None:
