@@ -25,13 +25,13 @@ LAYERS = (
     ("sfm.judgement",),
     (
         *("sfm.survey", "sfm.products.inspection", "sfm.products.drafting", "sfm.products.refining"),
-        *("sfm.products.calibration",),
+        *("sfm.products.calibration", "sfm.products.auditing"),
     ),
     ("sfm.report",),
     (  # pages of products
         *("sfm.products.epochs.page", "sfm.products.inspection.page", "sfm.products.refining.page"),
         *("sfm.products.planning.page", "sfm.products.planning.further_page"),
-        *("sfm.products.calibration.page",),
+        *("sfm.products.calibration.page", "sfm.products.auditing.page"),
     ),
     ("sfm.pipeline",),
     ("sfm.library",),  # the public functions

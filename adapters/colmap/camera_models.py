@@ -21,12 +21,12 @@ from pydantic import Field
 
 from adapters.colmap.adjuster import load_pycolmap, quiet, reason_of
 from adapters.colmap.model_files import check_model_files, names_with_blanks
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
+from adapters.colmap.reconstruction import HALF_PIXEL, as_opencv, camera_of, mount_of, reconstruction
 from sfm.files.open_folders import disk_errors, refuse_links_out
 from sfm.files.plain_text import MAX_NAME, Content, Name, Pixel, Side, is_name, read_json, shorten
 from sfm.files.result_tables import refuse_moments
 from sfm.files.whole_files import refuse_full
-from sfm.model.conventions import AnyArray, BoolArray
+from sfm.model.conventions import VISION_AXES, AnyArray, BoolArray
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import ImagePoints, Network
@@ -223,7 +223,7 @@ def network_of_scene(scene: Any, side: Names | None = None) -> tuple[Network, Es
     poses = [
         image.cam_from_world().matrix() if image.has_pose else np.full((3, 4), np.nan) for image in images
     ]
-    M = np.array([AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
+    M = np.array([VISION_AXES @ pose[:, :3] for pose in poses]).reshape(-1, 3, 3)
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses]).reshape(-1, 3)
     network = Network(
         _labels_of(image_ids, images, side),

@@ -23,14 +23,13 @@ import numpy as np
 
 from adapters.colmap.model_files import MODELS as COLMAP_MODELS
 from sfm.model.camera import Camera
-from sfm.model.conventions import AnyArray, BoolArray, FloatArray
+from sfm.model.conventions import VISION_AXES, AnyArray, BoolArray, FloatArray
 from sfm.model.distortion.models import MODELS, Role
 from sfm.model.errors import BackendError
 from sfm.model.estimate import Estimate, Mounts
 from sfm.model.network import Network, rows_of
 
 HALF_PIXEL = 0.5  # COLMAP's pixel coordinates minus ours, px
-AXES = np.diag([1.0, -1.0, -1.0])  # COLMAP's camera axes in ours
 # COLMAP's camera models by the names of Kolinear's, which have the same parameters in the same order
 COLMAP_NAMES = {name: name.upper() for name in MODELS if name.upper() in COLMAP_MODELS}
 OPENCV_NAMES = {"f": "fx", "k": "k1"}  # for models with one focal length or one coefficient
@@ -61,7 +60,7 @@ def reconstruction(
         if not estimate.oriented[i]:
             continue
         slot[rows] = np.arange(len(rows))
-        R = AXES @ estimate.rotation[i].T
+        R = VISION_AXES @ estimate.rotation[i].T
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
         keypoints = seen.xy[rows] + HALF_PIXEL
         a = int(network.camera[i])
@@ -201,7 +200,7 @@ def estimate_of(scene: Any, start: Estimate) -> Estimate:
         with_colmap_parameters(camera, scene.camera(k + 1).params) for k, camera in enumerate(start.cameras)
     ]
     poses = [scene.image(i + 1).cam_from_world().matrix() for i in range(len(start.position))]
-    R = np.array([(AXES @ pose[:, :3]).T for pose in poses])
+    R = np.array([(VISION_AXES @ pose[:, :3]).T for pose in poses])
     position = np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])
     points = np.array([scene.point3D(j + 1).xyz for j in range(len(start.points))])
     mounts = start.mounts
@@ -216,15 +215,15 @@ def estimate_of(scene: Any, start: Estimate) -> Estimate:
 
 def camera_from_rig(pycolmap: ModuleType, mounts: Mounts, camera: int) -> Any:
     """Return COLMAP's pose of a camera in its rig, whose axes are COLMAP's axes of the reference camera."""
-    R = AXES @ mounts.rotation[camera].T
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(R @ AXES), -R @ mounts.position[camera])
+    R = VISION_AXES @ mounts.rotation[camera].T
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(R @ VISION_AXES), -R @ mounts.position[camera])
 
 
 def mount_of(from_rig: Any) -> tuple[FloatArray, FloatArray]:
     """Return position (3,) and rotation (3, 3) of a mount from COLMAP's pose of a camera in its rig."""
     pose = from_rig.matrix()
-    R = AXES @ pose[:, :3].T @ AXES
-    return -R @ AXES @ pose[:, 3], R
+    R = VISION_AXES @ pose[:, :3].T @ VISION_AXES
+    return -R @ VISION_AXES @ pose[:, 3], R
 
 
 def residuals_of(scene: Any, network: Network) -> FloatArray:

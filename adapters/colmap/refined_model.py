@@ -16,8 +16,8 @@ import numpy as np
 
 from adapters.colmap.adjuster import load_pycolmap, quiet
 from adapters.colmap.camera_models import named_network, read_scene
-from adapters.colmap.reconstruction import AXES, HALF_PIXEL, camera_from_rig, camera_of, colmap_parameters
-from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from adapters.colmap.reconstruction import HALF_PIXEL, camera_from_rig, camera_of, colmap_parameters
+from sfm.model.conventions import VISION_AXES, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network, rows_of
 from sfm.model.similarity import Similarity
@@ -123,7 +123,7 @@ def update_model(
             for row in lost.tolist():
                 scene.delete_observation(model.image_ids[i], int(model.slot[row]))
             if images[i]:
-                R = AXES @ estimate.rotation[i].T
+                R = VISION_AXES @ estimate.rotation[i].T
                 pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ estimate.position[i])
                 image.frame.set_cam_from_world(image.camera_id, pose)
         for j, xyz in enumerate(estimate.points):

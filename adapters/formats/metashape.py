@@ -38,7 +38,7 @@ from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_P
 from adapters.reading.xml_lines import Node, Taken, read_xml
 from sfm.files.plain_text import MAX_PIXEL_MM, shorten
 from sfm.model.camera import Camera
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import VISION_AXES, FloatArray
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, ObjectPoints, rows_of
@@ -48,8 +48,6 @@ HALF_PIXEL = 0.5  # Metashape's pixel coordinates minus Kolinear's, px
 MARKER_SIGMA_PX = 0.1  # Metashape's default for markers placed by hand
 MARKER = ["markers", "marker"]  # path of elements below the chunk
 LOCATION = ["frames", "frame", "markers", "marker", "location"]
-
-AXES = np.diag([1.0, -1.0, -1.0])  # Metashape's camera axes in Kolinear's
 
 
 def read_metashape(path: Path) -> tuple[Network, Estimate]:
@@ -88,7 +86,7 @@ def read_metashape(path: Path) -> tuple[Network, Estimate]:
         if transform is not None:
             T = transform.numbers(16).reshape(4, 4)
             position[i] = object_from_chunk.apply(T[:3, 3])
-            rotation[i] = object_from_chunk.rotation @ T[:3, :3] @ AXES
+            rotation[i] = object_from_chunk.rotation @ T[:3, :3] @ VISION_AXES
     control = markers.control()
     network = Network(
         tuple(node.name("label") for node in nodes),
@@ -114,7 +112,7 @@ def write_metashape(path: Path, network: Network, estimate: Estimate) -> None:
             cameras.append(head + "/>")
             continue
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = estimate.rotation[i] @ AXES, estimate.position[i]
+        T[:3, :3], T[:3, 3] = estimate.rotation[i] @ VISION_AXES, estimate.position[i]
         cameras += [
             head + ">",
             f"        <transform>{' '.join(repr(float(v)) for v in T.ravel())}</transform>",

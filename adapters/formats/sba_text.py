@@ -22,12 +22,11 @@ from scipy.spatial.transform import Rotation
 
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_LINES, MAX_PHOTOGRAPHS, Lines, write_lines
 from sfm.model.camera import Camera, camera_from_values
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import VISION_AXES, FloatArray
 from sfm.model.errors import OutputError, SurveyFileError
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
 
-AXES = np.diag([1.0, -1.0, -1.0])  # sba's camera axes (y down, z forward) in Kolinear's
 POSE, POSE_WITH_CAMERA = 7, 12  # numbers of a camera line
 PLAIN, WITH_COVARIANCE = 3, 7  # numbers of a projection
 MIN_QUATERNION = 1e-6  # minimum length; quaternions should have unit length
@@ -90,7 +89,7 @@ def read_sba_text(
         image_points=image_points,
     )
     position = -np.einsum("mab,ma->mb", R, table[:, -3:])
-    return network, Estimate(made, position, np.swapaxes(AXES @ R, 1, 2).copy(), xyz)
+    return network, Estimate(made, position, np.swapaxes(VISION_AXES @ R, 1, 2).copy(), xyz)
 
 
 def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Estimate) -> None:
@@ -106,7 +105,7 @@ def write_sba_text(cameras: Path, points: Path, network: Network, estimate: Esti
             raise OutputError(f"camera {camera.name}: sba's files cannot store distortion")
     if not (estimate.oriented.all() and estimate.determined.all()):
         raise OutputError("sba's files require start values of all photographs and points")
-    rotation = AXES @ np.swapaxes(estimate.rotation, 1, 2)
+    rotation = VISION_AXES @ np.swapaxes(estimate.rotation, 1, 2)
     translation = -np.einsum("mab,mb->ma", rotation, estimate.position)
     quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
     lines = ["# fu u0 v0 ar s qw qx qy qz tx ty tz"]

@@ -16,13 +16,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from adapters.colmap.reconstruction import AXES
 from adapters.formats.cameras.lens_terms import is_rotation, nearest
 from adapters.formats.content import Content
 from adapters.reading.text_lines import MAX_IMAGE_POINTS, MAX_PHOTOGRAPHS, MAX_POINTS, Lines
 from sfm.files.plain_text import MAX_NAME, MAX_SIDE_PX, is_name, shorten
 from sfm.model.camera import Camera
-from sfm.model.conventions import FloatArray, IntArray
+from sfm.model.conventions import VISION_AXES, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Estimate
@@ -188,12 +187,12 @@ def from_vision_axes(R: FloatArray) -> FloatArray:
     Args:
         R: rotations of computer vision, object to camera axes, (..., 3, 3).
     """
-    return np.asarray(np.swapaxes(R, -1, -2) @ AXES)
+    return np.asarray(np.swapaxes(R, -1, -2) @ VISION_AXES)
 
 
 def to_vision_axes(rotation: FloatArray) -> FloatArray:
     """Return the inverse of `from_vision_axes`, (..., 3, 3)."""
-    return np.asarray(AXES @ np.swapaxes(rotation, -1, -2))
+    return np.asarray(VISION_AXES @ np.swapaxes(rotation, -1, -2))
 
 
 def numbers_of_slots(index: IntArray) -> IntArray:

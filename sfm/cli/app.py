@@ -19,6 +19,7 @@ from typer.core import TyperGroup
 
 from sfm.cli.commands.accept import accept
 from sfm.cli.commands.adjust import adjust
+from sfm.cli.commands.audit import audit
 from sfm.cli.commands.batch import batch
 from sfm.cli.commands.calibrate import calibrate
 from sfm.cli.commands.compare import compare
@@ -98,6 +99,7 @@ COMMANDS = (
     Command("compare", compare, "A B", "two results or cameras: differences and their significance", JUDGE),
     Command("epochs", epochs, "FIRST SECOND", "what moved between surveys of one object", JUDGE),
     Command("view", view, "FOLDER", "a result or a COLMAP model as one page to explore", JUDGE),
+    Command("audit", audit, "MODEL", "a model of another program, judged by its image points", JUDGE),
     Command("targets", targets, "--out sheet.pdf", "coded targets or tags to print", PLAN),
     Command(
         "plan network", plan_network, "OBJECT --camera CAMERA", "what planned photographs will give", PLAN

@@ -41,6 +41,8 @@ METRES = {
     "ft": 0.3048,
 }
 """units and their lengths in metres"""
+VISION_AXES = np.diag([1.0, -1.0, -1.0])
+"""image axes in the camera axes of computer vision, x right, y down, z forward, and these in image axes"""
 MAD_TO_SIGMA = 1.4826
 """ratio of the standard deviation of a normal variable to its median absolute deviation; Hampel (1974), JASA
 69"""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.conventions import BoolArray, FloatArray
+from sfm.model.conventions import VISION_AXES, BoolArray, FloatArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
 from sfm.orientation.image_rays import (
@@ -41,7 +41,6 @@ CONFIDENCE = 0.999  # confidence of the tests whether a simpler scene explains t
 RANSAC_CONFIDENCE = 0.9999
 RANSAC_TRIALS = 2000
 ROUNDS = 5  # rounds of adjustment and new selection of the fitting pairs
-_IMAGE_FROM_VISION = np.diag([1.0, -1.0, -1.0])  # cv2: y down, looking along +z
 _NAN = np.full(3, np.nan)
 
 
@@ -164,7 +163,7 @@ def five_point_orientations(first: FloatArray, second: FloatArray) -> tuple[Rela
         count, R, t, _ = cv2.recoverPose(matrix, uv1 * down, uv2 * down, np.eye(3))[:4]
         if count < len(uv1):
             continue
-        D = _IMAGE_FROM_VISION
+        D = VISION_AXES
         rotation = (D @ np.asarray(R, dtype=np.float64) @ D).T
         base = -rotation @ D @ np.asarray(t, dtype=np.float64).ravel()
         orientations.append(
@@ -252,7 +251,7 @@ def _spatial_orientation(
     if E is None or E.shape != (3, 3) or mask.sum() < SPATIAL_POINTS:
         return None
     used = mask.ravel().astype(bool)
-    D = _IMAGE_FROM_VISION
+    D = VISION_AXES
     _, R, t, front = cv2.recoverPose(E, uv1[used] * down, uv2[used] * down, np.eye(3), distanceThresh=1e9)[:4]
     if (front > 0).sum() < SPATIAL_POINTS:
         return None

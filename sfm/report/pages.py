@@ -45,6 +45,7 @@ from sfm.report.phrases import is_number
 
 PAGES: Mapping[str, str] = {
     "Acceptance": "sfm.products.inspection.page:acceptance_page",
+    "Audit": "sfm.products.auditing.page:page",
     "Calibration": "sfm.products.calibration.page:page",
     "CameraDifference": "sfm.report.camera_differences:page",
     "EpochSeries": "sfm.products.epochs.page:page",

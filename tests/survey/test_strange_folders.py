@@ -246,6 +246,7 @@ COMMANDS: dict[str, Command] = {
         lambda f: ("georeference", photographs(f)[0], flat(f), "--out", "new/a.png"),
         ("new", "new/a.png", "new/a.pgw"),
     ),
+    "audit": (lambda f: ("audit", model(f)), ("out", "out/model_audit", "out/.model_audit.lock")),
     "compare": (
         lambda f: ("compare", model(f), f / "model"),
         ("out", "out/comparison", "out/.comparison.lock"),

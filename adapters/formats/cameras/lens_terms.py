@@ -17,10 +17,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from adapters.colmap.reconstruction import AXES, as_opencv
+from adapters.colmap.reconstruction import as_opencv
 from sfm.files.plain_text import shorten
 from sfm.model.camera import Camera
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import VISION_AXES, FloatArray
 from sfm.model.distortion.models import MODELS
 from sfm.model.errors import SurveyFileError
 from sfm.model.estimate import Mounts
@@ -131,8 +131,8 @@ class Mounted:
     @classmethod
     def of(cls, camera: Camera, mounts: Mounts, a: int) -> Mounted:
         """Return camera a as it is mounted."""
-        R = AXES @ mounts.rotation[a].T @ AXES
-        return cls(as_opencv(camera), R, -R @ AXES @ mounts.position[a])
+        R = VISION_AXES @ mounts.rotation[a].T @ VISION_AXES
+        return cls(as_opencv(camera), R, -R @ VISION_AXES @ mounts.position[a])
 
     @property
     def pose(self) -> FloatArray:
@@ -155,8 +155,8 @@ def mounts_of(poses: list[tuple[FloatArray, FloatArray]]) -> Mounts:
     Args:
         poses: R (3, 3) and T (3,) of each camera, x = R x_reference + T in axes x right, y down, z forward.
     """
-    turned = [AXES @ nearest(R).T @ AXES for R, _ in poses]
-    position = np.array([-AXES @ nearest(R).T @ T for R, T in poses])
+    turned = [VISION_AXES @ nearest(R).T @ VISION_AXES for R, _ in poses]
+    position = np.array([-VISION_AXES @ nearest(R).T @ T for R, T in poses])
     free = np.tile(np.arange(len(poses))[:, None] > 0, (1, 6))
     return Mounts(position, np.array(turned), free, ("rig",) * len(poses))
 

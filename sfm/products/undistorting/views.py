@@ -14,13 +14,12 @@ import numpy as np
 
 from sfm.comparison.camera_conversion import ideal_camera
 from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
-from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.conventions import VISION_AXES, AnyArray, FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Mounts
 from sfm.model.rectification import Rectification, common_view, rectify
 from sfm.model.solution import Solution
 
-AXES = np.diag([1.0, -1.0, -1.0])  # image axes in axes x right, y down, z forward
 BLOCK_ROWS = 256  # rows of a photograph whose places are computed at a time
 
 
@@ -137,9 +136,9 @@ def rectified_pair(
             f"cameras {a.name} and {b.name}: photographs of {a.size_px[0]} x {a.size_px[1]} px and of "
             f"{b.size_px[0]} x {b.size_px[1]} px cannot be rectified to a pair, needed the same size"
         )
-    from_rig = [AXES @ mounts.rotation[k].T @ AXES for k in (first, second)]
+    from_rig = [VISION_AXES @ mounts.rotation[k].T @ VISION_AXES for k in (first, second)]
     R = from_rig[1] @ from_rig[0].T
-    T = -from_rig[1] @ AXES @ (mounts.position[second] - mounts.position[first])
+    T = -from_rig[1] @ VISION_AXES @ (mounts.position[second] - mounts.position[first])
     rectification = rectify(a, b, R, T, alpha=alpha)
     if rectification is None:
         raise GeometryError(

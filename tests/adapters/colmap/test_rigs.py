@@ -10,11 +10,11 @@ import pycolmap
 import pytest
 
 from adapters.colmap.camera_models import read_model, write_model
-from adapters.colmap.reconstruction import AXES
 from adapters.formats.registry import read_content, write_content
 from sfm.adjustment.solve import adjust
 from sfm.cli.commands.convert import convert
 from sfm.comparison.camera_conversion import convert_cameras
+from sfm.model.conventions import VISION_AXES
 from sfm.model.errors import SurveyFileError
 from tests.rigs import make_rig
 from tests.synthetic import seed_of
@@ -87,7 +87,7 @@ def test_mounts_are_those_of_colmap(tmp_path: Path) -> None:
             X = estimate.position[first] + R @ mounts.position[a]
             np.testing.assert_allclose(estimate.position[i], X, atol=1e-12)
     pose = rigs_of(scene)[0][1][0]
-    np.testing.assert_allclose(mounts.rotation[1], AXES @ pose[:, :3].T @ AXES, atol=1e-12)
+    np.testing.assert_allclose(mounts.rotation[1], VISION_AXES @ pose[:, :3].T @ VISION_AXES, atol=1e-12)
     assert adjust(network, estimate, reject="none").estimate.mounts is not None
 
 

@@ -1,0 +1,258 @@
+"""A model of another program, adjusted anew from its own image points, beside the figures it came with.
+
+The model gives image points and start values; a survey may add control, scale bars and survey observations.
+Everything else is that of any survey of image points: gross errors, datum, covariance, judgement. What the
+model states of itself is how it projects its own points.
+
+Source: Foerstner and Wrobel (2016), Photogrammetric Computer Vision, sec. 4.5 and 15.4 (gauge of a block).
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm.adjustment.covariance import change_datum
+from sfm.adjustment.datum import Datum
+from sfm.judgement.checks import root_mean_square
+from sfm.judgement.survey_result import SurveyResult
+from sfm.matching.lsm.coverage import project_points
+from sfm.model.camera import Camera
+from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, angles_from_rotation
+from sfm.model.errors import GeometryError
+from sfm.model.similarity import fit_similarity
+from sfm.model.solution import Solution
+from sfm.products.refining.refinement import free_cameras
+from sfm.survey.inputs.given_values import KnownPoints, Observations, ScaleBar, StartOrientations
+from sfm.survey.inputs.survey import CameraSetup, Survey
+
+LEAST_SIGMA_PX = 1e-3  # of image points that a model fits without residuals, as those of a simulation
+MIN_FIXED = 3  # points that a datum needs
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What a model states of itself, by its own projection of its points."""
+
+    residuals: FloatArray  # computed minus measured, px, (k, 2)
+    photographs: int  # with an orientation
+    points: int  # with coordinates
+
+    @property
+    def rms_px(self) -> float:
+        """RMS per coordinate, px."""
+        return root_mean_square(self.residuals)
+
+    @property
+    def mean_length_px(self) -> float:
+        """Mean length of the residual vectors, px, which many programs call mean reprojection error."""
+        return float(np.linalg.norm(self.residuals, axis=1).mean())
+
+    @property
+    def sigma_px(self) -> float:
+        """Robust standard deviation of a coordinate, px."""
+        return max(MAD_TO_SIGMA * float(np.median(np.abs(self.residuals))), LEAST_SIGMA_PX)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """How far the adjustment moved what a model states, after the best similarity."""
+
+    kind: str  # points or photographs
+    rms: float  # object unit
+    largest: float  # object unit
+    name: str  # of the one that moved farthest
+    over_sigma: float  # RMS over the adjusted standard deviations; NaN if these are not known
+
+
+@dataclass(frozen=True)
+class Audit:
+    """A model beside the adjustment of its own image points."""
+
+    model: Solution
+    stated: Stated
+    result: SurveyResult
+    moved: tuple[Moved, ...]
+    gauge: tuple[tuple[str, float, float], ...]  # datum, RMS of sX, sY, sZ of points and of photographs, unit
+
+
+def stated_of(model: Solution) -> Stated:
+    """Return what a model states of itself.
+
+    Raises:
+        GeometryError: it has no image point of an oriented photograph and a point with coordinates.
+    """
+    network, estimate = model.network, model.estimate
+    seen = network.image_points
+    projected = project_points(estimate, network.camera, seen.image, estimate.points[seen.point])
+    residuals = projected - seen.xy
+    residuals = residuals[np.isfinite(residuals).all(axis=1)]
+    if not len(residuals):
+        raise GeometryError(
+            "audit: the model has no image points of oriented photographs and points with coordinates; "
+            "poses, cameras or points alone cannot be tested"
+        )
+    return Stated(residuals, int(estimate.oriented.sum()), int(estimate.determined.sum()))
+
+
+def survey_of_model(
+    model: Solution, stated: Stated, *, fixed: tuple[str, ...] = (), given: Survey | None = None
+) -> Survey:
+    """Return the survey of a model's image points, with its cameras, photographs and points as start values.
+
+    The standard deviation of the image points is that of the model's residuals, unless they state their own.
+
+    Args:
+        model: the model.
+        stated: what it states of itself.
+        fixed: names of interior parameters to hold, such as cx or k1.
+        given: survey whose control, scale bars, tables, unit and settings of the adjustment are used.
+
+    Raises:
+        GeometryError: no camera has a parameter of a name to hold.
+        SurveyFileError: a value that no survey may have.
+    """
+    network, estimate = model.network, model.estimate
+    seen = network.image_points
+    used = estimate.oriented[seen.image] & estimate.determined[seen.point]
+    seen = seen.select(used)
+    oriented, determined = np.flatnonzero(estimate.oriented), np.flatnonzero(estimate.determined)
+    free = free_cameras(network, estimate, fixed)
+    photographs = [
+        [network.images[i] for i in oriented[network.camera[oriented] == k]] for k in range(len(free))
+    ]
+    cameras = [
+        _setup(camera, images, alone=sum(map(bool, photographs)) == 1)
+        for camera, images in zip(free, photographs, strict=True)
+        if images
+    ]
+    sigma = seen.stated_sigma
+    survey = Survey(
+        name=model.name,
+        cameras=tuple(cameras),
+        unit=model.unit if model.unit in METRES else "m",  # without control or bars it stays unknown
+        adjust={"sigma_px": stated.sigma_px, "reject": "tau"},  # type: ignore[arg-type]
+        compare={"backend": "none"},  # type: ignore[arg-type]
+        control=_control(model),
+        scale_bars=_bars(model),
+        observations=Observations.from_arrays(
+            [network.images[i] for i in seen.image],
+            [network.points[j] for j in seen.point],
+            seen.xy,
+            sigma if np.isfinite(sigma).all() else None,
+        ),
+        start_orientations=StartOrientations.from_arrays(
+            [network.images[i] for i in oriented],
+            estimate.position[oriented],
+            np.degrees([angles_from_rotation(estimate.rotation[i]) for i in oriented]),
+        ),
+        start_points=KnownPoints.from_arrays(
+            [network.points[j] for j in determined], estimate.points[determined]
+        ),
+    )
+    if given is None:
+        return survey
+    return replace(
+        survey,
+        unit=given.unit,
+        control=given.control or survey.control,
+        scale_bars=given.scale_bars or survey.scale_bars,
+        tables=given.tables,
+        equipment=given.equipment,
+        datum=given.datum,
+        adjust=given.adjust.model_copy(update={"sigma_px": stated.sigma_px, "reject": "tau"}),
+    )
+
+
+def _setup(camera: Camera, images: Sequence[str], *, alone: bool) -> CameraSetup:
+    """Return the settings of a camera of a model; its only camera takes all photographs."""
+    values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
+    is_free = dict(zip(camera.names, camera.free.tolist(), strict=True))
+    c_mm = values.pop("c", None)
+    return CameraSetup(
+        name=camera.name,
+        images=None if alone else tuple(glob.escape(image) for image in images),
+        size_px=camera.size_px,
+        pixel_mm=tuple(camera.pixel_mm.tolist()),
+        c_mm=c_mm,
+        model=camera.model,
+        free=tuple(name for name in camera.names if is_free[name]),
+        fixed={name: value for name, value in values.items() if not is_free[name]},
+        start={name: value for name, value in values.items() if is_free[name]},
+    )
+
+
+def _control(model: Solution) -> KnownPoints | None:
+    """Return the control of a model's file."""
+    control = model.network.control
+    if not len(control.point):
+        return None
+    names = [model.network.points[j] for j in control.point]
+    variance = np.diagonal(control.covariance, axis1=1, axis2=2)
+    return KnownPoints.from_arrays(names, control.xyz, np.sqrt(variance))
+
+
+def _bars(model: Solution) -> tuple[ScaleBar, ...]:
+    """Return the scale bars of a model's file."""
+    bars, names = model.network.scale_bars, model.network.points
+    rows = zip(bars.start.tolist(), bars.end.tolist(), bars.length.tolist(), bars.sigma.tolist(), strict=True)
+    return tuple(ScaleBar(names[i], names[j], length, sigma) for i, j, length, sigma in rows)
+
+
+def audit_of(model: Solution, stated: Stated, result: SurveyResult) -> Audit:
+    """Return a model beside the adjustment of its image points.
+
+    Args:
+        model: the model.
+        stated: what it states of itself.
+        result: the survey of `survey_of_model`.
+    """
+    a = result.adjustment
+    network, estimate = a.network, a.estimate
+    numbers = {name: j for j, name in enumerate(model.network.points)}
+    theirs = model.estimate.points[[numbers[name] for name in network.points]]
+    placing = fit_similarity(theirs, estimate.points)
+    numbers = {name: i for i, name in enumerate(model.network.images)}
+    stations = model.estimate.position[[numbers[name] for name in network.images]]
+    sigma = a.covariance
+    moved = (
+        _moved("points", network.points, placing.apply(theirs) - estimate.points, sigma.points),
+        _moved(
+            "photographs",
+            network.images,
+            placing.apply(stations) - estimate.position,
+            sigma.exterior[:, :3, :3],
+        ),
+    )
+    words = {"free": "inner constraints on all points, as in the report", "control": "the control"}
+    datums = [(words.get(a.datum, a.datum), a)]
+    if a.datum == "free" and len(network.points) > MIN_FIXED:
+        datums.append(("seven coordinates of three points held", change_datum(a, Datum("minimal"))))
+    gauge = tuple(
+        (
+            words,
+            root_mean_square(np.sqrt(np.diagonal(of.covariance.points, axis1=1, axis2=2))),
+            root_mean_square(np.sqrt(np.diagonal(of.covariance.exterior[:, :3, :3], axis1=1, axis2=2))),
+        )
+        for words, of in datums
+    )
+    return Audit(model, stated, result, moved, gauge)
+
+
+def _moved(kind: str, names: Sequence[str], off: FloatArray, covariance: FloatArray) -> Moved:
+    """Return how far points or photographs moved, off (n, 3), in standard deviations of (n, 3, 3)."""
+    length = np.linalg.norm(off, axis=1)
+    variance = np.trace(covariance, axis1=1, axis2=2)
+    known = variance > 0
+    share = (length[known] ** 2 / variance[known]).mean() if known.any() else np.nan
+    farthest = int(np.argmax(length))
+    return Moved(
+        kind,
+        float(np.sqrt((length**2).mean() / 3)),
+        float(length[farthest]),
+        names[farthest],
+        float(np.sqrt(share)),
+    )

@@ -1,0 +1,195 @@
+"""The page of an audit: what a model states of itself, and what its own image points say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sfm.judgement.bundle_statistics import given_of
+from sfm.judgement.checks import root_mean_square, standard_deviations
+from sfm.model.conventions import FloatArray
+from sfm.model.display import counted, listed
+from sfm.model.remarks.verdict import Level
+from sfm.products.auditing.audit import Audit
+from sfm.report.given_residuals import given_parts
+from sfm.report.page import Column, Note, Page, Paragraph, Part, Section, Table, columns, tested_section
+from sfm.report.phrases import fixed, general, significant
+
+MAX_ROWS = 30  # parameters on the page; the file has all
+STRONG = 0.95  # coefficient of correlation from which two parameters are hardly told apart
+_NOTHING_GIVEN = Paragraph(
+    "None. The scale of the model, and any bending that the cameras allow, are not checked: add control or "
+    "scale bars by --survey FILE."
+)
+
+
+def page(audit: Audit, *, report: str) -> Page:
+    """Return the page: figures side by side, cameras, what moved, datum, given values.
+
+    Args:
+        audit: the model and its adjustment.
+        report: file name of the report of the adjustment, beside the page.
+    """
+    result, a = audit.result, audit.result.adjustment
+    unit = result.length_unit
+    rms = f"RMS {significant(audit.stated.rms_px)} px as stated, {significant(a.rms_px)} px adjusted"
+    headlines: dict[Level, str] = {
+        "good": f"The image points determine this model: {rms}.",
+        "fair": f"The image points determine this model, with remarks: {rms}.",
+        "bad": f"The image points give no dependable model: {rms}.",
+    }
+    more = Note(f"All tables, tests and pictures of the adjustment: {report}.")
+    given = given_parts(given_of(a, unit), a, unit)
+    return Page(
+        "audit",
+        "Audit of a model",
+        audit.model.name,
+        replace(result.verdict, headline=headlines[result.verdict.level]),
+        (
+            Section("As it states, and as its image points give", *_figures(audit, unit), more),
+            Section("Are the cameras determined?", *_cameras(audit)),
+            Section("What the adjustment moved", *_moved(audit, unit)),
+            Section("Standard deviations depend on the datum", *_gauge(audit, unit)),
+            Section("Control, scale bars and other given values", *(given or (_NOTHING_GIVEN,))),
+            tested_section(result.verdict),
+        ),
+    )
+
+
+def _figures(audit: Audit, unit: str) -> Iterator[Part]:
+    """Yield the figures of the model beside those of the adjustment."""
+    stated, result, model = audit.stated, audit.result, audit.model
+    a = result.adjustment
+    v = a.residuals[~a.rejected]
+    accepted = f"{len(v)} ({counted(int(a.rejected.sum()), 'gross error')} rejected)"
+    covariances = (model.point_covariance, model.position_covariance)
+    sigma_points, sigma_stations = (
+        "not stated" if covariance is None else significant(root_mean_square(standard_deviations(covariance)))
+        for covariance in covariances
+    )
+    own = a.covariance
+    points, stations = (
+        significant(root_mean_square(standard_deviations(covariance)))
+        for covariance in (own.points, own.exterior[:, :3, :3])
+    )
+    mean = float(np.linalg.norm(v, axis=1).mean())
+    yield Table(
+        columns("", ">the model", ">adjusted here"),
+        [
+            ("Photographs", stated.photographs, len(a.network.images)),
+            ("Points", stated.points, len(a.network.points)),
+            ("Image points", len(stated.residuals), accepted),
+            ("RMS residual per coordinate [px]", general(stated.rms_px, 4), general(a.rms_px, 4)),
+            ("Mean length of a residual [px]", general(stated.mean_length_px, 4), general(mean, 4)),
+            ("Standard deviation of an image coordinate [px]", "not stated", general(a.sigma0_px, 4)),
+            (f"Standard deviation of a point, RMS [{unit}]", sigma_points, points),
+            (f"Standard deviation of a station, RMS [{unit}]", sigma_stations, stations),
+        ],
+    )
+    share = a.redundancy / (2 * len(v))
+    yield Note(
+        "The model's residuals are those of its own cameras, photographs and points. The mean length of a "
+        "residual is what many programs call mean reprojection error: it says how well the model fits, not "
+        f"how precise it is. Of {2 * len(v)} image coordinates {a.redundancy} are redundant, "
+        f"{fixed(share, 2)} each; the standard deviation of an image coordinate takes this into account."
+    )
+
+
+def _cameras(audit: Audit) -> Iterator[Part]:
+    """Yield the interior orientation before and after, with its standard deviations and correlations."""
+    a = audit.result.adjustment
+    theirs = {camera.name: camera for camera in audit.model.estimate.cameras}
+    rows, held = [], dict[str, int]()
+    for k, camera in enumerate(a.estimate.cameras):
+        before = theirs[camera.name]
+        sigma = a.interior_sigma(k)
+        partners = _strongest(a.covariance.interior[k], camera.free, camera.names)
+        for p, (name, unit) in enumerate(zip(camera.names, camera.units, strict=True)):
+            value, start = float(camera.parameters[p]), float(before.parameters[p])
+            if not camera.free[p]:
+                held[name] = held.get(name, 0) + bool(value)
+                continue
+            times = (value - start) / sigma[p] if sigma[p] > 0 else np.nan
+            rows.append(
+                (
+                    camera.name,
+                    name if unit == "1" else f"{name} [{unit}]",
+                    start,
+                    value,
+                    float(sigma[p]),
+                    times,
+                    partners.get(name, ""),
+                )
+            )
+    heads = (
+        Column("camera", "camera"),
+        Column("parameter", "parameter"),
+        Column("the model", "stated", format=".8g"),
+        Column("adjusted", "adjusted", format=".8g"),
+        Column("sigma", "sigma", format=significant),
+        Column("change / sigma", "change_over_sigma", format="z.1f", unknown=""),
+        Column("strongest correlation", "correlation"),
+    )
+    yield Table(heads, rows, "audit_cameras", most=MAX_ROWS)
+    yield Note(
+        f"Two parameters that correlate by more than {STRONG:g} are hardly told apart: only their combined "
+        "effect is known as well as the residuals suggest."
+    )
+    kept = [f"{name} of {counted(count, 'camera')}" for name, count in held.items() if count]
+    if kept:
+        yield Paragraph(
+            f"Held at the model's values, by --fix or as few photographs do not tell them: {listed(kept)}."
+        )
+    strong = audit.result.orientation_correlations
+    if strong:
+        words = "; ".join(f"{of.parameter} with {', '.join(of.partners)}" for of in strong)
+        yield Paragraph(f"Correlated with the orientation of photographs: {words}.")
+
+
+def _strongest(covariance: FloatArray, free: np.ndarray, names: tuple[str, ...]) -> dict[str, str]:
+    """Return for each free parameter the other one that it correlates with most, in words."""
+    sigma = np.sqrt(np.diagonal(covariance))
+    if len(sigma) < 2 or not (sigma > 0).all():
+        return {}
+    correlation = covariance / np.outer(sigma, sigma) - np.eye(len(sigma))
+    free_names = [name for name, is_free in zip(names, free.tolist(), strict=True) if is_free]
+    most = np.argmax(np.abs(correlation), axis=1)
+    return {
+        name: f"{free_names[j]} {correlation[i, j]:+.2f}"
+        for i, (name, j) in enumerate(zip(free_names, most.tolist(), strict=True))
+    }
+
+
+def _moved(audit: Audit, unit: str) -> tuple[Part, ...]:
+    """Return how far points and photographs moved."""
+    heads = (
+        Column(""),
+        Column("RMS of a coordinate", unit=unit, format=significant),
+        Column("largest", unit=unit, format=significant),
+        Column("of"),
+        Column("RMS / sigma", format=significant, unknown="not known"),
+    )
+    rows = [(m.kind, m.rms, m.largest, m.name, m.over_sigma) for m in audit.moved]
+    note = Note(
+        "Adjusted minus stated, after the similarity that fits the points best. Below one standard deviation "
+        "the model is as good as its image points; far above, the program that made it did not reach their "
+        "best solution, kept gross errors, held a parameter, or weights them differently."
+    )
+    return Table(heads, rows), note
+
+
+def _gauge(audit: Audit, unit: str) -> tuple[Part, ...]:
+    """Return the standard deviations in another datum."""
+    heads = (
+        Column("datum"),
+        Column("points, RMS", unit=unit, format=significant),
+        Column("stations, RMS", unit=unit, format=significant),
+    )
+    note = Note(
+        "Image points alone tell nothing of position, rotation and scale of the whole. Each program fixes "
+        "them in its way, and its standard deviations contain the way: those of the same model differ as "
+        "above. Distances and shape do not. Compare standard deviations only in one datum."
+    )
+    return Table(heads, audit.gauge), note

@@ -1,0 +1,147 @@
+"""Models of other programs, judged by their own image points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapters.formats.content import Content
+from adapters.formats.registry import write_content
+from sfm.model.errors import GeometryError
+from sfm.model.estimate import Estimate
+from sfm.model.network import Network
+from sfm.model.similarity import fit_similarity
+from sfm.model.solution import Solution
+from sfm.pipeline import run_survey
+from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
+from sfm.report.pages import page_of
+from sfm.survey.inputs.given_values import ScaleBar
+from sfm.survey.inputs.survey import CameraSetup, Survey
+from tests import commands
+from tests.synthetic import make_network, seed_of
+
+NOISE_PX = 0.3
+
+
+def network_of(name: str, **how: int) -> tuple[Network, Estimate]:
+    return make_network(seed_of(name), images=8, points=40, noise_px=NOISE_PX, model="opencv", free=(), **how)
+
+
+def model_of(network: Network, truth: Estimate, *, off: float = 0.0) -> Solution:
+    """Return a model as another program leaves it: points off by a part of the object, nothing stated."""
+    points = truth.points + off * seed_of("left off").standard_normal(truth.points.shape)
+    seen = replace(network.image_points, stated=np.zeros(len(network.image_points), dtype=bool))
+    return Solution("model", replace(network, image_points=seen), replace(truth, points=points))
+
+
+def audited(model: Solution, **how: object) -> Audit:
+    stated = stated_of(model)
+    return audit_of(model, stated, run_survey(survey_of_model(model, stated, **how)))  # type: ignore[arg-type]
+
+
+def test_a_model_is_adjusted_to_what_its_image_points_tell() -> None:
+    """Points of a model left far from its optimum are off by the stated standard deviations afterwards."""
+    network, truth = network_of("audited")
+    audit = audited(model_of(network, truth, off=0.002))
+    a = audit.result.adjustment
+    assert audit.result.verdict.level == "good" and not a.rejected.any()
+    assert a.sigma0_px == pytest.approx(NOISE_PX, rel=0.1)
+    assert audit.stated.rms_px > 2 * a.rms_px
+    error = fit_similarity(a.estimate.points, truth.points).apply(a.estimate.points) - truth.points
+    sigma = np.sqrt(np.trace(a.covariance.points, axis1=1, axis2=2).mean() / 3)
+    assert np.sqrt((error**2).mean()) == pytest.approx(sigma, rel=0.4)
+    points, photographs = audit.moved
+    assert points.over_sigma > 5 and points.rms == pytest.approx(0.002, rel=0.3)
+    assert photographs.kind == "photographs" and photographs.name in network.images
+
+
+def test_a_model_at_its_optimum_does_not_move() -> None:
+    network, truth = network_of("settled")
+    first = audited(model_of(network, truth)).result.adjustment
+    again = audited(model_of(network, first.estimate))
+    assert again.stated.rms_px == pytest.approx(again.result.adjustment.rms_px, rel=1e-4)
+    assert all(moved.over_sigma < 0.05 for moved in again.moved)
+
+
+def test_gross_errors_of_a_model_are_named() -> None:
+    network, truth = network_of("wrong matches")
+    seen = network.image_points
+    xy = seen.xy.copy()
+    wrong = [5, 60, 111]
+    xy[wrong] += (15.0, -9.0)
+    a = audited(model_of(replace(network, image_points=replace(seen, xy=xy)), truth)).result.adjustment
+    images, points = a.network.images, a.network.points
+    rejected = a.network.image_points.select(a.rejected)
+    assert {(images[i], points[j]) for i, j in zip(rejected.image, rejected.point, strict=True)} == {
+        (network.images[seen.image[k]], network.points[seen.point[k]]) for k in wrong
+    }
+
+
+def test_a_survey_gives_scale_to_a_model() -> None:
+    network, truth = network_of("scaled")
+    model = model_of(network, replace(truth, points=2.5 * truth.points, position=2.5 * truth.position))
+    length = float(np.linalg.norm(truth.points[0] - truth.points[1]))
+    first, second = network.points[:2]
+    camera = CameraSetup(name="any", images="*.jpg", c_mm=8.0)
+    bar = ScaleBar(first, second, length, 1e-6)
+    given = Survey(name="bar", unit="mm", cameras=(camera,), scale_bars=(bar,))
+    a = audited(model, given=given).result.adjustment
+    placing = fit_similarity(a.estimate.points, truth.points)
+    assert placing.scale == pytest.approx(1.0, abs=1e-3)
+
+
+def test_standard_deviations_depend_on_the_datum() -> None:
+    """Holding three points makes those of the others larger; the shape is known equally well."""
+    network, truth = network_of("gauge")
+    (_, *inner), (_, *held) = audited(model_of(network, truth)).gauge
+    assert held[0] > 1.2 * inner[0] and held[1] > inner[1]
+
+
+def test_parameters_are_held_and_named() -> None:
+    network, truth = network_of("held")
+    model = model_of(network, truth)
+    audit = audited(model, fixed=("cx", "cy"))
+    camera = audit.result.adjustment.estimate.cameras[0]
+    assert not camera.free[camera.parts[1]].any() and camera.free[camera.parts[0]].all()
+    text = page_of(audit, report="report.html").text
+    assert "change / sigma" in text and "cx" not in text
+    with pytest.raises(GeometryError, match="parameter 'cz' is to be held"):
+        survey_of_model(model, stated_of(model), fixed=("cz",))
+
+
+def test_cameras_are_told_by_their_photographs_whatever_their_names() -> None:
+    network, truth = network_of("cameras", cameras=2)
+    names = tuple(f"left [{i}].jpg" if k == 0 else f"right*{i}.jpg" for i, k in enumerate(network.camera))
+    audit = audited(model_of(replace(network, images=names), truth))
+    a = audit.result.adjustment
+    assert [a.estimate.cameras[k].name for k in a.network.camera] == [
+        truth.cameras[k].name for k in network.camera
+    ]
+
+
+def test_poses_alone_are_refused() -> None:
+    network, truth = network_of("poses")
+    unseen = replace(truth, points=np.full_like(truth.points, np.nan))
+    with pytest.raises(GeometryError, match="no image points of oriented photographs"):
+        stated_of(model_of(network, unseen))
+
+
+def test_the_command_writes_page_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network, truth = network_of("command")
+    write_content(tmp_path / "model", "opensfm", Content(model_of(network, truth, off=0.001)))
+    out = tmp_path / "audit"
+    assert commands.kolinear("audit", tmp_path / "model", "--out", out) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("The image points determine this model: RMS")
+    assert "What the adjustment moved" in printed and "What was tested?" not in printed
+    page = (out / "audit.html").read_text(encoding="utf-8")
+    assert "Are the cameras determined?" in page and (out / "report.html").is_file()
+    rows = (out / "audit_cameras.csv").read_text(encoding="utf-8").splitlines()
+    assert rows[0].startswith("camera,parameter,stated,adjusted,sigma") and len(rows) > 4
+    write_content(tmp_path / "poses.json", "nerfstudio", Content(model_of(network, truth)))
+    assert commands.kolinear("audit", tmp_path / "poses.json", "--out", tmp_path / "none") == 2
+    assert "poses, cameras or points alone" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
