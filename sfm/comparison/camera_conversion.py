@@ -193,11 +193,16 @@ def _affinity_in_pixels(camera: Camera) -> Camera:
     if not camera.in_mm:
         fx, fy = camera.parameters[camera.plays(Role.FOCAL)][[0, -1]]
         return replace(camera, pixel_mm=np.array([sy * fy / fx, sy]))
-    stretch = 1 + camera.value("b1") if MODELS[camera.model].corrects else 1 / (1 + camera.value("b1"))
-    values = dict(zip(camera.names, camera.parameters.tolist(), strict=True))
-    values |= {"b1": 0.0, "x0": values["x0"] * stretch}
-    folded = camera.with_parameters(np.array(list(values.values())))
+    b1 = _affinity(camera)
+    stretch = 1 + b1 if MODELS[camera.model].corrects else 1 / (1 + b1)
+    p = np.where(camera.plays(Role.AFFINITY), 0.0, camera.parameters)
+    folded = camera.with_parameters(np.where(camera.plays(Role.X0), stretch * p, p))
     return replace(folded, pixel_mm=np.array([sx * stretch, sy]))
+
+
+def _affinity(camera: Camera) -> float:
+    """Return b1 of a camera in mm, 0 if its model has no affinity."""
+    return float(camera.parameters[camera.plays(Role.AFFINITY)].sum())
 
 
 def _padded(p: FloatArray, fitted: BoolArray) -> FloatArray:
@@ -220,7 +225,8 @@ def start_values(camera: Camera, model: str) -> Camera:
     centre = (np.asarray(camera.size_px) - 1) / 2
     values: dict[str, float] = {}
     if camera.in_mm:
-        c, x0, y0, b1 = (camera.value(name) for name in ("c", "x0", "y0", "b1"))
+        c, x0, y0 = (camera.value(name) for name in ("c", "x0", "y0"))
+        b1 = _affinity(camera)
         if to_opencv:
             # brown multiplies the measured x by 1 + b1, brown_forward the ideal one
             fx = c / pixel[0] * (1 - b1 if backward else 1 + b1)

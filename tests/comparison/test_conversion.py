@@ -9,11 +9,12 @@ import pytest
 
 from sfm.adjustment.datum import Datum
 from sfm.adjustment.solve import adjust
+from sfm.comparison import camera_conversion
 from sfm.comparison.camera_conversion import convert_camera, corresponding_free, start_values, undistort
 from sfm.comparison.two_adjusters.adjusters import AdjusterComparison, compare_adjusters
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.camera import Camera, camera_from_values, pixel_from_tangents, tangents_from_pixel
-from sfm.model.distortion.models import GENERAL_MODELS, MODELS, Role
+from sfm.model.distortion.models import GENERAL_MODELS, MODELS, Model, Role
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.model.remarks.remark import of_kind
 from tests.findings import findings_of
@@ -135,6 +136,22 @@ def test_affinity_and_shear_keep_their_side_of_the_distortion(source: str, exact
     assert convert_camera(camera, exact).max_px < 2 * convert_camera(plain, exact).max_px + 1e-3
     for other in ("brown_affine", "brown_forward"):
         assert convert_camera(camera, other).max_px > 0.1
+
+
+def test_a_model_in_mm_without_affinity_is_converted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of CONTRIBUTING's exercises are: before, a survey with one ended at its comparison."""
+    brown = MODELS["brown"]
+    monkeypatch.setitem(MODELS, "plain", Model("plain", brown.function, brown.parameters[:3]))
+    camera = camera_from_values(
+        "plain", "plain", SIZE_PX, (PIXEL_MM, PIXEL_MM), c_mm=7.4, values=(("x0", 0.02),)
+    )
+    assert not camera.plays(Role.AFFINITY).any()
+    start = start_values(camera, "opencv")
+    assert start.value("fx") == start.value("fy") == pytest.approx(7.4 / PIXEL_MM)
+    assert (start.principal_point_px == camera.principal_point_px).all()
+    assert start_values(camera, "brown_forward_affine").value("x0") == 0.02
+    folded = camera_conversion._affinity_in_pixels(camera)
+    assert (folded.parameters == camera.parameters).all() and (folded.pixel_mm == camera.pixel_mm).all()
 
 
 @pytest.mark.parametrize("source", GENERAL_MODELS)
