@@ -585,6 +585,8 @@ def describe_stored(name: str, network: Network, estimate: Estimate) -> str:
     if name == "colmap-database":
         return f"{counted(len(network.images), 'photograph')}, {image_points}, no coordinates of points"
     images, points = estimate.oriented, estimate.determined
+    if "object points" not in form.keeps:
+        return f"{counted(int(images.sum()), 'photograph')}, no points"
     if not form.placed:
         images, points = np.ones_like(images), np.ones_like(points)
     seen = network.image_points

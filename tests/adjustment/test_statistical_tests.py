@@ -65,6 +65,16 @@ def test_the_robust_test_needs_no_stated_standard_deviation(stated: float) -> No
     assert robust_test(a).beyond == 0
 
 
+def test_the_robust_test_takes_its_scale_from_coordinates_that_have_a_check() -> None:
+    """Along the epipolar lines of a pair nothing is redundant: of 60 points, 116 coordinates were beyond."""
+    w = np.random.default_rng(5).standard_normal((60, 2))
+    w[:, 0] *= 1e-2
+    r = np.tile([1e-7, 0.5], (60, 1))
+    a = stub(standardised=w, redundancy_numbers=r, is_exact=False, levels=Levels())
+    found = robust_test(a)
+    assert (found.tested, found.beyond) == (60, 0)
+
+
 def test_the_global_test_is_by_chi_square() -> None:
     found = global_test(stub(sigma0=1.1, redundancy=50, false_alarm=0.05, reweighted=False))
     assert found.statistic == pytest.approx(60.5) and found.passed

@@ -210,7 +210,7 @@ def robust_test(adjustment: Adjustment, *, alpha: float | None = None) -> Coordi
     """
     alpha = adjustment.levels.question if alpha is None else alpha
     w = np.full_like(adjustment.standardised, np.nan) if adjustment.is_exact else adjustment.standardised
-    known = np.abs(w[np.isfinite(w)])
+    known = np.abs(w[_checked(adjustment) & np.isfinite(w)])
     sigma = MAD_TO_SIGMA * float(np.median(known)) if len(known) else 0.0
     return _coordinate_test(adjustment, w / (sigma or np.inf), float(normal_ppf(1 - alpha / 2)), alpha)
 
@@ -229,6 +229,12 @@ def more_than_chance(events: IntArray, trials: IntArray, level: float) -> BoolAr
     return np.asarray(binomial_sf(events - 1, trials, share) < level / max(1, len(events)))
 
 
+def _checked(adjustment: Adjustment) -> BoolArray:
+    """Return which image coordinates others check, unlike those along the epipolar line of a pair, (k, 2)."""
+    r = adjustment.redundancy_numbers
+    return np.asarray(np.isfinite(r) & (r > MIN_CHECKED_REDUNDANCY))
+
+
 def _coordinate_test(
     adjustment: Adjustment, statistic: FloatArray, critical: float, alpha: float
 ) -> CoordinateTest:
@@ -236,9 +242,8 @@ def _coordinate_test(
         raise GeometryError(
             f"test of image coordinates: alpha is {alpha:g}, expected more than 0 and below 1"
         )
-    r = adjustment.redundancy_numbers
-    checked = np.isfinite(r) & (r > MIN_CHECKED_REDUNDANCY)
-    shown = np.where(np.isfinite(r), statistic, np.nan)
+    checked = _checked(adjustment)
+    shown = np.where(np.isfinite(adjustment.redundancy_numbers), statistic, np.nan)
     beyond = int((np.abs(shown[checked]) > critical).sum())
     return CoordinateTest(alpha, critical, shown, int(checked.sum()), beyond)
 

@@ -88,6 +88,8 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
             (f"Standard deviation of a station, RMS [{unit}]", sigma_stations, stations),
         ],
     )
+    if model.network.moment is not None:
+        yield Note("The rigs of the model are not kept: its photographs are adjusted one by one.")
     share = a.redundancy / (2 * len(v))
     yield Note(
         "The model's residuals are those of its own cameras, photographs and points. The mean length of a "

@@ -17,7 +17,7 @@ from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
 from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
-from sfm.report.pages import page_of
+from sfm.report.pages import html_of, page_of
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests import commands
@@ -86,7 +86,7 @@ def test_a_survey_gives_scale_to_a_model() -> None:
     length = float(np.linalg.norm(truth.points[0] - truth.points[1]))
     first, second = network.points[:2]
     camera = CameraSetup(name="any", images="*.jpg", c_mm=8.0)
-    bar = ScaleBar(first, second, length, 1e-6)
+    bar = ScaleBar(first, second, length, 1e-4)
     given = Survey(name="bar", unit="mm", cameras=(camera,), scale_bars=(bar,))
     a = audited(model, given=given).result.adjustment
     placing = fit_similarity(a.estimate.points, truth.points)
@@ -120,6 +120,15 @@ def test_cameras_are_told_by_their_photographs_whatever_their_names() -> None:
     assert [a.estimate.cameras[k].name for k in a.network.camera] == [
         truth.cameras[k].name for k in network.camera
     ]
+
+
+def test_rigs_that_are_not_kept_are_said() -> None:
+    network, truth = network_of("rigged", cameras=2)
+    audit = audited(model_of(network, truth))
+    assert "rigs of the model" not in html_of(audit, report="report.html")
+    moment = np.arange(len(network.images)) // 2
+    rigged = replace(audit.model, network=replace(network, moment=moment))
+    assert "rigs of the model are not kept" in html_of(replace(audit, model=rigged), report="report.html")
 
 
 def test_poses_alone_are_refused() -> None:
