@@ -38,7 +38,7 @@ from sfm.adjustment.engine.unknowns import Unknowns, unknowns_of
 from sfm.adjustment.quality.rank import reduced_names
 from sfm.adjustment.result import Adjustment, Covariance, ErrorCorrelation
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import KNOWN_WITHOUT, pixel_from_tangents, tangents_from_pixel
+from sfm.model.camera import KNOWN_WITHOUT, pixel_from_rays, rays_from_pixel
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -310,12 +310,12 @@ def determines_cameras(marginal: Marginal) -> bool:
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
         if not len(xy) or not sigma.all():
             continue
-        uv = tangents_from_pixel(camera, xy)
+        rays = rays_from_pixel(camera, xy)
         moved = np.empty((len(sigma), *xy.shape))
         for n, s in enumerate(marginal.layout.interior_free[k]):
             parameters = camera.parameters.copy()
             parameters[s] += sigma[n]
-            moved[n] = pixel_from_tangents(camera.with_parameters(parameters), uv) - xy
+            moved[n] = pixel_from_rays(camera.with_parameters(parameters), rays) - xy
         correlation = covariance / np.outer(sigma, sigma)
         shift = np.sqrt(np.einsum("st,skx,tkx->k", correlation, moved, moved).max())
         reach = np.linalg.norm(xy - (np.array(camera.size_px) - 1) / 2, axis=1).max()

@@ -28,14 +28,8 @@ from scipy.spatial.transform import Rotation
 
 from sfm.adjustment.quality.correlations import observed_part
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import (
-    Camera,
-    parameter_jacobian,
-    pixel_from_tangents,
-    pixel_jacobian,
-    tangents_from_pixel,
-)
-from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
+from sfm.model.camera import Camera, parameter_jacobian, pixel_from_rays, ray_jacobian, rays_from_pixel
+from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector, skew
 from sfm.model.display import html_table, text_table
 from sfm.model.distributions import LEVEL, chi2_sf
 from sfm.model.errors import GeometryError
@@ -43,7 +37,6 @@ from sfm.model.errors import GeometryError
 STEPS = 36  # of the grid along the longer side
 ROUNDS = 20  # of the rotation and translation; after five they change no more
 CONVERGED = 1e-12  # rad, and distances
-STEP = 1e-6  # of tangents, for a derivative
 
 
 @dataclass(frozen=True, repr=False)
@@ -176,8 +169,8 @@ def compare_cameras(
     x = np.linspace(0, width - 1, max(2, round(width / step) + 1))
     y = np.linspace(0, height - 1, max(2, round(height / step) + 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    uv = tangents_from_pixel(a, grid)
-    fits = np.isfinite(uv).all(axis=1) & np.isfinite(pixel_from_tangents(b, uv)).all(axis=1)
+    rays = _points(a, grid)
+    fits = np.isfinite(rays).all(axis=1) & np.isfinite(pixel_from_rays(b, rays)).all(axis=1)
     known: BoolArray = np.array(fits)
     for seen in seen_px:
         if seen is not None and len(seen):
@@ -188,23 +181,21 @@ def compare_cameras(
             "to both, needed at least 4"
         )
     shifts = 0 if np.isinf(distance) else 3
-    R, t = _implied(b, _points(uv), grid, known, shifts)
-    points = _points(uv) @ R.T + t
-    moved = _tangents(points)
-    difference = pixel_from_tangents(b, moved) - grid
+    R, t = _implied(b, rays, grid, known, shifts)
+    points = rays @ R.T + t
+    difference = pixel_from_rays(b, points) - grid
     difference[~fits] = np.nan
     known = np.asarray(known & np.isfinite(difference).all(axis=1))
     C, p_value = np.full((len(grid), 2, 2), np.nan), float("nan")
     sigmas = []
     if covariance[0] is not None:  # a pixel of a keeps its place, so that its ray moves the other way
-        by_pixel = _by_ray(b, uv, R, t) @ np.linalg.inv(pixel_jacobian(a, grid))
-        sigmas.append(-by_pixel @ _moved_by_sigma(a, uv, covariance[0]))
+        sigmas.append(-_by_pixel(a, b, grid, R, t) @ _moved_by_sigma(a, rays, covariance[0]))
     if covariance[1] is not None:
-        sigmas.append(_moved_by_sigma(b, moved, covariance[1]))
+        sigmas.append(_moved_by_sigma(b, points, covariance[1]))
     if any(columns.shape[2] for columns in sigmas):
         both = np.concatenate(sigmas, axis=2)
         # without what a rotation and shift, fitted where the difference is known, take up
-        lever = _lever(b, moved, points, shifts)
+        lever = _lever(b, points, shifts)
         sound = known & np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(both).all(axis=(1, 2))
         A, by_sigma = lever[sound].reshape(-1, lever.shape[2]), both[sound].reshape(-1, both.shape[2])
         free = both - lever @ np.linalg.lstsq(A, by_sigma, rcond=None)[0]
@@ -247,8 +238,7 @@ def _implied(
     R, t = np.eye(3), np.zeros(3)
     for _ in range(ROUNDS):
         at = (points @ R.T + t)[known]
-        uv = _tangents(at)
-        lever, off = _lever(b, uv, at, shifts), pixel_from_tangents(b, uv) - xy[known]
+        lever, off = _lever(b, at, shifts), pixel_from_rays(b, at) - xy[known]
         sound = np.isfinite(lever).all(axis=(1, 2)) & np.isfinite(off).all(axis=1)
         A, rest = lever[sound].reshape(-1, 3 + shifts), -off[sound].ravel()
         step = np.asarray(np.linalg.lstsq(A, rest, rcond=None)[0], dtype=float)
@@ -259,59 +249,39 @@ def _implied(
     return R, t
 
 
-def _points(uv: FloatArray) -> FloatArray:
-    """Return the points at distance 1 on rays, in camera axes, (k, 3)."""
-    rays = np.column_stack([uv, -np.ones(len(uv))])
+def _points(camera: Camera, xy: FloatArray) -> FloatArray:
+    """Return the points at distance 1 on the rays of pixels, in camera axes, (k, 3)."""
+    rays = rays_from_pixel(camera, xy)
     return np.asarray(rays / np.linalg.norm(rays, axis=1)[:, None])
 
 
-def _tangents(points: FloatArray) -> FloatArray:
-    """Return -U/W and -V/W of points in camera axes, NaN behind the camera, (k, 2)."""
-    W = np.where(points[:, 2] < 0, points[:, 2], np.nan)
-    return np.asarray(-points[:, :2] / W[:, None])
-
-
-def _lever(b: Camera, uv: FloatArray, points: FloatArray, shifts: int) -> FloatArray:
+def _lever(b: Camera, points: FloatArray, shifts: int) -> FloatArray:
     """Return the derivatives of the pixels of points by a rotation and a shift, px, (k, 2, 3 + shifts).
 
     Args:
         b: the camera.
-        uv: tangents of the points, (k, 2).
         points: in its axes, (k, 3).
         shifts: 3 for the derivatives by a shift too, otherwise 0.
     """
-    pixels = pixel_from_tangents(b, uv)
+    pixels = pixel_from_rays(b, points)
     known = np.isfinite(pixels).all(axis=1)
-    J = np.full((len(uv), 2, 2), np.nan)
-    J[known] = pixel_jacobian(b, pixels[known])
-    U, V, W = points.T
-    zero = np.zeros(len(points))
-    by_point = np.stack(
-        [np.stack([-1 / W, zero, U / W**2], axis=1), np.stack([zero, -1 / W, V / W**2], axis=1)], axis=1
-    )
-    turned = np.stack(
-        [
-            np.stack([zero, W, -V], axis=1),
-            np.stack([-W, zero, U], axis=1),
-            np.stack([V, -U, zero], axis=1),
-        ],
-        axis=1,
-    )  # d (w x point) / d w
-    columns = [by_point @ turned] + ([by_point] if shifts else [])
-    return np.asarray(J @ np.concatenate(columns, axis=2))
+    by_point = np.full((len(points), 2, 3), np.nan)
+    by_point[known] = ray_jacobian(b, pixels[known], points[known])
+    columns = [by_point @ -skew(points)] + ([by_point] if shifts else [])  # w x point
+    return np.concatenate(columns, axis=2)
 
 
-def _by_ray(b: Camera, uv: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the derivatives of pixels of b by the tangents of the first camera's rays, px, (k, 2, 2)."""
-    ahead, behind = (
-        np.stack([_tangents(_points(uv + step) @ R.T + t) for step in sign * STEP * np.eye(2)], axis=-1)
-        for sign in (1, -1)
-    )
-    pixels = pixel_from_tangents(b, _tangents(_points(uv) @ R.T + t))
-    return np.asarray(pixel_jacobian(b, pixels) @ ((ahead - behind) / (2 * STEP)))
+def _by_pixel(a: Camera, b: Camera, xy: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the derivatives of pixels of b by the pixels of a that show the same points, (k, 2, 2).
+
+    The rays of a have differences over two pixels.
+    """
+    by_pixel = np.stack([(_points(a, xy + step) - _points(a, xy - step)) / 2 for step in np.eye(2)], axis=-1)
+    points = _points(a, xy) @ R.T + t
+    return np.asarray(ray_jacobian(b, pixel_from_rays(b, points), points) @ R @ by_pixel)
 
 
-def _moved_by_sigma(camera: Camera, uv: FloatArray, Q: FloatArray) -> FloatArray:
+def _moved_by_sigma(camera: Camera, rays: FloatArray, Q: FloatArray) -> FloatArray:
     """Return how independent unit variables of a camera move the pixels of rays, px, (k, 2, n).
 
     These are variables whose covariance is the identity, so that the sum of the outer products of the columns
@@ -319,7 +289,7 @@ def _moved_by_sigma(camera: Camera, uv: FloatArray, Q: FloatArray) -> FloatArray
 
     Args:
         camera: the camera.
-        uv: tangents of the rays, (k, 2).
+        rays: directions in its axes, (k, 3).
         Q: covariance of its parameters, (p, p).
     """
     n = len(camera.parameters)
@@ -328,10 +298,10 @@ def _moved_by_sigma(camera: Camera, uv: FloatArray, Q: FloatArray) -> FloatArray
     sigma = np.sqrt(np.maximum(np.diagonal(Q), 0.0))
     free = np.flatnonzero(sigma > 0)
     if not len(free):
-        return np.zeros((len(uv), 2, 0))
+        return np.zeros((len(rays), 2, 0))
     values, vectors = np.linalg.eigh(Q[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
     root = sigma[free][:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(parameter_jacobian(camera, uv)[:, :, free] @ root)
+    return np.asarray(parameter_jacobian(camera, rays)[:, :, free] @ root)
 
 
 def _probability(square_sum: float, moved: FloatArray) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment, Covariance
 from sfm.comparison.pairing import rounding_of
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, pixel_from_tangents, project, tangents_from_pixel
+from sfm.model.camera import Camera, pixel_from_rays, project, rays_from_pixel
 from sfm.model.conventions import FloatArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
@@ -243,7 +243,7 @@ def interior_effect_px(a: Camera, b: Camera) -> float:
     x = np.linspace(-0.5, width - 0.5, EFFECT_STEPS)
     y = np.linspace(-0.5, height - 0.5, EFFECT_STEPS)
     xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    shift = pixel_from_tangents(b, tangents_from_pixel(a, xy)) - xy
+    shift = pixel_from_rays(b, rays_from_pixel(a, xy)) - xy
     return _longest(shift)
 
 

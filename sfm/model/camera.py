@@ -30,7 +30,7 @@ DIRECTIONS, WIDEST, NARROWER, CERTAIN = 16, 1.25, 0.75, 0.9
 # the numerator cancels, as it nearly does in many fits (a ring of 1e-5 of the radius in one to a mild lens).
 RING = 1e-3
 CURVATURE_STEP = 1e-3  # tangents, one or a few pixels
-# In tangents; the error of Newton's method after such a step is its square, or rounding.
+# In coordinates of a ray; the error of Newton's method after such a step is its square, or rounding.
 STEP_TOLERANCE = 1e-11
 # Fraction of the half diagonal, at the corner of the photograph, by which nominal focal lengths, sensors and
 # lenses differ from true ones. A parameter that the network determines worse is better held fixed.
@@ -109,9 +109,10 @@ class Camera:
 
     @property
     def frame(self) -> FloatArray:
-        """Centre (px), pixel size (mm) and variant of the model, for compiled code, (6,)."""
-        width, height = self.size_px
-        return np.array([(width - 1) / 2, (height - 1) / 2, *self.pixel_mm, *MODELS[self.model].variant])
+        """Centre (px), pixel size (mm), variant of the model, plane of its rays, for compiled code, (7,)."""
+        (width, height), model = self.size_px, MODELS[self.model]
+        centre = (width - 1) / 2, (height - 1) / 2
+        return np.array([*centre, *self.pixel_mm, *model.variant, float(model.stereographic)])
 
     @property
     def linear_frame(self) -> FloatArray:
@@ -289,15 +290,17 @@ def tangents_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
     Returns:
         u = -U/W and v = -V/W (image axes, y up), shape (k, 2); NaN where no ray within the monotone range of
-        a model that distorts the ideal point has the pixel. Models that correct the measured point give a
-        ray to every pixel.
+        a model that distorts the ideal point has the pixel, and where the ray is 90 degrees or more from the
+        axis (`rays_from_pixel` returns it). Models that correct the measured point give a ray to every pixel.
 
     Source: collinearity, Kraus (2007), sec. 4.2.1; the distortion model of the camera
     (`sfm.model.distortion`).
     """
-    xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
-    corrects = MODELS[camera.model].corrects
-    return _tangents(camera.index, camera.linear_frame, camera.parameters, corrects, xy)
+    uv = _rays_in_plane(camera, xy_px)
+    if not MODELS[camera.model].stereographic:
+        return uv
+    W = 1.0 - (uv * uv).sum(axis=1) / 4.0
+    return np.asarray(uv / np.where(W > 0, W, np.nan)[:, None])
 
 
 def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
@@ -310,24 +313,129 @@ def pixel_from_tangents(camera: Camera, uv: FloatArray) -> FloatArray:
     Returns:
         Pixel coordinates, shape (k, 2), px; NaN beyond the monotone range, where the distortion folds over.
     """
-    rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
+    tangents = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
+    if MODELS[camera.model].stereographic:
+        length = np.sqrt(1.0 + (tangents * tangents).sum(axis=1))
+        tangents = tangents * (2.0 / (1.0 + length))[:, None]
+    return _pixel_in_plane(camera, tangents)
+
+
+def rays_from_pixel(camera: Camera, xy_px: FloatArray) -> FloatArray:
+    """Return the rays through pixels, distortion removed, at any angle to the axis that the model reaches.
+
+    Args:
+        camera: interior orientation.
+        xy_px: pixel coordinates, shape (k, 2), px.
+
+    Returns:
+        Directions (U, V, W) in the image frame, shape (k, 3): (u, v, -1) of models of tangents, of length 1
+        of stereographic ones. NaN without a ray, as of `tangents_from_pixel`.
+    """
+    uv = _rays_in_plane(camera, xy_px)
+    if not MODELS[camera.model].stereographic:
+        return np.column_stack([uv, -np.ones(len(uv))])
+    r2 = (uv * uv).sum(axis=1) / 4.0
+    return np.asarray(np.column_stack([uv, r2 - 1.0]) / (1.0 + r2)[:, None])
+
+
+def pixel_from_rays(camera: Camera, rays: FloatArray) -> FloatArray:
+    """Return the pixel coordinates of rays.
+
+    Args:
+        camera: interior orientation.
+        rays: directions (U, V, W) of any length in the image frame, shape (k, 3).
+
+    Returns:
+        Pixel coordinates, shape (k, 2), px; NaN beyond the monotone range, where the distortion folds over,
+        and for rays 90 degrees or more from the axis, which only stereographic models reach.
+    """
+    return _pixel_in_plane(camera, plane_from_rays(camera, rays))
+
+
+def plane_from_rays(camera: Camera, rays: FloatArray) -> FloatArray:
+    """Return the coordinates u, v of rays that a camera's model takes (`sfm.model.distortion.models`).
+
+    Args:
+        camera: interior orientation.
+        rays: directions (U, V, W) of any length in the image frame, shape (k, 3).
+
+    Returns:
+        Tangents or stereographic coordinates, shape (k, 2); NaN for rays that have none.
+    """
+    directions = np.asarray(rays, dtype=float).reshape(-1, 3)
+    W = directions[:, 2]
+    if not MODELS[camera.model].stereographic:
+        return np.asarray(-directions[:, :2] / np.where(W < 0, W, np.nan)[:, None])
+    depth = np.sqrt((directions * directions).sum(axis=1)) - W
+    return np.asarray(2.0 * directions[:, :2] / np.where(depth > 0, depth, np.nan)[:, None])
+
+
+def within_reach(camera: Camera, xy_px: FloatArray, seen_px: FloatArray) -> BoolArray:
+    """Return which pixels have a ray that photographs of the camera may have.
+
+    Beyond 90 degrees from the axis, the image circle of a lens ends somewhere. Image points tell how far it
+    reaches at least.
+
+    Args:
+        camera: interior orientation.
+        xy_px: pixel coordinates, shape (k, 2), px.
+        seen_px: image points, shape (n, 2), px.
+
+    Returns:
+        Which pixels have a ray less than 90 degrees from the axis, or no farther from it than that of an
+        image point, (k,).
+    """
+    rays, measured = (rays_from_pixel(camera, places) for places in (xy_px, seen_px))
+    rays, measured = (part / np.linalg.norm(part, axis=1)[:, None] for part in (rays, measured))
+    return np.asarray(rays[:, 2] <= max(0.0, np.nanmax(measured[:, 2], initial=0.0)))
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> float:
+    """Return the angle of view between two rays of a camera on opposite sides of its axis, rad.
+
+    Args:
+        first: direction (U, V, W) in the image frame, (3,).
+        second: the other one, (3,).
+
+    Returns:
+        The angle across the axis, which exceeds 180 degrees where both rays together are farther from it; NaN
+        without a ray.
+    """
+    a, b = first / np.linalg.norm(first), second / np.linalg.norm(second)
+    angle = float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+    return 2 * np.pi - angle if np.arccos(-a[2]) + np.arccos(-b[2]) > np.pi else angle
+
+
+def _rays_in_plane(camera: Camera, xy_px: FloatArray) -> FloatArray:
+    """Return the coordinates u, v of the rays through pixels that the camera's model takes, (k, 2)."""
+    xy = np.ascontiguousarray(xy_px, dtype=float).reshape(-1, 2)
     corrects = MODELS[camera.model].corrects
-    return _pixels(camera.index, camera.linear_frame, camera.parameters, corrects, rays)
+    return _rays(camera.index, camera.linear_frame, camera.parameters, corrects, xy)
 
 
-def parameter_jacobian(camera: Camera, uv: FloatArray) -> FloatArray:
+def _pixel_in_plane(camera: Camera, uv: FloatArray) -> FloatArray:
+    """Return the pixels of rays from the coordinates u, v that the camera's model takes, (k, 2)."""
+    corrects = MODELS[camera.model].corrects
+    return _pixels(camera.index, camera.linear_frame, camera.parameters, corrects, np.ascontiguousarray(uv))
+
+
+def parameter_jacobian(camera: Camera, rays: FloatArray) -> FloatArray:
     """Return d (x, y) / d (parameters), the change of the pixel coordinates of rays with each parameter.
 
     Args:
         camera: interior orientation of n parameters.
-        uv: tangents of the rays, shape (k, 2).
+        rays: directions (U, V, W) of any length in the image frame, shape (k, 3); or their tangents u = -U/W
+            and v = -V/W, shape (k, 2).
 
     Returns:
         Derivatives, shape (k, 2, n), px per unit of the parameter; NaN where the distortion folds over.
     """
-    rays = np.ascontiguousarray(uv, dtype=float).reshape(-1, 2)
-    xy, frame = pixel_from_tangents(camera, rays), camera.linear_frame
-    Jp = residuals_of_rays(camera.index, frame, camera.parameters, xy, rays)[1]
+    rays = np.asarray(rays, dtype=float)
+    if rays.shape[1] == 2:
+        rays = np.column_stack([rays, -np.ones(len(rays))])
+    uv = plane_from_rays(camera, rays)
+    xy, frame = _pixel_in_plane(camera, uv), camera.linear_frame
+    Jp = residuals_of_rays(camera.index, frame, camera.parameters, xy, uv)[1]
     if not MODELS[camera.model].corrects:
         return np.asarray(np.where(np.isfinite(xy)[:, :, None], Jp, np.nan))
     # of correction models, the residual stays 0 if the measured point moves; it does against x0 and y0
@@ -361,7 +469,8 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
         points: object points, shape (n, 3), object unit.
 
     Returns:
-        Pixel coordinates, shape (n, 2), px; NaN for points behind the camera.
+        Pixel coordinates, shape (n, 2), px; NaN for points that the camera does not see: behind it, if its
+        model takes tangents.
 
     Example:
         >>> camera = camera_from_values("D3", "brown", (6000, 4000), (0.004, 0.004), c_mm=20.0)
@@ -370,10 +479,7 @@ def project(camera: Camera, position: FloatArray, rotation: FloatArray, points: 
 
     Source: Kraus (2007), eq. 5.1-1.
     """
-    UVW = (np.asarray(points, dtype=float) - position) @ rotation
-    in_front = UVW[:, 2] < 0
-    W = np.where(in_front, UVW[:, 2], np.nan)
-    return pixel_from_tangents(camera, np.asarray(-UVW[:, :2] / W[:, None]))
+    return pixel_from_rays(camera, (np.asarray(points, dtype=float) - position) @ rotation)
 
 
 def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
@@ -384,21 +490,62 @@ def pixel_jacobian(camera: Camera, xy_px: FloatArray) -> FloatArray:
         xy_px: pixel coordinates, shape (k, 2), px.
 
     Returns:
-        Derivatives, shape (k, 2, 2), px, from the inverse of central differences over two pixels.
+        Derivatives, shape (k, 2, 2), px, from the inverse of central differences over two pixels; NaN 90
+        degrees or more from the axis, where `ray_jacobian` has them.
     """
+    by_plane = _jacobian_in_plane(camera, xy_px)
+    if not MODELS[camera.model].stereographic:
+        return by_plane
+    uv = tangents_from_pixel(camera, xy_px)
+    rays = np.column_stack([uv, -np.ones(len(uv))])
+    return np.asarray(by_plane @ _plane_by_rays(camera, rays)[:, :, :2])
+
+
+def ray_jacobian(camera: Camera, xy_px: FloatArray, rays: FloatArray) -> FloatArray:
+    """Return d (x, y) / d (U, V, W), the change of pixel coordinates with their rays.
+
+    Args:
+        camera: interior orientation.
+        xy_px: pixel coordinates, shape (k, 2), px.
+        rays: the directions that they show, of any length, in the image frame, shape (k, 3).
+
+    Returns:
+        Derivatives, shape (k, 2, 3), px over the unit of the rays; NaN without a ray.
+    """
+    return np.asarray(_jacobian_in_plane(camera, xy_px) @ _plane_by_rays(camera, rays))
+
+
+def _jacobian_in_plane(camera: Camera, xy_px: FloatArray) -> FloatArray:
+    """Return the derivatives of pixels by the coordinates u, v that the camera's model takes, (k, 2, 2)."""
     columns = []
     for step in np.eye(2):
-        ahead = tangents_from_pixel(camera, xy_px + step)
-        columns.append((ahead - tangents_from_pixel(camera, xy_px - step)) / 2)
+        ahead = _rays_in_plane(camera, xy_px + step)
+        columns.append((ahead - _rays_in_plane(camera, xy_px - step)) / 2)
     return np.asarray(np.linalg.inv(np.stack(columns, axis=-1)))
 
 
-def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
+def _plane_by_rays(camera: Camera, rays: FloatArray) -> FloatArray:
+    """Return the derivatives of the coordinates u, v that a camera's model takes by rays, (k, 2, 3)."""
+    uv, eye = plane_from_rays(camera, rays), np.eye(2)
+    if not MODELS[camera.model].stereographic:
+        by = np.concatenate([np.tile(eye, (len(uv), 1, 1)), uv[:, :, None]], axis=2)
+        return np.asarray(by / -rays[:, 2, None, None])
+    length = np.linalg.norm(rays, axis=1)
+    # u = 2 U / D with D = L - W, and dL is the unit vector along the ray
+    D = length - rays[:, 2]
+    by_D = rays / length[:, None] - (0.0, 0.0, 1.0)
+    flat = np.concatenate([np.tile(2.0 * eye, (len(uv), 1, 1)), np.zeros((len(uv), 2, 1))], axis=2)
+    return np.asarray((flat - uv[:, :, None] * by_D[:, None, :]) / D[:, None, None])
+
+
+def pixel_curvature(camera: Camera, uv: FloatArray, turned: FloatArray | None = None) -> FloatArray:
     """Return d^2 (x, y) / d (u, v)^2: how much distortion bends lines that are straight in the tangents.
 
     Args:
         camera: interior orientation.
         uv: tangents of rays, shape (k, 2).
+        turned: axes in which they are tangents, as rotations into the image frame, shape (k, 3, 3); the image
+            frame if not given.
 
     Returns:
         Second derivatives [:, i, a, b] of pixel coordinate i, shape (k, 2, 2, 2), px, from differences over
@@ -406,9 +553,15 @@ def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
     """
     u, v = CURVATURE_STEP * np.eye(2)
 
+    def seen(tangents: FloatArray) -> FloatArray:
+        if turned is None:
+            return pixel_from_tangents(camera, tangents)
+        rays = np.column_stack([tangents, -np.ones(len(tangents))])
+        return pixel_from_rays(camera, np.einsum("kij,kj->ki", turned, rays))
+
     def mixed(a: FloatArray, b: FloatArray) -> FloatArray:
         ends = (a + b, a - b, b - a, -a - b)
-        one, two, three, four = (pixel_from_tangents(camera, uv + step) for step in ends)
+        one, two, three, four = (seen(uv + step) for step in ends)
         return np.asarray((one - two - three + four) / (4 * CURVATURE_STEP**2))
 
     uv_part = mixed(u, v)
@@ -417,8 +570,8 @@ def pixel_curvature(camera: Camera, uv: FloatArray) -> FloatArray:
 
 
 @compiled
-def _tangents(model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: FloatArray) -> FloatArray:
-    """Return the tangents of pixels; correction models are linear in them, so that one step is exact."""
+def _rays(model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: FloatArray) -> FloatArray:
+    """Return the rays of pixels; correction models are linear in tangents, so that one step is exact."""
     residual, J, Jp, at = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS)), np.empty(2)
     uv = np.empty_like(xy)
     clear = 0.0
@@ -437,7 +590,7 @@ def _tangents(model: int, frame: FloatArray, p: FloatArray, corrects: bool, xy: 
 
 @compiled
 def _pixels(model: int, frame: FloatArray, p: FloatArray, corrects: bool, uv: FloatArray) -> FloatArray:
-    """Return the pixels of tangents; models that distort the ideal point give them directly."""
+    """Return the pixels of rays; models that distort the ideal point give them directly."""
     residual, J, Jp, at = np.empty(2), np.empty((2, 2)), np.empty((2, MAX_PARAMETERS)), np.empty(2)
     xy = np.empty_like(uv)
     clear = _clear_radius(model, frame, p, corrects, len(uv), np.empty(2), residual, J, Jp, at)
@@ -468,7 +621,7 @@ def residuals_of_rays(
         frame: linear frame of the camera.
         p: its parameters, (n,).
         xy: pixel coordinates, px, (k, 2).
-        uv: tangents of the rays, (k, 2).
+        uv: coordinates of the rays in the plane of the model, (k, 2); see `plane_from_rays`.
     """
     residual, J, Jp = np.empty(2), np.empty((2, 2)), np.zeros((2, MAX_PARAMETERS))
     residuals = np.empty((len(xy), 2))
@@ -516,7 +669,7 @@ def _solve(
     model: int, frame: FloatArray, p: FloatArray, corrects: bool, known: FloatArray, clear: float,
     residual: FloatArray, J: FloatArray, Jp: FloatArray, at: FloatArray,
 ) -> None:  # fmt: skip
-    """Find the pixel of known tangents (correction models), or the tangents of a known pixel, in `at`.
+    """Find the pixel of a known ray (correction models), or the ray of a known pixel, in `at`.
 
     Newton's method begins on the axis. Its steps are halved until they stay within the monotone range and
     reduce the residual, so that it finds the only solution there; NaN if there is none. Within the clear
@@ -559,12 +712,12 @@ def _is_monotone(
     model: int, frame: FloatArray, p: FloatArray, uv: FloatArray,
     residual: FloatArray, J: FloatArray, Jp: FloatArray, at: FloatArray,
 ) -> bool:  # fmt: skip
-    """Return whether the distortion of the ideal point is monotone from the axis to the tangents (u, v)."""
+    """Return whether the distortion of the ideal point is monotone from the axis to the ray (u, v)."""
     _linearise(model, frame, p, False, frame, 0.0, 0.0, residual, J, Jp)
     axis = J[0, 0], J[0, 1], J[1, 0], J[1, 1]
     left = np.hypot(uv[0], uv[1])
     x, y, reached = 0.0, 0.0, 0.0
-    while reached < left:  # in steps that double, since rays near 90 degrees have large tangents
+    while reached < left:  # in steps that double, since rays near 90 or 180 degrees have large coordinates
         reached = min(2.0 * reached + 1.0, left)
         at[0], at[1] = uv[0] * (reached / left), uv[1] * (reached / left)
         if not _stays_monotone(model, frame, p, False, frame, axis, x, y, at, residual, J, Jp):
@@ -635,7 +788,7 @@ def _linearise(
 
 @inlined
 def _axis(frame: FloatArray, p: FloatArray, corrects: bool) -> tuple[float, float]:
-    """Return the unknown on the axis: the principal point (px) of correction models, else tangents of 0."""
+    """Return the unknown on the axis: the principal point (px) of correction models, else a ray at 0."""
     if corrects:
         return frame[0] + p[1] / frame[2], frame[1] - p[2] / frame[3]
     return 0.0, 0.0
@@ -661,7 +814,7 @@ def corner_shift(camera: Camera, s: int, sigma: float) -> float:
     places = inwards[:, None] * (np.array(camera.size_px) - 1)
     p = camera.parameters.copy()
     p[s] += sigma
-    moved = pixel_from_tangents(camera.with_parameters(p), tangents_from_pixel(camera, places)) - places
+    moved = pixel_from_rays(camera.with_parameters(p), rays_from_pixel(camera, places)) - places
     reach = 2 * np.hypot(*moved.T) / float(np.hypot(*camera.size_px))
     known = np.isfinite(reach)
     return float(reach[known.argmax()]) if known.any() else np.inf

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sfm.model.camera import Camera, tangents_from_pixel
+from sfm.model.camera import Camera, rays_from_pixel, tangents_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
@@ -20,7 +20,9 @@ MAX_PAIRS = 4_000_000  # pairs of rays compared at a time
 
 
 def image_tangents(seen: ImagePoints, camera: IntArray, cameras: Sequence[Camera]) -> FloatArray:
-    """Return the tangents u = -U/W, v = -V/W of image points, NaN for image points without a ray, (k, 2).
+    """Return the tangents u = -U/W, v = -V/W of image points, (k, 2).
+
+    NaN for image points without a ray, and with one 90 degrees or more from the axis.
 
     Args:
         seen: image points.
@@ -39,7 +41,8 @@ def intersect_image_points(
     """Return the object points that most rays of oriented photographs support; see `intersect`.
 
     Rays of wide-angle cameras are compared by angles: each becomes the axis of a separate photograph. With
-    tangents, one pixel at 70 degrees off the axis would weigh as much as eight in the middle.
+    tangents, one pixel at 70 degrees off the axis would weigh as much as eight in the middle, and there are
+    none at 90 degrees.
 
     Args:
         seen: image points.
@@ -53,18 +56,14 @@ def intersect_image_points(
     wide = np.array([lens.wide_angle for lens in estimate.cameras])[camera[image]]
     if wide.any():
         position = np.concatenate([position, position[image[wide]]])
-        # rotations with axis -z along the rays
-        u, v = uv[wide].T
-        ones = np.ones(len(u))
-        z = np.column_stack([-u, -v, ones])
-        z /= np.linalg.norm(z, axis=1, keepdims=True)
-        x = np.column_stack([ones, 0 * ones, u])
-        x /= np.linalg.norm(x, axis=1, keepdims=True)
-        along = rotation[image[wide]] @ np.stack([x, np.cross(z, x), z], axis=2)
-        rotation = np.concatenate([rotation, along])
+        rays = np.empty((len(seen), 3))
+        for k, rows in enumerate(rows_of(camera[image], len(estimate.cameras))):
+            if estimate.cameras[k].wide_angle:
+                rays[rows] = rays_from_pixel(estimate.cameras[k], seen.xy[rows])
+        rotation = np.concatenate([rotation, rotation[image[wide]] @ axes_along(rays[wide])])
         image = image.copy()
         image[wide] = len(estimate.position) + np.arange(int(wide.sum()))
-        uv[wide] *= 0.0  # keeps NaN
+        uv[wide] = 0.0 * rays[wide][:, :2]  # keeps NaN
     return intersect(
         uv,
         image,
@@ -74,6 +73,22 @@ def intersect_image_points(
         n_points=n_points,
         limits=RayLimits(tolerance=tolerance_px / min(lens.c_px for lens in estimate.cameras)),
     )
+
+
+def axes_along(rays: FloatArray) -> FloatArray:
+    """Return rotations from axes whose -z is along a ray, and whose x is level, into those of the rays.
+
+    Args:
+        rays: directions, of any length, (k, 3).
+
+    Returns:
+        Rotation matrices, (k, 3, 3).
+    """
+    z = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    x = np.column_stack([z[:, 2], 0 * z[:, 1], -z[:, 0]])
+    length = np.linalg.norm(x, axis=1, keepdims=True)
+    x = np.where(length > 0, x / np.where(length > 0, length, 1.0), (1.0, 0.0, 0.0))  # a ray along y
+    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
 def ray_angles(network: Network, estimate: Estimate, used: BoolArray) -> FloatArray:

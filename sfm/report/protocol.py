@@ -25,7 +25,7 @@ from sfm.judgement.checks import (
     standard_deviations,
 )
 from sfm.judgement.survey_result import ControlCheck, SurveyResult
-from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.model.camera import Camera, angle_between, pixel_from_rays, rays_from_pixel
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.distortion.models import Role
 from sfm.model.distributions import f_sf
@@ -169,15 +169,14 @@ def _lens(camera: Camera) -> Lens:
         ]
     )
     straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
-    moved = np.linalg.norm(pixel_from_tangents(straight, tangents_from_pixel(camera, edge)) - edge, axis=1)
+    moved = np.linalg.norm(pixel_from_rays(straight, rays_from_pixel(camera, edge)) - edge, axis=1)
     middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])
     upright = np.array([[(width - 1) / 2, 0.0], [(width - 1) / 2, height - 1.0]])
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     angles = []  # between the rays of opposite points, rad
     for pair in (middle, upright, corners):
-        rays = np.concatenate([tangents_from_pixel(camera, pair), -np.ones((2, 1))], axis=1)
-        first, second = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        angles.append(float(np.arccos(np.clip(first @ second, -1.0, 1.0))))
+        rays = rays_from_pixel(camera, pair)
+        angles.append(angle_between(rays[0], rays[1]))
     largest = float(moved[np.isfinite(moved)].max(initial=0.0)) if np.isfinite(moved).any() else np.nan
     return Lens(camera.name, largest, np.degrees(angles))
 

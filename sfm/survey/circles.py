@@ -11,12 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.judgement.survey_result import Eccentricity
-from sfm.model.camera import pixel_curvature, pixel_jacobian
+from sfm.model.camera import pixel_curvature, pixel_jacobian, ray_jacobian
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
+from sfm.model.distortion.models import MODELS
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
 from sfm.model.remarks.remark import Remark, remark
 from sfm.orientation.eccentricity import CircleViews, ellipse_shape, fit_circles
+from sfm.orientation.image_rays import axes_along
 from sfm.survey.inputs.measurements import MeasuredPhotographs, Naming
 from sfm.survey.inputs.survey import Survey
 from sfm.survey.placing import object_scale
@@ -211,9 +213,19 @@ def _circle_views(
     rotation = estimate.rotation[seen.image]
     outward = estimate.points[seen.point] - estimate.position[seen.image]
     rays = np.einsum("kji,kj->ki", rotation, outward)
+    rotation = rotation.copy()
     jacobian, curvature = np.empty((len(seen), 2, 2)), np.empty((len(seen), 2, 2, 2))
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
     for camera, of_one in zip(estimate.cameras, of_camera, strict=True):
-        jacobian[of_one] = pixel_jacobian(camera, seen.xy[of_one])
-        curvature[of_one] = np.nan_to_num(pixel_curvature(camera, -rays[of_one, :2] / rays[of_one, 2:]))
+        if MODELS[camera.model].stereographic:  # tangents about the ray; those about the axis may not exist
+            along, ahead = axes_along(rays[of_one]), np.zeros((len(of_one), 2))
+            distance = np.linalg.norm(rays[of_one], axis=1)
+            by_ray = ray_jacobian(camera, seen.xy[of_one], rays[of_one] / distance[:, None])
+            jacobian[of_one] = by_ray @ along[:, :, :2]
+            curvature[of_one] = np.nan_to_num(pixel_curvature(camera, ahead, along))
+            rotation[of_one] = rotation[of_one] @ along
+            rays[of_one] = np.column_stack([ahead, -distance])
+        else:
+            jacobian[of_one] = pixel_jacobian(camera, seen.xy[of_one])
+            curvature[of_one] = np.nan_to_num(pixel_curvature(camera, -rays[of_one, :2] / rays[of_one, 2:]))
     return CircleViews(point, shape, rays, rotation, jacobian, curvature)

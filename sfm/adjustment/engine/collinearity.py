@@ -2,6 +2,9 @@
 
     (U, V, W) = M (X - X0),  u = -U/W,  v = -V/W,  r = model(u, v, p) - measured
 
+Models that reach beyond 90 degrees from the axis take stereographic coordinates, u = 2 U/(L - W) and
+v = 2 V/(L - W) with the distance L of the point, in place of the tangents.
+
 The unknowns of a photograph are its projection centre X0 and a small rotation w in its image axes,
 R <- R exp([w]x). Then d(U, V, W)/dw = [(U, V, W)]x, and no angle becomes singular.
 
@@ -37,7 +40,9 @@ class Observations(NamedTuple):
     poses: int  # number of poses
     mounted: BoolArray  # cameras of rigs other than the reference cameras, (a,)
     model: IntArray  # number of the distortion model of each camera, (a,)
-    frame: FloatArray  # centre (px), pixel size (mm), planes of residuals and affinity of each camera, (a, 6)
+    frame: (
+        FloatArray  # centre (px), pixel size (mm), planes of residuals, affinity and rays of cameras, (a, 7)
+    )
     interior: IntArray  # number of parameters in the model of each camera, 0 if none is free, (a,)
     free_count: IntArray  # number of free parameters of each camera and its mount, (a,)
     free_index: IntArray  # their indices; those of the mount start at MAX_PARAMETERS, (a, CAMERA_UNKNOWNS)
@@ -84,7 +89,7 @@ def new_workspace() -> Workspace:
 def collinearity(
     o: int, observations: Observations, state: State, weight: float, workspace: Workspace
 ) -> bool:
-    """Fill the weighted residual and derivatives of image point o; False if it is behind the camera.
+    """Fill the weighted residual and derivatives of image point o; False if its camera does not see it.
 
     Args:
         o: index of the image point.
@@ -95,6 +100,8 @@ def collinearity(
     """
     i, j = observations.image[o], observations.point[o]
     a = observations.camera[i]
+    if observations.frame[a, 6] > 0.0:
+        return _of_direction(o, observations, state, weight, workspace)
     m00, m01, m02 = state.M[i, 0, 0], state.M[i, 0, 1], state.M[i, 0, 2]
     m10, m11, m12 = state.M[i, 1, 0], state.M[i, 1, 1], state.M[i, 1, 2]
     m20, m21, m22 = state.M[i, 2, 0], state.M[i, 2, 1], state.M[i, 2, 2]
@@ -150,8 +157,69 @@ def collinearity(
         workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
     if observations.mounted[a]:
         _of_rig(a, observations.pose_of[i], state, workspace.A)
-    in_front: bool = W < 0.0
-    return in_front
+    seen: bool = W < 0.0
+    return seen
+
+
+@kernel
+def _of_direction(
+    o: int, observations: Observations, state: State, weight: float, workspace: Workspace
+) -> bool:
+    """Fill what `collinearity` does for a model that takes stereographic coordinates.
+
+    It is a function of its own so that the compiler rounds the equations of tangents as ever.
+    """
+    i, j = observations.image[o], observations.point[o]
+    a = observations.camera[i]
+    M = state.M[i]
+    dX = state.points[j, 0] - state.position[i, 0]
+    dY = state.points[j, 1] - state.position[i, 1]
+    dZ = state.points[j, 2] - state.position[i, 2]
+    U = M[0, 0] * dX + M[0, 1] * dY + M[0, 2] * dZ
+    V = M[1, 0] * dX + M[1, 1] * dY + M[1, 2] * dZ
+    W = M[2, 0] * dX + M[2, 1] * dY + M[2, 2] * dZ
+    L = np.sqrt(U * U + V * V + W * W)
+    inverse = 2.0 / (L - W)
+    u, v = U * inverse, V * inverse
+    observe(
+        observations.model[a],
+        observations.frame[a],
+        state.parameters[a],
+        observations.xy[o, 0],
+        observations.xy[o, 1],
+        u,
+        v,
+        workspace.r,
+        workspace.Ju,
+        workspace.Jp,
+    )
+    root = np.sqrt(weight * observations.share[o])
+    whitening = observations.whitening[o]
+    f00, f10, f11 = root * whitening[0], root * whitening[1], root * whitening[2]
+    workspace.r[1] = f10 * workspace.r[0] + f11 * workspace.r[1]
+    workspace.r[0] = f00 * workspace.r[0]
+    for row in range(2):
+        # weighted d r / d (U, V, W): du/d(U, V, W) = inverse ((1, 0, 0) - u/2 (U/L, V/L, W/L - 1))
+        if row == 0:
+            ru, rv = f00 * workspace.Ju[0, 0] * inverse, f00 * workspace.Ju[0, 1] * inverse
+        else:
+            ru = (f10 * workspace.Ju[0, 0] + f11 * workspace.Ju[1, 0]) * inverse
+            rv = (f10 * workspace.Ju[0, 1] + f11 * workspace.Ju[1, 1]) * inverse
+        along = (ru * u + rv * v) / (2.0 * L)
+        rU, rV, rW = ru - along * U, rv - along * V, along * (L - W)
+        for b in range(3):
+            workspace.B[row, b] = rU * M[0, b] + rV * M[1, b] + rW * M[2, b]
+            workspace.A[row, b] = -workspace.B[row, b]
+        workspace.A[row, 3] = rV * W - rW * V
+        workspace.A[row, 4] = rW * U - rU * W
+        workspace.A[row, 5] = rU * V - rV * U
+    for s in range(observations.interior[a]):
+        workspace.A[0, 6 + s] = f00 * workspace.Jp[0, s]
+        workspace.A[1, 6 + s] = f10 * workspace.Jp[0, s] + f11 * workspace.Jp[1, s]
+    if observations.mounted[a]:
+        _of_rig(a, observations.pose_of[i], state, workspace.A)
+    seen: bool = L > W
+    return seen
 
 
 @inlined
@@ -176,7 +244,7 @@ def _of_rig(a: int, pose: int, state: State, A: FloatArray) -> None:
 
 
 def sum_of_squares(observations: Observations, state: State, weight: FloatArray) -> float:
-    """Return v'Pv of the image points; infinite if one with weight > 0 lies behind its camera.
+    """Return v'Pv of the image points; infinite if the camera of one with weight > 0 does not see it.
 
     Args:
         observations: image points.
@@ -187,7 +255,7 @@ def sum_of_squares(observations: Observations, state: State, weight: FloatArray)
 
 
 def residuals(observations: Observations, state: State) -> FloatArray:
-    """Return v = computed - measured of all image points, px, (k, 2); NaN behind the camera.
+    """Return v = computed - measured of all image points, px, (k, 2); NaN where the camera does not see it.
 
     Args:
         observations: image points.
@@ -206,11 +274,11 @@ def _residuals(observations: Observations, state: State, weight: FloatArray, v: 
     total = 0.0
     for o in range(len(observations.image)):
         if weight[o] > 0.0:
-            in_front = _residual(o, observations, state, workspace)
+            seen = _residual(o, observations, state, workspace)
             if wanted:
-                v[o, 0] = workspace.r[0] if in_front else np.nan
-                v[o, 1] = workspace.r[1] if in_front else np.nan
-            elif not in_front:
+                v[o, 0] = workspace.r[0] if seen else np.nan
+                v[o, 1] = workspace.r[1] if seen else np.nan
+            elif not seen:
                 return np.inf
             x = observations.whitening[o, 0] * workspace.r[0]
             y = observations.whitening[o, 1] * workspace.r[0] + observations.whitening[o, 2] * workspace.r[1]
@@ -220,7 +288,7 @@ def _residuals(observations: Observations, state: State, weight: FloatArray, v: 
 
 @inlined
 def _residual(o: int, observations: Observations, state: State, workspace: Workspace) -> bool:
-    """Fill the unweighted residual of image point o; False if it is behind the camera."""
+    """Fill the unweighted residual of image point o; False if its camera does not see it."""
     i, j = observations.image[o], observations.point[o]
     a = observations.camera[i]
     dX = state.points[j, 0] - state.position[i, 0]
@@ -229,7 +297,12 @@ def _residual(o: int, observations: Observations, state: State, workspace: Works
     U = state.M[i, 0, 0] * dX + state.M[i, 0, 1] * dY + state.M[i, 0, 2] * dZ
     V = state.M[i, 1, 0] * dX + state.M[i, 1, 1] * dY + state.M[i, 1, 2] * dZ
     W = state.M[i, 2, 0] * dX + state.M[i, 2, 1] * dY + state.M[i, 2, 2] * dZ
-    inverse = -1.0 / W
+    L = 0.0
+    if observations.frame[a, 6] > 0.0:
+        L = np.sqrt(U * U + V * V + W * W)
+        inverse = 2.0 / (L - W)
+    else:
+        inverse = -1.0 / W
     observe(
         observations.model[a],
         observations.frame[a],
@@ -242,12 +315,12 @@ def _residual(o: int, observations: Observations, state: State, workspace: Works
         workspace.Ju,
         workspace.Jp,
     )
-    in_front: bool = W < 0.0
-    return in_front  # a single exit: with an early return the compiler keeps the unused derivatives
+    seen: bool = W < L
+    return seen  # a single exit: with an early return the compiler keeps the unused derivatives
 
 
 def behind_camera(observations: Observations, state: State) -> BoolArray:
-    """Return which image points belong to object points that are behind the camera or undetermined, (k,).
+    """Return which image points belong to object points that the camera does not see or undetermined, (k,).
 
     Args:
         observations: image points.
@@ -262,7 +335,10 @@ def behind_camera(observations: Observations, state: State) -> BoolArray:
 def _behind(observations: Observations, state: State, behind: BoolArray) -> None:
     for o in range(len(behind)):
         i, j = observations.image[o], observations.point[o]
-        W = 0.0
+        W, L2 = 0.0, 0.0
         for p in range(3):
-            W += state.M[i, 2, p] * (state.points[j, p] - state.position[i, p])
-        behind[o] = not W < 0.0
+            away = state.points[j, p] - state.position[i, p]
+            W += state.M[i, 2, p] * away
+            L2 += away * away
+        reach = np.sqrt(L2) if observations.frame[observations.camera[i], 6] > 0.0 else 0.0
+        behind[o] = not reach > W

@@ -25,7 +25,7 @@ import numpy as np
 
 from sfm.adjustment.quality.variance_components import VarianceComponents, by_photograph
 from sfm.adjustment.result import Adjustment, computed_once
-from sfm.model.camera import pixel_jacobian, project
+from sfm.model.camera import project, ray_jacobian
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_isf, chi2_sf, f_sf, level_of_single, normal_ppf, t_ppf
 from sfm.model.network import rows_of
@@ -384,13 +384,12 @@ def point_normals(adjustment: Adjustment, sigma0: float | None = None) -> PointN
     seen = network.image_points
     R, X = estimate.rotation[seen.image], estimate.points[seen.point] - estimate.position[seen.image]
     UVW = np.einsum("kji,kj->ki", R, X)
-    W = UVW[:, 2]
-    uv = -UVW[:, :2] / W[:, None]
-    A = -(np.swapaxes(R, 1, 2)[:, :2] + uv[:, :, None] * R[:, None, :, 2]) / W[:, None, None]
+    A = np.empty((len(seen), 2, 3))
     of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
     for camera, rows_of_camera in zip(estimate.cameras, of_camera, strict=True):
         if len(rows_of_camera):
-            A[rows_of_camera] = pixel_jacobian(camera, seen.xy[rows_of_camera]) @ A[rows_of_camera]
+            by_ray = ray_jacobian(camera, seen.xy[rows_of_camera], UVW[rows_of_camera])
+            A[rows_of_camera] = by_ray @ np.swapaxes(R[rows_of_camera], 1, 2)
     P = (
         np.linalg.inv(adjustment.image_covariance)
         / (adjustment.image_sigma0 if sigma0 is None else sigma0) ** 2

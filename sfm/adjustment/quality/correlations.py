@@ -45,8 +45,8 @@ from sfm.adjustment.engine.unknowns import interior_names
 from sfm.adjustment.quality.statistics import MIN_REPORTED_CORRELATION
 from sfm.adjustment.result import Adjustment, ErrorCorrelation
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, pixel_from_tangents, pixel_jacobian, tangents_from_pixel
-from sfm.model.conventions import BoolArray, FloatArray, IntArray
+from sfm.model.camera import Camera, pixel_from_rays, ray_jacobian, rays_from_pixel, within_reach
+from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.display import counted
 from sfm.model.network import rows_of
 from sfm.model.observations.pose import exterior_jacobian
@@ -357,8 +357,8 @@ def projection_covariance(
         xy: pixel positions of the directions, px, (n, 2).
 
     Returns:
-        Covariance, px^2, (n, 2, 2); NaN where the camera model cannot be inverted, infinite if a parameter is
-        not determined.
+        Covariance, px^2, (n, 2, 2); NaN where the camera model cannot be inverted and, 90 degrees or more
+        from the axis, beyond the image points; infinite if a parameter is not determined.
     """
     sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
     if np.isinf(sigma).any():
@@ -374,22 +374,21 @@ def projection_covariance(
     of_rotation = turned_seen[sound].reshape(-1, 3)
     rotation = np.linalg.lstsq(of_rotation, moved_seen[sound].reshape(-1, len(known)), rcond=None)[0]
     J = _moved(camera, steps, xy) - _turned(camera, xy) @ rotation
-    return np.asarray(np.einsum("nis,st,njt->nij", J, correlation, J))
+    Q = np.einsum("nis,st,njt->nij", J, correlation, J)
+    return np.asarray(np.where(within_reach(camera, xy, seen)[:, None, None], Q, np.nan))
 
 
 def _moved(camera: Camera, steps: FloatArray, xy: FloatArray) -> FloatArray:
     """Return the shifts of images of distant points by steps of the parameters (s, p), px, (n, 2, s)."""
-    uv = tangents_from_pixel(camera, xy)
+    rays = rays_from_pixel(camera, xy)
     columns = []
     for step in steps:
-        ahead = pixel_from_tangents(camera.with_parameters(camera.parameters + step / 2), uv)
-        columns.append(ahead - pixel_from_tangents(camera.with_parameters(camera.parameters - step / 2), uv))
+        ahead = pixel_from_rays(camera.with_parameters(camera.parameters + step / 2), rays)
+        columns.append(ahead - pixel_from_rays(camera.with_parameters(camera.parameters - step / 2), rays))
     return np.stack(columns, axis=-1)
 
 
 def _turned(camera: Camera, xy: FloatArray) -> FloatArray:
     """Return the shifts of images of rays by small rotations about the image axes, px/rad, (n, 2, 3)."""
-    u, v = tangents_from_pixel(camera, xy).T
-    # for rays (u, v, -1): w x ray, divided by its depth again
-    turned = np.array([[u * v, -1 - u**2, -v], [1 + v**2, -u * v, u]])
-    return np.asarray(np.einsum("nij,jkn->nik", pixel_jacobian(camera, xy), turned))
+    rays = rays_from_pixel(camera, xy)
+    return np.asarray(ray_jacobian(camera, xy, rays) @ -skew(rays))  # w x ray

@@ -2,15 +2,20 @@
 
 A model is a compiled function `model(frame, p, x, y, u, v, residual, Ju, Jp)`. Its inputs are
 
-    frame (6,)      [0:2] centre of the photograph, px; [2:4] width and height of a pixel, mm
+    frame (7,)      [0:2] centre of the photograph, px; [2:4] width and height of a pixel, mm
                     models in mm: [4] is 1 if residuals are those of the measured point, 0 if those of the
                     corrected one; [5] is 1 if affinity and shear act on the distorted point, 0 if on the
                     ideal one
                     models in px: [4] is the number of focal lengths, [5] the number of parameters after the
                     principal point
+                    [6] is 1 if u, v are stereographic, 0 if they are tangents; for the callers of models
     p     (n,)      parameters in the order of the model's names
     x, y            measured pixel
-    u, v            tangents of the ray in the image frame (u = -U/W, v = -V/W, y up)
+    u, v            coordinates of the ray (U, V, W) in the image frame, y up, as the row of the model states.
+                    Tangents are u = -U/W, v = -V/W, and end before 90 degrees from the axis.
+                    Stereographic ones are u = 2 U/(L - W), v = 2 V/(L - W) with the length L of the ray, so
+                    that sqrt(u^2 + v^2) = 2 tan(theta/2), and end before 180 degrees. Near the axis both are
+                    equal.
 
 and its outputs are
 
@@ -156,6 +161,9 @@ class Model:
     """whether residuals are those of the corrected point instead of the measured one"""
     distorted_affinity: bool = False
     """whether affinity and shear act on the distorted point instead of the ideal one"""
+    stereographic: bool = False
+    """whether it takes stereographic coordinates of rays, so that they reach beyond 90 degrees from the axis;
+    otherwise their tangents"""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -235,19 +243,20 @@ PERSPECTIVE = (
 )
 # models for lenses that map approximately by angles instead of tangents
 WIDE_ANGLE = (
-    Model("simple_fisheye", fisheye, _ONE),
-    Model("fisheye", fisheye, _TWO),
-    Model("simple_radial_fisheye", fisheye, (*_ONE, *_K)),
-    Model("radial_fisheye", fisheye, (*_ONE, *_K1_K2)),
-    Model("opencv_fisheye", fisheye, (*_TWO, *_K1_K2, *_K3_K4)),
+    Model("simple_fisheye", fisheye, _ONE, stereographic=True),
+    Model("fisheye", fisheye, _TWO, stereographic=True),
+    Model("simple_radial_fisheye", fisheye, (*_ONE, *_K), stereographic=True),
+    Model("radial_fisheye", fisheye, (*_ONE, *_K1_K2), stereographic=True),
+    Model("opencv_fisheye", fisheye, (*_TWO, *_K1_K2, *_K3_K4), stereographic=True),
     Model("fov", fov, (*_TWO, *_parameters(Role.RADIAL, "omega", "rad"))),
-    Model("simple_division", division, (*_ONE, *_K)),
-    Model("division", division, (*_TWO, *_K)),
-    Model("eucm", eucm, (*_TWO, *_ALPHA_BETA)),
+    Model("simple_division", division, (*_ONE, *_K), stereographic=True),
+    Model("division", division, (*_TWO, *_K), stereographic=True),
+    Model("eucm", eucm, (*_TWO, *_ALPHA_BETA), stereographic=True),
     Model(
         "thin_prism_fisheye",
         thin_prism_fisheye,
         (*_OPENCV, *_K3_K4, *_parameters(Role.PRISM, "sx1 sy1", "1")),
+        stereographic=True,
     ),
     Model(
         "rad_tan_thin_prism_fisheye",
@@ -258,6 +267,7 @@ WIDE_ANGLE = (
             *_parameters(Role.DECENTRING, "p0 p1", "1"),
             *_parameters(Role.PRISM, "s0 s1 s2 s3", "1"),
         ),
+        stereographic=True,
     ),
 )
 COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)

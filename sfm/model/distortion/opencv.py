@@ -1,8 +1,8 @@
 """OpenCV's models, and equidistant models with decentring and thin prism distortion.
 
-All are in units of the focal lengths, as in COLMAP. The ideal point (a, b) is mapped to e = s(r2) (a, b), as
-in `radial`, and from there to the distorted point. The outputs are described in
-`sfm.model.distortion.models`.
+All are in units of the focal lengths, as in COLMAP. The coordinates of a ray (a, b) are mapped to
+e = s(r2) (a, b), as in `radial`, and from there to the distorted point. Those of equidistant models are
+stereographic. The outputs are described in `sfm.model.distortion.models`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ def thin_prism_fisheye(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Like OPENCV, with (a, b) theta / r for (a, b): fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1.
+    """Like OPENCV, with (a, b) theta / r for (x/z, y/z): fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1.
 
     With t2 = theta^2, ad = ea (1 + k1 t2 + ... + k4 t8) + 2 p1 ea eb + p2 (t2 + 2 ea^2) + sx1 t2,
     bd = eb (1 + ...) + 2 p2 ea eb + p1 (t2 + 2 eb^2) + sy1 t2.
@@ -26,7 +26,7 @@ def thin_prism_fisheye(
     """
     a, b = u, -v
     r2 = a * a + b * b
-    s, ds = equidistant(r2)
+    s, ds, _ = equidistant(r2)
     ea, eb = s * a, s * b
     t2 = s * s * r2
     k1, k2, p1, p2, k3, k4, sx1, sy1 = p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11]
@@ -66,14 +66,14 @@ def rad_tan_thin_prism_fisheye(
     """
     a, b = u, -v
     r2 = a * a + b * b
-    q, dq = equidistant(r2)
+    q, dq, dt2 = equidistant(r2)
     t2 = q * q * r2
     P, dP, power = 1.0, 0.0, 1.0
     for j in range(6):
         dP += (j + 1) * p[4 + j] * power
         power *= t2
         P += p[4 + j] * power
-    s, ds = q * P, dq * P + q * dP * q / (1.0 + r2)
+    s, ds = q * P, dq * P + q * dP * dt2
     ea, eb = s * a, s * b
     e2 = s * s * r2
     p0, p1, s0, s1, s2, s3 = p[10], p[11], p[12], p[13], p[14], p[15]

@@ -1,7 +1,9 @@
 """Models of radial distortion with focal lengths in px, perspective or wide-angle, as in COLMAP.
 
-The ideal point (a, b) = (x/z, y/z), y down, is mapped to s(r2) (a, b) with r2 = a^2 + b^2. One or two focal
-lengths (frame[4]) convert it to pixels. All models are smooth on the axis because s is a function of r2.
+The coordinates of a ray (a, b) = (u, -v), y down, are mapped to s(r2) (a, b) with r2 = a^2 + b^2. One or two
+focal lengths (frame[4]) convert them to pixels. All models are smooth on the axis because s is a function of
+r2. With tangents, (a, b) = (x/z, y/z) and r = tan(theta). With stereographic coordinates r = 2 tan(theta/2),
+and the ray is the direction (a, b, 1 - r2/4).
 
 The outputs are described in `sfm.model.distortion.models`.
 """
@@ -43,14 +45,14 @@ def fisheye(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Equidistant: r s = theta (1 + k1 theta^2 + k2 theta^4 + ...), r = tan(theta).
+    """Equidistant: r s = theta (1 + k1 theta^2 + k2 theta^4 + ...), r = 2 tan(theta/2).
 
     Source: Kannala and Brandt (2006), IEEE Trans. PAMI 28(8), eq. 6; COLMAP, camera models SIMPLE_FISHEYE,
     FISHEYE, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE and OPENCV_FISHEYE.
     """
     a, b, first = u, -v, int(frame[4]) + 2
     r2 = a * a + b * b
-    q, dq = equidistant(r2)
+    q, dq, dtheta2 = equidistant(r2)
     theta2 = q * q * r2
     P, dP, power = 1.0, 0.0, 1.0
     for j in range(int(frame[5])):
@@ -59,8 +61,7 @@ def fisheye(
         power *= theta2
         P += k * power
         fill_derivative(frame, p, first + j, a * q * power, b * q * power, Jp)
-    # d theta^2 / d r2 = theta / (r (1 + r2))
-    _fill_radial(frame, p, x, y, a, b, q * P, dq * P + q * dP * q / (1.0 + r2), residual, Ju, Jp)
+    _fill_radial(frame, p, x, y, a, b, q * P, dq * P + q * dP * dtheta2, residual, Ju, Jp)
 
 
 @inlined
@@ -68,7 +69,7 @@ def fov(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Field of view: r s = atan(2 r tan(omega / 2)) / omega.
+    """Field of view: r s = atan(2 r tan(omega / 2)) / omega, r = tan(theta).
 
     Source: Devernay and Faugeras (2001), Machine Vision and Applications 13, eq. 13; COLMAP, model FOV.
     """
@@ -78,7 +79,7 @@ def fov(
     w = 2.0 * math.tan(omega / 2.0)
     dw = 1.0 + w * w / 4.0
     ratio, dratio = _ratio_of_tangent(omega, w, dw)  # w / omega
-    q, dq = equidistant(w * w * r2)
+    q, dq = arctangent(w * w * r2)
     by_omega = dratio * q + ratio * dq * 2.0 * w * dw * r2
     fill_derivative(frame, p, first, a * by_omega, b * by_omega, Jp)
     _fill_radial(frame, p, x, y, a, b, ratio * q, ratio * dq * w * w, residual, Ju, Jp)
@@ -89,16 +90,17 @@ def division(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Division: (a, b) = (ad, bd) / (1 + k rd^2), so that s = 2 / (1 + sqrt(1 - 4 k r2)).
+    """Division: the ray is (ad, bd, 1 + k rd^2), so that s = 2 / (z + sqrt(z^2 - 4 k r2)), z = 1 - r2/4.
 
     Source: Fitzgibbon (2001), CVPR; COLMAP, camera models SIMPLE_DIVISION and DIVISION.
     """
     a, b, first = u, -v, int(frame[4]) + 2
     r2 = a * a + b * b
     k = p[first]
-    root = math.sqrt(1.0 - 4.0 * k * r2)  # NaN where the distortion folds over
-    s = 2.0 / (1.0 + root)
-    ds = s * s * k / root
+    z = 1.0 - r2 / 4.0
+    root = math.sqrt(z * z - 4.0 * k * r2)  # NaN where the distortion folds over
+    s = 2.0 / (z + root)
+    ds = s * s * (k + (z + root) / 8.0) / root
     by_k = s * s * r2 / root
     fill_derivative(frame, p, first, a * by_k, b * by_k, Jp)
     _fill_radial(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
@@ -109,23 +111,34 @@ def eucm(
     frame: FloatArray, p: FloatArray, x: float, y: float, u: float, v: float,
     residual: FloatArray, Ju: FloatArray, Jp: FloatArray,
 ) -> None:  # fmt: skip
-    """Enhanced unified camera model: s = 1 / (alpha d + 1 - alpha), d = sqrt(beta r2 + 1).
+    """Enhanced unified camera model: s = 1 / (alpha d + (1 - alpha) z) with d = sqrt(beta r2 + z^2).
+
+    The ray is (a, b, z) with z = 1 - r2/4.
 
     Source: Khomutenko et al. (2016), IEEE Robotics and Automation Letters 1(1), eq. 8; COLMAP, model EUCM.
     """
     a, b, first = u, -v, int(frame[4]) + 2
     r2 = a * a + b * b
     alpha, beta = p[first], p[first + 1]
-    d = math.sqrt(beta * r2 + 1.0)
-    s = 1.0 / (alpha * d + 1.0 - alpha)
-    by_alpha, by_beta = s * s * (1.0 - d), -s * s * alpha * r2 / (2.0 * d)
+    z = 1.0 - r2 / 4.0
+    d = math.sqrt(beta * r2 + z * z)
+    s = 1.0 / (alpha * d + (1.0 - alpha) * z)
+    by_alpha, by_beta = s * s * (z - d), -s * s * alpha * r2 / (2.0 * d)
+    ds = -s * s * (alpha * (beta - z / 2.0) / (2.0 * d) - (1.0 - alpha) / 4.0)
     fill_derivative(frame, p, first, a * by_alpha, b * by_alpha, Jp)
     fill_derivative(frame, p, first + 1, a * by_beta, b * by_beta, Jp)
-    _fill_radial(frame, p, x, y, a, b, s, -s * s * alpha * beta / (2.0 * d), residual, Ju, Jp)
+    _fill_radial(frame, p, x, y, a, b, s, ds, residual, Ju, Jp)
 
 
 @inlined
-def equidistant(r2: float) -> tuple[float, float]:
+def equidistant(r2: float) -> tuple[float, float, float]:
+    """Return q = theta / r, dq / d(r2) and d(theta^2) / d(r2) of stereographic r = 2 tan(theta/2)."""
+    q, dq = arctangent(r2 / 4.0)
+    return q, dq / 4.0, q / (1.0 + r2 / 4.0)
+
+
+@inlined
+def arctangent(r2: float) -> tuple[float, float]:
     """Return q = atan(r) / r and dq / d(r2), by their series near the axis."""
     if r2 < SERIES:
         q, dq = 0.0, 0.0

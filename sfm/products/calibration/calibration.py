@@ -18,7 +18,7 @@ from sfm.judgement.calibrated_cameras import InteriorParameter, interior_paramet
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, free_network
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, camera_families, tangents_from_pixel
+from sfm.model.camera import Camera, angle_between, camera_families, rays_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import level_of_single
 from sfm.model.errors import GeometryError
@@ -65,8 +65,8 @@ class CameraCalibration:
 
     @property
     def corners(self) -> FloatArray:
-        """Corners of the format, or the outermost places on its diagonals that have a ray, px, (4, 2)."""
-        return corners_of(self.camera)
+        """Corners of the format, or the outermost places on its diagonals that it reaches, px, (4, 2)."""
+        return corners_of(self.camera, self.xy)
 
     @property
     def degrees(self) -> tuple[float, float, float]:
@@ -76,10 +76,8 @@ class CameraCalibration:
         ends = ((-0.5, y), (width, y)), ((x, -0.5), (x, height)), ((-0.5, -0.5), (width, height))
         angles = []
         for pair in ends:
-            uv = tangents_from_pixel(self.camera, np.array(pair))
-            rays = np.column_stack([uv, -np.ones(2)])
-            rays /= np.linalg.norm(rays, axis=1)[:, None]
-            angles.append(float(np.degrees(np.arccos(np.clip(rays[0] @ rays[1], -1, 1)))))
+            rays = rays_from_pixel(self.camera, np.array(pair))
+            angles.append(float(np.degrees(angle_between(rays[0], rays[1]))))
         return angles[0], angles[1], angles[2]
 
     @property

@@ -23,7 +23,7 @@ from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import AdjustmentOptions, adjust
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import pixel_from_tangents, tangents_from_pixel
+from sfm.model.camera import pixel_from_rays, rays_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import chi2_sf
 from sfm.model.errors import GeometryError
@@ -214,9 +214,9 @@ def _difference(
         photographs.append(int(of_camera.sum()))
         seen = half.network.image_points
         xy = xy[observed_part(seen.xy[of_camera[seen.image]], xy)[1]]
-    rays = tangents_from_pixel(camera, xy)
-    first, second = (pixel_from_tangents(half.estimate.cameras[k], rays) for half in halves)
-    known = np.isfinite(rays + first + second).all(axis=1)
+    rays = rays_from_pixel(camera, xy)
+    first, second = (pixel_from_rays(half.estimate.cameras[k], rays) for half in halves)
+    known = np.isfinite(np.column_stack([rays, first, second])).all(axis=1)
     if known.sum() < 3:
         raise GeometryError(
             f"camera {camera.name}: both halves of its photographs cover no part of the format"

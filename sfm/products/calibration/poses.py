@@ -30,13 +30,7 @@ from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import (
-    Camera,
-    parameter_jacobian,
-    pixel_from_tangents,
-    pixel_jacobian,
-    tangents_from_pixel,
-)
+from sfm.model.camera import Camera, parameter_jacobian, project, ray_jacobian, rays_from_pixel, within_reach
 from sfm.model.conventions import FloatArray, IntArray, skew
 from sfm.model.network import ImagePoints
 from sfm.products.calibration.projection import (
@@ -94,7 +88,8 @@ def next_poses(adjustment: Adjustment, camera: int = 0, count: int = 3) -> NextP
         (1, True)
     """
     lens = adjustment.estimate.cameras[camera]
-    corners = corners_of(lens)
+    seen = adjustment.network.image_points.select(~adjustment.rejected)
+    corners = corners_of(lens, seen.xy[adjustment.network.camera[seen.image] == camera])
     before = worst_corner(adjustment, camera, corners)
     if not np.isfinite(before) or not lens.free.any():
         return NextPoses(lens.name, (), before, ())
@@ -106,14 +101,19 @@ def next_poses(adjustment: Adjustment, camera: int = 0, count: int = 3) -> NextP
     return NextPoses(lens.name, tuple(taken), before, tuple(after))
 
 
-def corners_of(camera: Camera) -> FloatArray:
-    """Return the corners of the format, or the places nearest to them that have a ray, px, (4, 2)."""
+def corners_of(camera: Camera, seen: FloatArray) -> FloatArray:
+    """Return the corners of the format, or the places nearest to them that the camera reaches, px, (4, 2).
+
+    Args:
+        camera: interior orientation.
+        seen: its image points, px, (k, 2); see `within_reach`.
+    """
     size = np.array(camera.size_px) - 1.0
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
     places = []
     for corner in corners:
         line = corner + 2 * DIAGONAL[:, None] * (size / 2 - corner)
-        inner = np.isfinite(tangents_from_pixel(camera, line)).all(axis=1)
+        inner = within_reach(camera, line, seen)
         places.append(line[int(inner.argmax())])
     return np.array(places)
 
@@ -158,18 +158,15 @@ def candidates(adjustment: Adjustment, camera: int) -> Iterator[Pose]:
     least_px = float(np.minimum(measured, np.array(lens.size_px) - 1 - measured).min())
     width, height = lens.size_px
     places = [(x, y) for x, y in product(PLACES, PLACES)]
-    tangents = tangents_from_pixel(lens, np.array(places) * (width, height) - 0.5)
+    rays = rays_from_pixel(lens, np.array(places) * (width, height) - 0.5)
     for a, b, roll, distance in product(TILTS_DEG, TILTS_DEG, ROLLS_DEG, distances):
         rotation = facing @ _turned(np.radians(a), np.radians(b), np.radians(roll))
-        for place, tangent in zip(places, tangents, strict=True):
-            if not np.isfinite(tangent).all():
+        for place, ray in zip(places, rays, strict=True):
+            if not np.isfinite(ray).all():
                 continue
-            position = middle - rotation @ (distance * np.array([*tangent, -1.0]))
+            position = middle - rotation @ (distance * ray)
             xy = np.full((len(network.points), 2), np.nan)
-            # NaN behind the camera and beyond its last ray
-            UVW = (points - position) @ rotation
-            depth = np.where(UVW[:, 2] < 0, UVW[:, 2], np.nan)[:, None]
-            all_xy = pixel_from_tangents(lens, -UVW[:, :2] / depth)
+            all_xy = project(lens, position, rotation, points)  # NaN beyond its last ray
             apart = np.linalg.norm(all_xy - all_xy[neighbour], axis=1) / 2
             border = np.minimum(all_xy, np.array(lens.size_px) - 1 - all_xy).min(axis=1)
             inside = border >= np.minimum(apart, least_px)
@@ -285,11 +282,9 @@ def _information(
     seen = np.flatnonzero(np.isfinite(view.xy[sample, 0]))
     points = adjustment.estimate.points[sample[seen]]
     UVW = (points - view.position) @ view.rotation
-    uv = -UVW[:, :2] / UVW[:, 2:]
-    by_ray = np.concatenate([np.tile(np.eye(2), (len(uv), 1, 1)), uv[:, :, None]], axis=2)
-    by_point = pixel_jacobian(lens, view.xy[sample[seen]]) @ by_ray / -UVW[:, 2][:, None, None]
+    by_point = ray_jacobian(lens, view.xy[sample[seen]], UVW)
     pose = np.concatenate([by_point, by_point @ skew(UVW)], axis=2).reshape(-1, 6)
-    interior = parameter_jacobian(lens, uv)[:, :, np.flatnonzero(lens.free)]
+    interior = parameter_jacobian(lens, UVW)[:, :, np.flatnonzero(lens.free)]
     f = interior.shape[2]
     A = np.zeros((len(seen), 2, f + 3 * len(sample)))
     A[:, :, :f] = interior

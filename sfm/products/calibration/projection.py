@@ -28,7 +28,7 @@ from sfm.adjustment.datum import Datum
 from sfm.adjustment.quality.correlations import CELLS
 from sfm.adjustment.result import Adjustment
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, parameter_jacobian, pixel_jacobian, tangents_from_pixel
+from sfm.model.camera import Camera, parameter_jacobian, ray_jacobian, rays_from_pixel
 from sfm.model.conventions import FloatArray, IntArray, skew
 from sfm.model.errors import GeometryError
 from sfm.model.network import index_of
@@ -68,14 +68,11 @@ class ProjectionUncertainty:
             xy: pixels, px, (k, 2).
             distance: as in `covariance_at`.
         """
-        uv = tangents_from_pixel(self.camera, xy)
-        ray = np.column_stack([uv, -np.ones(len(uv))])
+        ray = rays_from_pixel(self.camera, xy)
         shift = np.linalg.norm(ray, axis=1)[:, None, None] * np.eye(3) / distance
-        motion = np.concatenate([shift, skew(ray)], axis=2)  # of the ray, one unit long along the axis
-        # u = -U/W and v = -V/W at W = -1
-        by_ray = np.concatenate([np.tile(np.eye(2), (len(uv), 1, 1)), uv[:, :, None]], axis=2)
-        of_pose = pixel_jacobian(self.camera, xy) @ by_ray @ motion
-        return np.concatenate([of_pose, parameter_jacobian(self.camera, uv)[:, :, self.free]], axis=2)
+        motion = np.concatenate([shift, skew(ray)], axis=2)  # of the ray, in its length
+        of_pose = ray_jacobian(self.camera, xy, ray) @ motion
+        return np.concatenate([of_pose, parameter_jacobian(self.camera, ray)[:, :, self.free]], axis=2)
 
     def sigma_at(self, xy: FloatArray, distance: float) -> FloatArray:
         """Return the standard deviation of a projection, RMS of both coordinates, px, (k,).

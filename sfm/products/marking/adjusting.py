@@ -24,8 +24,8 @@ from sfm.model.camera import (
     Camera,
     corner_shift,
     parameter_jacobian,
-    pixel_from_tangents,
-    pixel_jacobian,
+    pixel_from_rays,
+    ray_jacobian,
 )
 from sfm.model.conventions import BoolArray, FloatArray, IntArray, skew
 from sfm.model.distortion.models import Role
@@ -276,23 +276,19 @@ class JointPrecision:
         estimate = self._marks.estimate
         lens, R = estimate.cameras[camera], estimate.rotation[i]
         U = R.T @ (X - estimate.position[i])
-        if not U[2] < 0:
-            return None
-        uv = -U[:2] / U[2]
-        xy = pixel_from_tangents(lens, uv[None])
+        xy = pixel_from_rays(lens, U[None])
         if not np.isfinite(xy).all():
             return None
-        by_U = np.column_stack([-np.eye(2) / U[2], U[:2] / U[2] ** 2])
-        by_uv = pixel_jacobian(lens, xy)[0] @ by_U
-        by_X = by_uv @ R.T
-        by_pose = np.hstack([-by_X, by_uv @ skew(U[None])[0]])
+        by_U = ray_jacobian(lens, xy, U[None])[0]
+        by_X = by_U @ R.T
+        by_pose = np.hstack([-by_X, by_U @ skew(U[None])[0]])
         by = np.zeros((2, self.size))
         k, width = int(self._image[i]), self._width
         by[:, k * width : (k + 1) * width] = by_pose @ self._by[k]
         free = self._layout.interior_free[camera]
         if len(self._interior[camera]):
             first = int(self._first[camera])
-            by[:, first : first + len(free)] = parameter_jacobian(lens, uv[None])[0][:, free]
+            by[:, first : first + len(free)] = parameter_jacobian(lens, U[None])[0][:, free]
         return xy[0], by, by_X
 
     def of_adjusted(self, j: int, by: FloatArray, by_X: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ def gains(simulations: int, *, fixed: bool) -> tuple[float, float]:
     for number in range(simulations):
         a, rng = calibration(number, fixed=fixed), seed_of(f"random {number}")
         further = next_poses(a)
-        views, corners = list(candidates(a, 0)), corners_of(CAMERA)
+        views, corners = list(candidates(a, 0)), corners_of(CAMERA, a.network.image_points.xy)
         chosen = [views[k] for k in rng.choice(len(views), 3, replace=False)]
         advised += further.before - further.after[-1]
         random += further.before - worst_corner(with_poses(a, 0, chosen), 0, corners)
@@ -75,6 +75,12 @@ def test_corners_of_a_fisheye_are_where_it_has_rays() -> None:
     fisheye = camera_from_values(
         "fish", "opencv_fisheye", (1000, 1000), (0.005, 0.005), c_mm=1.6, free=("fx", "fy")
     )
-    corners = corners_of(fisheye)
+    seen = np.array([[500.0, 600.0]])
+    corners = corners_of(fisheye, seen)
     assert ((corners > 0) & (corners < 999)).all() and len(FREE)
-    assert np.array_equal(corners_of(CAMERA)[3], [1199, 899])
+    off_axis = np.linalg.norm(corners - 499.5, axis=1) / 320
+    assert (off_axis < np.pi / 2).all() and (off_axis > np.pi / 2 - 0.1).all()
+    beyond = corners_of(fisheye, np.array([[499.5, 499.5 - 320 * np.radians(100)]]))
+    off_axis = np.linalg.norm(beyond - 499.5, axis=1) / 320
+    assert (off_axis < np.radians(100)).all() and (off_axis > np.radians(100) - 0.1).all()
+    assert np.array_equal(corners_of(CAMERA, seen)[3], [1199, 899])

@@ -9,7 +9,7 @@ import pytest
 
 import sfm
 from sfm.adjustment.solve import predict
-from sfm.model.camera import Camera, pixel_from_tangents, tangents_from_pixel
+from sfm.model.camera import Camera, pixel_from_rays, rays_from_pixel
 from sfm.model.conventions import FloatArray
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
@@ -29,8 +29,7 @@ def projected(truth: Estimate, estimate: Estimate, xy: FloatArray, distance: flo
     Written as the definition reads: each photograph fixes them to the object, and the mean is projected.
     """
     camera: Camera = truth.cameras[0]
-    uv = tangents_from_pixel(camera, xy)
-    ray = np.column_stack([uv, -np.ones(len(uv))])
+    ray = rays_from_pixel(camera, xy)
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     mean = np.zeros_like(ray)
     for i in range(len(truth.position)):
@@ -39,7 +38,7 @@ def projected(truth: Estimate, estimate: Estimate, xy: FloatArray, distance: flo
             mean += (fixed - estimate.position[i]) @ estimate.rotation[i]
         else:
             mean += ray @ truth.rotation[i].T @ estimate.rotation[i]
-    return pixel_from_tangents(estimate.cameras[0], -mean[:, :2] / mean[:, 2:])
+    return pixel_from_rays(estimate.cameras[0], mean)
 
 
 def predicted_and_scatter(

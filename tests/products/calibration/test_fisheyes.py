@@ -1,0 +1,105 @@
+"""Fisheyes of 190 degrees: calibrated with image points beyond 90 degrees from the axis, with true sigmas."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+import sfm
+from sfm.adjustment.solve import predict
+from sfm.model.camera import rays_from_pixel
+from sfm.products.calibration import projection_uncertainty
+from tests.commands import kolinear
+from tests.products.calibration.fisheyes import FISHEYE, fisheye_board, off_axis
+from tests.products.calibration.surveys import GIVEN
+from tests.products.calibration.test_projection import projected
+from tests.surveys import observed_text
+from tests.synthetic import perturb, seed_of
+
+MIDDLE = FISHEYE.principal_point_px - 0.5
+# in the middle, at about 50 degrees and, on three sides, at about 94 degrees from the axis
+PLACES = MIDDLE + np.array([[0, 0], [300, 0], [0, -300], [-578, 0], [0, 578], [409, -409]])
+
+
+def write_fisheye_survey(folder: Path, name: str, *, c_mm: float) -> Path:
+    """Write the survey of a board in photographs of a fisheye; only c is known roughly."""
+    folder.mkdir(parents=True)
+    board = fisheye_board(seed_of("survey of a fisheye"))
+    network = board.noisy(seed_of(name))
+    seen = network.image_points
+    rows = ["image,point,x_px,y_px,sx_px,sy_px"]
+    rows += [
+        f"{network.images[i]},{network.points[j]},{x!r},{y!r},0.1,0.1"
+        for i, j, (x, y) in zip(seen.image, seen.point, seen.xy.tolist(), strict=True)
+    ]
+    (folder / "image_points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    given = [f"p{j},{x!r},{y!r},{z!r}" for j, (x, y, z) in enumerate(board.truth.points.tolist())]
+    (folder / "control.csv").write_text("\n".join(["id,X,Y,Z", *given]) + "\n", encoding="utf-8")
+    camera = (
+        'name = "cam"\nsize_px = [1200, 1200]\npixel_mm = [0.005, 0.005]\nmodel = "opencv_fisheye"\n'
+        f'c_mm = {c_mm}\nfree = ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]\n'
+    )
+    path = folder / "survey.toml"
+    path.write_text(observed_text(name, "mm", camera, further=GIVEN), encoding="utf-8")
+    return path
+
+
+def test_points_beyond_90_degrees_are_adjusted() -> None:
+    board = fisheye_board(seed_of("fisheye"))
+    network, seen = board.noisy(seed_of("points beyond")), board.network.image_points
+    angle = np.concatenate(
+        [
+            off_axis(board.truth.position[i], board.truth.rotation[i], board.truth.points)[
+                seen.point[seen.image == i]
+            ]
+            for i in range(len(network.images))
+        ]
+    )
+    assert (angle > 90).sum() > 50 and angle.max() > 94
+    start = perturb(board.truth, seed_of("start"), points=0.0)
+    a = sfm.adjust(network, start, datum="control", reject="none")
+    assert a.converged and 0.9 < a.sigma0 < 1.1
+    beyond = a.residuals[angle > 90]
+    assert np.isfinite(beyond).all() and 0.085 < np.sqrt((beyond**2).mean()) < 0.115
+    error = a.estimate.cameras[0].parameters - FISHEYE.parameters
+    assert (np.abs(error) < 4 * np.sqrt(np.diagonal(a.covariance.interior[0]))).all()
+    without = sfm.adjust(
+        sfm.Network(
+            network.images, network.camera, network.points, network.image_points.select(angle < 90),
+        ).with_control(network.points, board.truth.points, 0.0),
+        start, datum="control", reject="none",
+    )  # fmt: skip
+    known, less = projection_uncertainty(a), projection_uncertainty(without)
+    assert (known.sigma_at(PLACES[3:], np.inf) < 0.8 * less.sigma_at(PLACES[3:], np.inf)).all()
+
+
+def test_stated_sigmas_are_true_beyond_90_degrees() -> None:
+    """Thirty calibrations: their parameters and projections scatter as stated, 0.9 to 1.1."""
+    board, rng = fisheye_board(seed_of("fisheye")), seed_of("thirty fisheyes")
+    assert (rays_from_pixel(FISHEYE, PLACES)[3:, 2] > 0.05).all()
+    expected = predict(board.network, board.truth, datum="control")
+    known = projection_uncertainty(expected)
+    root = np.linalg.inv(np.linalg.cholesky(expected.covariance.interior[0]))
+    normed, shifts = [], []
+    for _ in range(30):
+        a = sfm.adjust(board.noisy(rng), board.truth, datum="control", reject="none", covariance=False)
+        normed.append(root @ (a.estimate.cameras[0].parameters - FISHEYE.parameters))
+        shifts.append(projected(board.truth, a.estimate, PLACES, np.inf) - PLACES)
+    assert 0.9 < np.sqrt(np.mean(np.square(normed))) < 1.1
+    ratio = np.sqrt((np.array(shifts) ** 2).mean(axis=(0, 2))) / known.sigma_at(PLACES, np.inf)
+    assert 0.9 < np.sqrt((ratio**2).mean()) < 1.1 and ((ratio > 0.7) & (ratio < 1.3)).all()
+
+
+def test_a_fisheye_of_190_degrees_is_calibrated_from_nothing(tmp_path: Path) -> None:
+    """Without poses, and with c wrong by 10 %: the command gives the camera, and does not doubt it."""
+    path = write_fisheye_survey(tmp_path / "s", "fisheye", c_mm=1.6)
+    out = tmp_path / "out"
+    assert kolinear("calibrate", path, "--out", out) == 0
+    stored = json.loads((out / "calibration.json").read_text(encoding="utf-8"))
+    (camera,) = stored["cameras"]
+    for name in ("fx", "fy"):
+        value, sigma = camera["focal_px"][name]["value"], camera["focal_px"][name]["sigma"]
+        assert abs(value - 350.0) < 4 * sigma and sigma < 0.1
+    assert stored["verdict"]["level"] == "good", stored["verdict"]
