@@ -14,7 +14,7 @@ import numpy as np
 from sfm.adjustment.result import Adjustment
 from sfm.model.camera import Camera, camera_from_values, project
 from sfm.model.conventions import BoolArray, FloatArray, rotation_from_vector
-from sfm.model.distortion.models import COLMAP, MODELS
+from sfm.model.distortion.models import COLMAP, MODELS, SPLINED, Role
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network
 from sfm.model.solution import Solution
@@ -71,6 +71,10 @@ DISTORTION |= {
         *(("p0", 3e-4), ("p1", -2e-4), ("s0", 1e-3), ("s1", 2e-3), ("s2", -5e-4), ("s3", 1e-3)),
     ),
 }
+DISTORTION["splined"] = (
+    *(("cx", 1005.0), ("a_max", 0.55), ("b_max", 0.4)),
+    *((name, 1e-3 * (7 * k % 11 - 5)) for k, name in enumerate(SPLINED.names_of(Role.SURFACE))),
+)
 FREE = {
     "brown": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
     "brown_forward": ("c", "x0", "y0", "K1", "K2", "P1", "P2"),
@@ -81,6 +85,7 @@ FREE["brown_dbat"] = FREE["brown"]
 FREE["brown_forward_affine"] = (*FREE["brown_forward"], "b1", "b2")
 FREE["brown_affine"] = FREE["brown_affine_dbat"] = (*FREE["brown"], "b1")
 FREE |= {model.name: model.names for model in COLMAP}
+FREE["splined"] = ("fx", "fy", "cx", "cy")
 
 
 def seed_of(name: str) -> np.random.Generator:

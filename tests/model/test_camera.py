@@ -58,6 +58,7 @@ def test_a_reduced_camera_sees_the_same_in_larger_pixels(model: str, shrink: int
 def test_derivatives_equal_differences(model: str) -> None:
     camera = lens(model)
     rng = seed_of(model + " derivatives")
+    share = 1e-6 if model == "splined" else 1e-8  # third derivatives of cubic splines have steps
     for xy in rng.uniform(100, 1400, (20, 2)):
         uv = tangents_from_pixel(camera, xy[None])[0] + rng.normal(0, 1e-3, 2)
         _, Ju, Jp = residual(camera, camera.parameters, xy, uv)
@@ -67,21 +68,21 @@ def test_derivatives_equal_differences(model: str) -> None:
             steps = [
                 residual(camera, camera.parameters, xy, uv + f * h * np.eye(2)[s])[0] for f in (-2, -1, 1, 2)
             ]
-            assert_derivative(Ju[:, s], steps, h)
+            assert_derivative(Ju[:, s], steps, h, share)
         for s in range(len(camera.parameters)):
             h = 0.1 / max(np.abs(Jp[:, s]).max(), 100.0)  # moves the residual by 0.1 px at most
             steps = [
                 residual(camera, camera.parameters + f * h * np.eye(len(camera.parameters))[s], xy, uv)[0]
                 for f in (-2, -1, 1, 2)
             ]
-            assert_derivative(Jp[:, s], steps, h)
+            assert_derivative(Jp[:, s], steps, h, share)
 
 
-def assert_derivative(derivative: np.ndarray, steps: list[np.ndarray], h: float) -> None:
+def assert_derivative(derivative: np.ndarray, steps: list[np.ndarray], h: float, share: float) -> None:
     """Five-point differences are good to h^4 and to the rounding of the residual over h."""
     difference = (steps[0] - 8 * steps[1] + 8 * steps[2] - steps[3]) / (12 * h)
     rounding = 1e-12 / h  # residuals are of the order of 1000 px
-    assert np.abs(derivative - difference).max() <= 1e-8 * np.abs(derivative).max() + rounding
+    assert np.abs(derivative - difference).max() <= share * np.abs(derivative).max() + rounding
 
 
 def test_a_model_is_a_function_and_a_row() -> None:
@@ -131,6 +132,10 @@ def strong_lens(model: str, rng: np.random.Generator) -> Camera:
             p[s] = share / 20 / reach
         elif role in (Role.AFFINITY, Role.SHEAR):
             p[s] = share / 20
+        elif role is Role.RANGE:
+            p[s] = 1.0
+        elif role is Role.SURFACE:
+            p[s] = share / 10
         elif role in (Role.X0, Role.Y0):
             p[s] += share * (0.3 if camera.in_mm else 30.0)
     return camera.with_parameters(p)
@@ -269,9 +274,9 @@ def test_parameter_jacobian_against_differences(model: str) -> None:
     J = parameter_jacobian(camera, uv)
     assert J.shape == (3, 2, len(camera.parameters))
     for s in range(len(camera.parameters)):
-        moves = np.abs(J[:, :, s]).max()
+        moves = max(np.abs(J[:, :, s]).max(), 1.0)  # some coefficients act elsewhere
         step = np.zeros(len(camera.parameters))
-        step[s] = 1e-3 / moves  # px
+        step[s] = 1e-4 / moves  # px
         ahead, behind = (
             pixel_from_tangents(camera.with_parameters(camera.parameters + sign * step), uv)
             for sign in (1, -1)

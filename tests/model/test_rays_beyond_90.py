@@ -119,7 +119,7 @@ def test_derivatives_by_parameters_equal_differences_beyond_90_degrees(model: st
     assert np.isfinite(J).all()
     for s in range(len(camera.parameters)):
         step = np.zeros(len(camera.parameters))
-        step[s] = 1e-3 / np.abs(J[:, :, s]).max()
+        step[s] = 1e-3 / max(np.abs(J[:, :, s]).max(), 1.0)  # some coefficients act elsewhere
         ahead, behind = (
             pixel_from_rays(camera.with_parameters(camera.parameters + sign * step), rays) for sign in (1, -1)
         )

@@ -6,7 +6,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -164,13 +164,21 @@ class _Product(WatchedSurvey):
 
     def write(self, result: SurveyResult, part: Path, folder: Path) -> None:
         """Write the page of the calibration and its files."""
+        from sfm.library.surveys import write_result
         from sfm.products.calibration.calibration import calibrate as calibrated
+        from sfm.products.calibration.page import splined_folder
         from sfm.report.pages import page_of, texts_of
 
         self.result, self.calibration = result, calibrated(result, self.distances)
         self.page = page_of(self.calibration, folder=str(folder))
         for name, content in texts_of(self.page).items():
             (part / name).write_text(content, encoding="utf-8", newline="")
+        for camera in self.calibration.cameras:
+            if camera.splined is not None:
+                solution = replace(
+                    camera.splined.adjustment.solution, name=result.survey, unit=result.length_unit
+                )
+                write_result(solution, part / splined_folder(camera))
 
     def show(self, folder: Path) -> bool:
         """Print the verdict and the figures of the cameras."""

@@ -46,6 +46,7 @@ from sfm.model.conventions import FloatArray
 from sfm.model.distortion.brown import brown, brown_affine
 from sfm.model.distortion.opencv import full_opencv, opencv, rad_tan_thin_prism_fisheye, thin_prism_fisheye
 from sfm.model.distortion.radial import division, eucm, fisheye, fov, radial
+from sfm.model.distortion.splined import KNOTS, splined
 from sfm.runtime.compiling import inlined, kernel
 
 
@@ -130,6 +131,8 @@ class Role(Enum):
     PRISM = "thin prism distortion"
     AFFINITY = "ratio of the scales along x and y"
     SHEAR = "angle between the axes"
+    RANGE = "range of a surface of distortion"
+    SURFACE = "coefficient of a surface of distortion"
 
 
 class Parameter(NamedTuple):
@@ -271,7 +274,20 @@ WIDE_ANGLE = (
     ),
 )
 COLMAP = (*PERSPECTIVE, *WIDE_ANGLE)
-ALL = (*GENERAL, *COLMAP)
+_GRID = [f"{j}_{i}" for j in range(KNOTS) for i in range(KNOTS)]
+# the model for lenses that no other describes; fitted to the image points of another model
+SPLINED = Model(
+    "splined",
+    splined,
+    (
+        *_TWO,
+        *_parameters(Role.RANGE, "a_max b_max", "1"),
+        *_parameters(Role.SURFACE, " ".join(f"A{place}" for place in _GRID), "1"),
+        *_parameters(Role.SURFACE, " ".join(f"B{place}" for place in _GRID), "1"),
+    ),
+    stereographic=True,
+)
+ALL = (*GENERAL, *COLMAP, SPLINED)
 MODELS = {model.name: model for model in ALL}
 OF_COLMAP = frozenset(("opencv", "full_opencv", *(model.name for model in COLMAP)))  # models that it has
 GENERAL_MODELS = tuple(model.name for model in GENERAL)

@@ -4,6 +4,7 @@
 - `projection_uncertainty`: where a camera images points at any distance, and how precisely.
 - `cross_validate`: cameras of halves of the photographs, and whether chance explains their difference.
 - `compare_models`: which parameters of its model the photographs bear.
+- `spline_camera`: a camera with a surface of distortion, for a lens that no parametric model describes.
 - `next_poses`: the photographs that would help most.
 
     >>> import numpy as np, sfm

@@ -9,3 +9,5 @@ from sfm.products.calibration.poses import NextPoses as NextPoses
 from sfm.products.calibration.poses import next_poses as next_poses
 from sfm.products.calibration.projection import ProjectionUncertainty as ProjectionUncertainty
 from sfm.products.calibration.projection import projection_uncertainty as projection_uncertainty
+from sfm.products.calibration.splined import SplinedCalibration as SplinedCalibration
+from sfm.products.calibration.splined import spline_camera as spline_camera

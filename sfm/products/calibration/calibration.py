@@ -8,7 +8,7 @@ object: its shape from the image points alone, against the given one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from sfm.products.calibration.models import Alternative, compare_models
 from sfm.products.calibration.poses import NextPoses, corners_of, next_poses
 from sfm.products.calibration.projection import ProjectionUncertainty, grid_of, projection_uncertainty
 from sfm.products.calibration.residual_field import ResidualField, residual_field
+from sfm.products.calibration.splined import SplinedCalibration, spline_camera
 
 # Sigma of projection over the smallest one, beyond which the camera counts as extrapolated: mrcal's picture
 # of a region, and three times the error is nine times the weight of a point.
@@ -52,6 +53,7 @@ class CameraCalibration:
     alternatives: tuple[Alternative, ...]
     demanded: tuple[str, ...]  # held parameters that the image points contradict
     next: NextPoses
+    splined: SplinedCalibration | None = None  # where the model is insufficient, if the photographs bear it
 
     @property
     def name(self) -> str:
@@ -193,6 +195,7 @@ def calibrate(result: SurveyResult, distances: Sequence[float] = ()) -> Calibrat
         finite = [float(np.median([camera.usual for camera in cameras]))]
     validation = cross_validate(adjustment)
     level = level_of_single(adjustment.levels.family, max(len(validation.differences), len(cameras)))
+    cameras = tuple(_with_splined(adjustment, camera, level) for camera in cameras)
     remarks = (*result.remarks, *_remarks(result, cameras, validation, level))
     return Calibration(
         result,
@@ -237,6 +240,20 @@ def _camera_of(adjustment: Adjustment, k: int, demanded: Sequence[tuple[str, str
         tuple(name for owner, name in demanded if owner in owners),
         next_poses(adjustment, k),
     )
+
+
+def _with_splined(adjustment: Adjustment, camera: CameraCalibration, level: float) -> CameraCalibration:
+    """Return a calibration with a splined camera, if its model is insufficient and no parameter mends it."""
+    if not camera.is_insufficient(level):
+        return camera
+    names = [lens.name for lens in adjustment.estimate.cameras]
+    try:
+        splined = spline_camera(adjustment, names.index(camera.name))
+    except (GeometryError, np.linalg.LinAlgError):
+        return camera
+    wider = [alternative for alternative in camera.alternatives if alternative.added and alternative.borne]
+    mended = max((alternative.gain - alternative.price for alternative in wider), default=0.0)
+    return replace(camera, splined=splined) if splined.gain - splined.price > mended else camera
 
 
 def _remarks(

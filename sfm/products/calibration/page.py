@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -23,6 +24,7 @@ from sfm.products.calibration.calibration import (
 )
 from sfm.products.calibration.crossvalidation import HalvesDifference
 from sfm.products.calibration.poses import NextPoses, Pose
+from sfm.products.calibration.splined import SplinedCalibration
 from sfm.report.figures.comparisons import difference_figure
 from sfm.report.figures.plot_data import Plot
 from sfm.report.figures.plots import (
@@ -86,7 +88,7 @@ def page(calibration: Calibration, *, folder: str = "RESULT") -> Page:
         (
             Section("Can I trust it?", *_trust(calibration), key="trust"),
             Section("Where?", *_where(calibration), key="where"),
-            Section("What is wrong?", *_wrong(calibration), key="wrong"),
+            Section("What is wrong?", *_wrong(calibration, folder), key="wrong"),
             Section("What next?", *_next(calibration, folder), key="next"),
         ),
         summary=summary_of(calibration),
@@ -284,11 +286,11 @@ def _format(panel: Axes, camera: CameraCalibration, title: str) -> None:
     entitled(panel, title.replace("$", r"\$"))
 
 
-def _wrong(calibration: Calibration) -> Iterator[Part]:
+def _wrong(calibration: Calibration, folder: str) -> Iterator[Part]:
     level = calibration.level
     yield Heading("Model")
     for camera in calibration.cameras:
-        yield from _model_parts(camera, level)
+        yield from _model_parts(camera, level, folder)
     yield Note(
         "A parameter is needed if it raises ln of the likelihood by more than its price, which grows with "
         "the number of image points. The same rule chose a central or a fisheye lens in the draft. "
@@ -317,7 +319,7 @@ def _p(probability: float) -> str:
     return "p < 0.001" if probability < 1e-3 else f"p = {probability:.3f}"
 
 
-def _model_parts(camera: CameraCalibration, level: float) -> Iterator[Part]:
+def _model_parts(camera: CameraCalibration, level: float, folder: str) -> Iterator[Part]:
     rows: list[Sequence[object]] = []
     for alternative in camera.alternatives:
         word, names = "with" if alternative.added else "without", ", ".join(alternative.parameters)
@@ -357,6 +359,8 @@ def _model_parts(camera: CameraCalibration, level: float) -> Iterator[Part]:
         words.append(f"{suffices}residuals do not depend on the place in the format ({_p(field.whole)}).")
     else:
         words.append("Its residuals are not tested: no part of the format has points of enough photographs.")
+    if camera.splined is not None:
+        words.append(_splined_words(camera.splined, camera, folder))
     if camera.missing:
         words.append(f"The photographs demand {listed(camera.missing)}: add to free in the survey file.")
     if needless:
@@ -364,6 +368,22 @@ def _model_parts(camera: CameraCalibration, level: float) -> Iterator[Part]:
     trusted = not (insufficient or camera.missing) and np.isfinite(field.whole)
     yield Statement(" ".join(words), "good" if trusted else "fair")
     yield Table(heads, rows)
+
+
+def _splined_words(splined: SplinedCalibration, camera: CameraCalibration, folder: str) -> str:
+    """Return what a splined camera describes, and how it is used."""
+    return (
+        f"A splined camera describes the lens: its surface departs from {camera.camera.model} by "
+        f"{significant(splined.sigma_px)} px, image points determine {splined.determined:.0f} of its "
+        f"{int(splined.camera.free.sum())} coefficients, and sigma0 falls to "
+        f"{significant(splined.adjustment.sigma0_px)} px. Use it with --camera "
+        f"{shlex.quote(f'{folder}/{splined_folder(camera)}')}."
+    )
+
+
+def splined_folder(camera: CameraCalibration) -> str:
+    """Return the name of the folder with a splined camera, in that of the result."""
+    return "splined-" + re.sub(r"[^\w.-]+", "-", camera.name)
 
 
 def _field_plot(cameras: Sequence[CameraCalibration], level: float) -> Plot:
@@ -640,6 +660,16 @@ def _camera_summary(calibration: Calibration, camera: CameraCalibration) -> dict
             }
             for alternative in camera.alternatives
         ],
+        "splined": None
+        if camera.splined is None
+        else {
+            "folder": splined_folder(camera),
+            "sigma_px": camera.splined.sigma_px,
+            "determined": camera.splined.determined,
+            "gain": camera.splined.gain,
+            "price": camera.splined.price,
+            "sigma0_px": camera.splined.adjustment.sigma0_px,
+        },
         "halves": [
             {
                 "division": halves.division,

@@ -23,10 +23,12 @@ kind = "control"
 ALL = 'free = ["c", "x0", "y0", "K1", "K2", "P1", "P2"]'
 
 
-def write_board_survey(folder: Path, board: SimulatedBoard, *, name: str = "board", free: str = ALL) -> Path:
-    """Write the survey of a simulated board with errors that depend on the name; return its file."""
+def write_board_survey(
+    folder: Path, board: SimulatedBoard, *, name: str = "board", free: str = ALL, noise: bool = True
+) -> Path:
+    """Write the survey of a simulated board, with errors that depend on the name; return its file."""
     folder.mkdir(parents=True)
-    network = board.noisy(seed_of(name))
+    network = board.noisy(seed_of(name)) if noise else board.network
     seen = network.image_points
     rows = ["image,point,x_px,y_px,sx_px,sy_px"]
     rows += [

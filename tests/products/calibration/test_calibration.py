@@ -77,6 +77,7 @@ def test_a_model_that_does_not_fit_is_called_insufficient(tmp_path: Path) -> Non
     board = simulated_board(seed_of("calibration"), photographs=16, camera=lens)
     found = calibrate(surveyed(tmp_path, board))
     (camera,) = found.cameras
+    assert camera.splined is None, "a parameter of the model mends it"
     assert camera.is_insufficient(0.001) and ("K3",) in {a.parameters for a in camera.alternatives if a.borne}
     assert {"model_insufficient", "distortion_not_described"} & set(
         kinds_of(found.remarks)

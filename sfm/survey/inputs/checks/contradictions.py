@@ -11,7 +11,7 @@ from typing import Protocol
 
 from sfm.model.display import counted, listed
 from sfm.model.distortion.brown import BALANCED, BALANCED_MODEL, from_balanced
-from sfm.model.distortion.models import MODELS
+from sfm.model.distortion.models import MODELS, Role
 from sfm.model.errors import GeometryError, SurveyFileError
 from sfm.survey.inputs.calibration import (
     plate_control,
@@ -139,7 +139,9 @@ def _of_cameras(survey: Described) -> Iterator[str]:
             yield f"two cameras are named '{name}'"
     needs_images = reads_photographs(survey) or len(names) > 1
     for camera in survey.cameras:
-        for of_settings in (_of_balanced, _of_parameters, _of_correlations, _of_calibration, _of_values):
+        for of_settings in (
+            _of_balanced, _of_parameters, _of_surface, _of_correlations, _of_calibration, _of_values
+        ):  # fmt: skip
             for contradiction in of_settings(camera):
                 yield f"camera {camera.name}: {contradiction}"
         if camera.images is None and needs_images:
@@ -190,6 +192,18 @@ def _of_parameters(camera: CameraSettings) -> Iterator[str]:
     for first, second in EXCLUSIVE:
         for parameter in sorted(set(stated[first]) & set(stated[second])):
             yield f"parameter '{parameter}' is both {first} and {second}"
+
+
+def _of_surface(camera: CameraSettings) -> Iterator[str]:
+    """Yield what is missing of a surface of distortion, which no survey determines by itself."""
+    surface = MODELS[camera.model].names_of(Role.RANGE, Role.SURFACE)
+    known = {*dict(camera.fixed), *dict(camera.weighted)}
+    missing = [name for name in surface if name not in known]
+    if missing and camera.calibration is None:
+        yield (
+            f"model {camera.model} needs the values of {counted(len(surface), 'parameter')} of its surface, "
+            f"{len(missing)} are missing; give the folder of a calibration with them, calibration = FOLDER"
+        )
 
 
 def _of_correlations(camera: CameraSettings) -> Iterator[str]:
