@@ -7,9 +7,10 @@ one adjustment with a wide s gives what they know of d, that is N d = n with the
 
     ln p(image points | s) = n' (N + K^-1 / s^2)^-1 n / 2 - ln det(I + s^2 K N) / 2
 
-is largest for the chosen s. It is 0 for s = 0, which is the adjusted model, so that its largest value is the
-gain of ln likelihood by the surface. The sum of s^2 K N (I + s^2 K N)^-1 over its diagonal is the number of
-coefficients that the image points determine. Where there are none, the covariance is that before them.
+is largest for the chosen s. It is 0 for s = 0, which is the adjusted model. The sum of
+s^2 K N (I + s^2 K N)^-1 over its diagonal is the number of coefficients that the image points determine.
+Where there are none, the covariance is that before them. The gain of ln likelihood by the surface is, as of
+other models, that of v'Pv, now with the change, minus ln det(I + s^2 K N) / 2.
 
 Focal lengths and principal point keep their values: the surface has their effects too.
 
@@ -102,15 +103,15 @@ def spline_camera(adjustment: Adjustment, camera: int = 0) -> SplinedCalibration
     known = np.linalg.inv(wide.covariance.interior[camera])
     N = known - np.linalg.inv(K) * (pixels / WIDEST_PX) ** 2
     sizes = np.geomspace(SMALLEST_PX, WIDEST_PX, STEPS)
-    evidence, determined = np.transpose([_evidence(N, known @ d, K, size / pixels) for size in sizes])
-    best = int(evidence.argmax())
+    fit, price, determined = np.transpose([_evidence(N, known @ d, K, size / pixels) for size in sizes])
+    best = int((fit - price).argmax())
     final = _adjusted(adjustment, camera, start, sizes[best] / pixels)
     return SplinedCalibration(
         final.estimate.cameras[camera],
         final,
         float(sizes[best]),
         float(determined[best]),
-        float(evidence[best]),
+        final.redundancy / 2 * float(np.log(adjustment.vPv / final.vPv)) - float(price[best]),
         float(np.log(STEPS / adjustment.levels.family)),
     )
 
@@ -170,8 +171,8 @@ def _correlation() -> FloatArray:
     return np.asarray(np.kron(np.eye(2), np.kron(along, along)))
 
 
-def _evidence(N: FloatArray, n: FloatArray, K: FloatArray, size: float) -> tuple[float, float]:
-    """Return the gain of ln likelihood by a surface, and the number of coefficients that are determined.
+def _evidence(N: FloatArray, n: FloatArray, K: FloatArray, size: float) -> tuple[float, float, float]:
+    """Return what ln likelihood gains and loses by a surface, and how many coefficients are determined.
 
     Args:
         N: normal equations of the coefficients by the image points, (f, f).
@@ -183,8 +184,8 @@ def _evidence(N: FloatArray, n: FloatArray, K: FloatArray, size: float) -> tuple
     values, vectors = np.linalg.eigh(L.T @ N @ L)
     values = np.maximum(values, 0.0)
     along = vectors.T @ (L.T @ n)
-    gain = ((along**2) / (1.0 + values)).sum() - np.log1p(values).sum()
-    return float(gain / 2), float((values / (1.0 + values)).sum())
+    gained = ((along**2) / (1.0 + values)).sum() / 2
+    return float(gained), float(np.log1p(values).sum() / 2), float((values / (1.0 + values)).sum())
 
 
 def _adjusted(adjustment: Adjustment, k: int, start: Camera, sigma: float) -> Adjustment:
