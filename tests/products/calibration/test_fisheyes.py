@@ -9,7 +9,9 @@ import numpy as np
 
 import sfm
 from sfm.adjustment.solve import predict
-from sfm.model.camera import rays_from_pixel
+from sfm.model.camera import pixel_curvature, project, ray_jacobian, rays_from_pixel
+from sfm.orientation.eccentricity import CircleViews, fit_circles
+from sfm.orientation.image_rays import axes_along
 from sfm.products.calibration import projection_uncertainty
 from tests.commands import kolinear
 from tests.products.calibration.fisheyes import FISHEYE, fisheye_board, off_axis
@@ -103,3 +105,41 @@ def test_a_fisheye_of_190_degrees_is_calibrated_from_nothing(tmp_path: Path) -> 
         value, sigma = camera["focal_px"][name]["value"], camera["focal_px"][name]["sigma"]
         assert abs(value - 350.0) < 4 * sigma and sigma < 0.1
     assert stored["verdict"]["level"] == "good", stored["verdict"]
+
+
+def test_the_eccentricity_of_circles_beyond_90_degrees_is_that_of_their_outlines() -> None:
+    """Seen by tangents about their rays, as `sfm.survey.circles` has them for models of directions."""
+    centre, normal, radius = np.array([300.0, 80.0, 12.0]), np.array([-0.8, 0.3, 0.5]), 8.0
+    normal /= np.linalg.norm(normal)
+    across = np.cross(normal, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    turn = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[:, None]
+    circle = centre + radius * (np.cos(turn) * across + np.sin(turn) * np.cross(normal, across))
+    stations = np.array([[0.0, 0.0, 0.0], [120.0, -180.0, 4.0], [150.0, 320.0, -2.0], [80.0, 120.0, -9.0]])
+    rays = centre - stations
+    assert (rays[:, 2] > 0).all()  # behind the image planes
+    shapes, truth, xy = [], [], project(FISHEYE, np.zeros(3), np.eye(3), rays)
+    for station, seen in zip(stations, xy, strict=True):
+        outline = project(FISHEYE, station, np.eye(3), circle)
+        ends = np.roll(outline, -1, axis=0)
+        area = (outline[:, 0] * ends[:, 1] - outline[:, 1] * ends[:, 0]) / 2
+        middle = ((outline + ends) * area[:, None]).sum(axis=0) / 3 / area.sum()
+        # triangles about the middle: squares at the middles of their sides
+        p, q = outline - middle, ends - middle
+        area = (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2
+        second = sum(np.einsum("k,ki,kj->ij", area, side, side) for side in (p / 2, q / 2, (p + q) / 2)) / 3
+        shapes.append(4 * second / area.sum())
+        truth.append(middle - seen)
+    along, k = axes_along(rays), len(stations)
+    distance = np.linalg.norm(rays, axis=1)
+    views = CircleViews(
+        np.zeros(k, dtype=np.int64),
+        np.array(shapes),
+        np.column_stack([np.zeros((k, 2)), -distance]),
+        along,
+        ray_jacobian(FISHEYE, xy, rays / distance[:, None]) @ along[:, :, :2],
+        pixel_curvature(FISHEYE, np.zeros((k, 2)), along),
+    )
+    shift = fit_circles(views, 1, radius=np.array([radius])).shift
+    assert np.abs(truth).max() > 0.15
+    np.testing.assert_allclose(shift, truth, atol=0.1 * np.abs(truth).max())
