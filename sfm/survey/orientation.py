@@ -39,6 +39,7 @@ from sfm.survey.circles import circle_misfit
 from sfm.survey.clock_offsets import agree_on_clocks
 from sfm.survey.diagnosis.codes_found import describe_codes
 from sfm.survey.diagnosis.lost_photographs import (
+    MIN_FITTING_FRACTION,
     explain_lost_photographs,
     find_second_motion,
     find_second_objects,
@@ -56,8 +57,6 @@ FISHEYE = "opencv_fisheye"
 # c of a central perspective over half the diagonal. Below it the corner is more than 45 degrees off the axis,
 # where equal angles and equal tangents differ by more than a tenth of the half diagonal.
 WIDE_C = 1.0
-# If at least this share of the image points fits a central perspective, no other model is tried.
-MIN_FITTING_FRACTION = 0.9
 # Points of natural texture that take part in the orientation: those with the most rays, and at least so many
 # of every photograph.
 ORIENTATION_POINTS, POINTS_PER_PHOTOGRAPH = 400, 100

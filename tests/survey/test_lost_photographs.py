@@ -234,6 +234,30 @@ def test_residuals_far_above_their_sigmas_are_tried_with_cameras_held(
     assert (found.estimate.cameras[0].free == camera.free).all()
 
 
+@pytest.mark.parametrize(
+    ("noise_px", "fitting", "tried"), [(0.4, 1.0, False), (0.1, 1.0, True), (0.4, 0.8, True)]
+)
+def test_no_other_camera_is_tried_where_pairs_alone_fit_no_better(
+    noise_px: float, fitting: float, tried: bool
+) -> None:
+    """Image points of a video may be worse than stated; no principal distance changes that."""
+    network, truth = make_network(seed_of("pairs"), images=IMAGES, points=2 * POINTS, noise_px=noise_px)
+    covariance = np.broadcast_to(0.1**2 * np.eye(2), network.image_points.covariance.shape)
+    network = replace(network, image_points=replace(network.image_points, covariance=covariance))
+    present = replace(orientation(network, truth), rms_px=0.35)
+    k = len(present.fits)
+    present = replace(present, fits=present.fits & (seed_of("fitting").permutation(k) < fitting * k))
+    factors = []
+
+    def orient_from(values: Estimate) -> Orientation:
+        factors.append(values.cameras[0].value("c"))
+        return present
+
+    start = empty_estimate(network, truth.cameras)
+    assert try_other_principal_distances(network, start, present, orient_from) == (present, ())
+    assert bool(factors) == tried
+
+
 def _none(_: Estimate) -> Orientation:
     raise AssertionError("tried")
 

@@ -29,6 +29,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from scipy.optimize import minimize
 from scipy.sparse import csr_matrix
@@ -73,6 +74,10 @@ C_FACTORS = (1.4, 0.7, 2.0, 0.5)  # of the given principal distance: a crop fact
 # RMS residual, in standard deviations of image points, from which another minimum is searched. It saves the
 # search where nothing calls for one; the likelihood of the solutions decides.
 MISFIT = 3.0
+# If at least this share of the image points fits a central perspective, nothing calls for another one. The
+# rest may be wrong matches.
+MIN_FITTING_FRACTION = 0.9
+PAIR_UNKNOWNS = 7  # of the epipolar geometry of two photographs with unknown cameras
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,8 @@ def try_other_principal_distances(
 
     If c is adjusted and all photographs are oriented, but with residuals far larger than the image points
     have, they are tried with the cameras held. A network that estimates its camera while it grows may have
-    moved along the valley of c and distance into a false minimum.
+    moved along the valley of c and distance into a false minimum. They are not tried where nearly all image
+    points fit as well as those of pairs of photographs do by themselves: no principal distance fits better.
 
     Args:
         network: has the named image points.
@@ -187,7 +193,7 @@ def try_other_principal_distances(
     def starts(before: Orientation | None) -> list[Estimate]:
         if not single:
             return [_with_c(estimate, factor, free=True) for factor in C_FACTORS]
-        misfit = before is not None and free and before.rms_px > limit
+        misfit = before is not None and free and before.rms_px > limit and not _fits_as_pairs(network, before)
         return [_with_c(estimate, factor, free=False) for factor in (1.0, *C_FACTORS)] if misfit else []
 
     def gain(before: Orientation | None, after: Orientation | None) -> float:
@@ -243,6 +249,30 @@ def _count_unexplained(network: Network, orientation: Orientation) -> int:
         for i in group.images.tolist()
     ]
     return sum(network.images[i] not in mirrored for i in lost)
+
+
+def _fits_as_pairs(network: Network, orientation: Orientation) -> bool:
+    """Return whether an orientation fits as well as the epipolar geometries of pairs, whatever their cameras.
+
+    They are those of the pairs that connect the network, from the image points that fit the orientation.
+
+    Source: Hartley and Zisserman (2003), sec. 11.1 (eight points) and 11.4.3 (Sampson's distance).
+    """
+    if orientation.fits.mean() < MIN_FITTING_FRACTION:
+        return False
+    xy, squares, redundancy = network.image_points.xy, 0.0, 0
+    for a, b in _conjugate_points(network):
+        fit = orientation.fits[a] & orientation.fits[b]
+        first, second = xy[a[fit]], xy[b[fit]]
+        F = cv2.findFundamentalMat(first, second, cv2.FM_8POINT)[0] if len(first) >= MIN_COMMON else None
+        if F is None:
+            continue
+        x, y = (np.column_stack([of_pair, np.ones(len(of_pair))]) for of_pair in (first, second))
+        lines, lines_back = x @ F.T, y @ F
+        slopes = (lines[:, :2] ** 2).sum(axis=1) + (lines_back[:, :2] ** 2).sum(axis=1)
+        squares += float((np.einsum("ki,ki->k", y, lines) ** 2 / slopes).sum())
+        redundancy += len(x) - PAIR_UNKNOWNS
+    return redundancy > 0 and orientation.rms_px**2 <= squares / redundancy
 
 
 def _likelihood(network: Network, cameras: tuple[Camera, ...], orientation: Orientation | None) -> float:
