@@ -23,6 +23,7 @@ from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.exif import read_metadata
 from sfm.photographs.reading import read_mask
+from sfm.runtime.sampling import is_shown
 
 SUFFIX = ".png"
 MASKS = "masks"  # folder in which masks are searched
@@ -76,11 +77,7 @@ class Masks:
             PhotographError: the mask cannot be read.
         """
         black = self.black(name, size_px)
-        if black is None:
-            return np.ones(len(xy), dtype=bool)
-        last = np.array(size_px) - 1
-        column, row = np.clip(np.rint(np.nan_to_num(xy)).astype(np.int64), 0, last).T
-        return np.asarray(~black[row, column])
+        return np.ones(len(xy), dtype=bool) if black is None else is_shown(black, xy)
 
     def visible_points(
         self, names: Sequence[str], sizes_px: Sequence[tuple[int, int]], image: IntArray, xy: FloatArray

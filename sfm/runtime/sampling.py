@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.model.arguments import checked_arguments
-from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
 from sfm.model.errors import GeometryError
 from sfm.runtime.compiling import compiled, compiled_fast, inlined_fast
 
@@ -62,6 +62,18 @@ def resample(photograph: AnyArray, xy: FloatArray, *, interpolation: str = "six_
     return np.asarray(_resample(as_grey(photograph), positions.reshape(-1, 2), kind)).reshape(
         positions.shape[:-1]
     )
+
+
+def is_shown(hidden: BoolArray, xy: FloatArray) -> BoolArray:
+    """Return which positions in a photograph are on pixels that are not masked, (k,).
+
+    Args:
+        hidden: masked pixels, (H, W).
+        xy: positions, px, (k, 2); those outside the photograph count as at its border.
+    """
+    last = np.array(hidden.shape[::-1]) - 1
+    column, row = np.clip(np.rint(np.nan_to_num(xy)).astype(np.int64), 0, last).T
+    return np.asarray(~hidden[row, column])
 
 
 @compiled

@@ -13,7 +13,7 @@ import numpy as np
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.errors import KolinearError, PhotographError
-from sfm.runtime.sampling import as_grey
+from sfm.runtime.sampling import as_grey, is_shown
 from sfm.targets.codes.boards import find_boards
 from sfm.targets.codes.concentric import ConcentricFamily, ConcentricTags, find_concentric
 from sfm.targets.codes.dot_plates import name_dots, rings_among
@@ -106,6 +106,7 @@ def find_targets(
     centres: str = "model",
     min_diameter_px: float = 4.0,
     max_diameter_px: float = math.inf,
+    hidden: BoolArray | None = None,
 ) -> Targets:
     """Find, measure and decode the targets of one photograph.
 
@@ -123,6 +124,7 @@ def find_targets(
             squared weights.
         min_diameter_px: minimum minor axis of a target.
         max_diameter_px: maximum major axis of a target; infinite for the width of the photograph.
+        hidden: masked pixels, which have no targets, (H, W).
 
     Returns:
         The targets in order of rows, and the rejected candidates.
@@ -160,6 +162,27 @@ def find_targets(
         )
     if not isinstance(codes, str | CodeFamily | TagFamily | ConcentricFamily | PlateFamily | PlateGroup):
         raise KolinearError(f"codes {codes!r}, expected the name of a family, as 'ring14' or 'none'")
+    targets = _targets_of(photograph, polarity, codes, centres, min_diameter_px, max_diameter_px, hidden)
+    if hidden is None:
+        return targets
+    shown, rejected = is_shown(hidden, targets.xy), is_shown(hidden, targets.rejected_xy)
+    return replace(
+        targets.select(shown),
+        rejected_xy=targets.rejected_xy[rejected],
+        rejected_flag=targets.rejected_flag[rejected],
+    )
+
+
+def _targets_of(
+    photograph: AnyArray,
+    polarity: str,
+    codes: str | TargetFamily,
+    centres: str,
+    min_diameter_px: float,
+    max_diameter_px: float,
+    hidden: BoolArray | None,
+) -> Targets:
+    """Return the targets of a photograph; the arguments are those of `find_targets`."""
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     boards = [plate for plate in plates_of(codes) if plate.name in BOARDS]
     crossings = find_boards(photograph, boards, scale=scale, noise=noise) if boards else []
@@ -170,7 +193,7 @@ def find_targets(
     limits = {"min_diameter_px": min_diameter_px, "max_diameter_px": max_diameter_px}
     if isinstance(codes, PlateGroup):
         parts += [
-            find_targets(photograph, polarity=polarity, codes=plate, centres=centres, **limits)
+            _targets_of(photograph, polarity, plate, centres, min_diameter_px, max_diameter_px, hidden)
             for plate in codes.plates
             if plate not in boards
         ]
@@ -179,7 +202,16 @@ def find_targets(
     if parts:
         return parts[0]
     family = codes if isinstance(codes, PlateFamily) else code_family(codes)
-    outlines = find_outlines(photograph, SIGNS[polarity], noise=noise, scale=scale, **limits)
+    outlines = find_outlines(
+        photograph,
+        SIGNS[polarity],
+        noise=noise,
+        scale=scale,
+        min_diameter_px=min_diameter_px,
+        max_diameter_px=max_diameter_px,
+        hidden=hidden,
+        reach=family.outer if isinstance(family, CodeFamily) else 1.0,
+    )
     fit = fit_ellipse_model(
         photograph, outlines.xy, outlines.shape, outlines.sign, noise=noise, saturation=scale
     )

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sfm.model.conventions import AnyArray, FloatArray, IntArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
 
 # The local mean is that of 3 x 3 cells of 4 x 4 px, interpolated, about 14 px: an edge is detected up to half
@@ -64,6 +64,8 @@ def find_outlines(
     scale: float,
     min_diameter_px: float,
     max_diameter_px: float,
+    hidden: BoolArray | None = None,
+    reach: float = 1.0,
 ) -> Outlines:
     """Find outlines that resemble ellipses.
 
@@ -78,6 +80,8 @@ def find_outlines(
         scale: largest intensity that the photograph can represent.
         min_diameter_px: minimum minor axis of a target.
         max_diameter_px: maximum major axis of a target.
+        hidden: masked pixels, (H, W); outlines that do not reach any other pixel are left out.
+        reach: of a target and its code, in semi-axes of its outline.
 
     Returns:
         The outlines.
@@ -93,12 +97,13 @@ def find_outlines(
         ellipse, reason = _ellipses_of_contours(
             points, first, image.shape[0], image.shape[1], float(min_diameter_px), float(max_diameter_px)
         )
-        _bridge_damage(points, first, ellipse, reason)
-        good = reason == 0
+        shown = _reaching_shown(ellipse, hidden, reach)
+        _bridge_damage(points, first, ellipse, reason, shown)
+        good = (reason == 0) & shown
         ellipses.append(ellipse[good])
         kept_signs.append(np.full(int(good.sum()), sign))
-        rejected_xy.append(ellipse[~good, :2])
-        rejected_flag.append(reason[~good])
+        rejected_xy.append(ellipse[~good & shown, :2])
+        rejected_flag.append(reason[~good & shown])
     candidates = np.concatenate(ellipses)
     return Outlines(
         xy=candidates[:, :2],
@@ -107,6 +112,21 @@ def find_outlines(
         rejected_xy=np.concatenate(rejected_xy),
         rejected_flag=np.concatenate(rejected_flag),
     )
+
+
+def _reaching_shown(ellipse: FloatArray, hidden: BoolArray | None, reach: float) -> BoolArray:
+    """Return which ellipses, x, y, p, q, r, (k, 5), reach pixels that are not masked, (k,).
+
+    The code of a target whose centre is masked shows that the parts of it that are not are no targets.
+    """
+    if hidden is None:
+        return np.ones(len(ellipse), dtype=bool)
+    distance = cv2.distanceTransform(hidden.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    column, row = np.rint(ellipse[:, :2]).astype(np.int64).T
+    p, q, r = ellipse[:, 2:].T
+    smallest = (p + r) / 2 - np.hypot((p - r) / 2, q)  # inverse of the major semi-axis; 0 without a shape
+    reaching = distance[row, column] * smallest <= reach
+    return np.asarray(reaching & ((smallest > 0) | ~hidden[row, column]))
 
 
 def estimate_noise(photograph: AnyArray) -> float:
@@ -265,7 +285,9 @@ def _ellipses_of_contours(
     return ellipse, reason
 
 
-def _bridge_damage(points: AnyArray, first: IntArray, ellipse: FloatArray, reason: IntArray) -> None:
+def _bridge_damage(
+    points: AnyArray, first: IntArray, ellipse: FloatArray, reason: IntArray, shown: BoolArray
+) -> None:
     """Fit ellipses to the longest smooth part of outlines interrupted by a nick, a splash or a scratch.
 
     The outline of a large target is that of a thin band along its edge, and the contour enters the band
@@ -277,8 +299,9 @@ def _bridge_damage(points: AnyArray, first: IntArray, ellipse: FloatArray, reaso
         first: start of each contour, (k + 1,).
         ellipse: x, y, p, q, r, improved for a bridged outline, (k, 5).
         reason: set to 0 for a bridged outline, (k,).
+        shown: outlines that are looked at, (k,).
     """
-    for c in np.flatnonzero(reason == Flag.NOT_ELLIPTIC.value):
+    for c in np.flatnonzero((reason == Flag.NOT_ELLIPTIC.value) & shown):
         contour = points[first[c] : first[c + 1]]
         if len(contour) < MIN_OUTLINE_POINTS:
             continue

@@ -40,7 +40,12 @@ from sfm.matching.tracks.feature_tracks import (
     link_features,
 )
 from sfm.matching.tracks.features import Features, PairMatches, matched_features, sift_features
-from sfm.matching.tracks.interest import foerstner_points, natural_points, textured_squares
+from sfm.matching.tracks.interest import (
+    foerstner_points,
+    natural_points,
+    squares_side_by_side,
+    textured_pixels,
+)
 from sfm.model.camera import Camera, project, tangents_from_pixel
 from sfm.model.conventions import (
     AnyArray,
@@ -238,14 +243,25 @@ def test_squares_with_texture_lie_side_by_side() -> None:
     rng = np.random.default_rng(3)
     photograph = np.full((120, 160), 90, np.uint8)
     photograph[:, :80] = rng.integers(0, 255, (120, 80))
-    everywhere = np.ones(photograph.shape, dtype=bool)
-    xy = textured_squares(photograph, 15, everywhere, border_px=11)
+    textured = textured_pixels(photograph, 15)
+    xy = squares_side_by_side(textured, 15, border_px=11)
     assert len(xy) == 7 * 6 and (xy == np.rint(xy)).all() and (xy[:, 0] < 80 + 8).all()
     assert xy.min() >= 11 and len({tuple(one) for one in ((xy - 11) % 15).tolist()}) == 1
-    everywhere[:60] = False
-    lower = textured_squares(photograph, 15, everywhere, border_px=11)
+    hidden = np.zeros(photograph.shape, dtype=bool)
+    hidden[:60] = True
+    lower = squares_side_by_side(textured & ~hidden, 15, border_px=11)
     assert 0 < len(lower) < len(xy) and lower[:, 1].min() == 60
-    assert len(textured_squares(np.full((60, 60), 9, np.uint8), 15, np.ones((60, 60), dtype=bool))) == 0
+    assert not textured_pixels(np.full((60, 60), 9, np.uint8), 15).any()
+
+
+def test_only_the_part_around_what_is_not_masked_is_searched_for_texture() -> None:
+    photograph = np.random.default_rng(4).integers(0, 255, (120, 400)).astype(np.uint8)
+    photograph[:, 200:] //= 20  # weaker than a tenth of the mean of the whole, but not of itself
+    hidden = np.zeros(photograph.shape, dtype=bool)
+    hidden[:, :330] = True
+    assert not textured_pixels(photograph, 15)[:, 330:].any()
+    shown = textured_pixels(photograph, 15, hidden)
+    assert not shown[:, :256].any() and shown[10:-10, 330:-10].all()
 
 
 def test_texture_is_the_same_strip_by_strip(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,7 +362,7 @@ def test_planes_with_wrong_slopes_give_the_same_depths(tilt: float) -> None:
     photographs, truth, _ = _scene()
     lens, camera = truth.cameras[0], np.zeros(3, dtype=np.int64)
     grey = GreyPhotographs(photographs.__getitem__)
-    xy = textured_squares(grey[0].pixels, 15, np.ones(photographs[0].shape[:2], dtype=bool), border_px=60)
+    xy = squares_side_by_side(textured_pixels(grey[0].pixels, 15), 15, border_px=60)
     planes = planes_at(truth, camera, 0, xy, np.arange(len(truth.points)))
     known = np.isfinite(planes.slope_covariance).all(axis=(1, 2))
     xy, planes = xy[known], planes.select(known)
@@ -388,7 +404,7 @@ def test_pairs_whose_matches_are_known_are_not_matched_again(monkeypatch: pytest
 def test_interest_operators_take_a_small_part_of_a_large_photograph_at_a_time() -> None:
     """Gradients, their products and sums in double precision would take twenty times its memory."""
     photograph = np.random.default_rng(1).integers(0, 255, (3000, 1000)).astype(np.uint8)
-    for find in (foerstner_points, lambda one: textured_squares(one, 15, np.ones(one.shape, bool))):
+    for find in (foerstner_points, lambda one: textured_pixels(one, 15)):
         tracemalloc.start()
         find(photograph)
         peak = tracemalloc.get_traced_memory()[1]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.model.conventions import AnyArray
+from sfm.model.conventions import AnyArray, FloatArray
 from sfm.model.errors import PhotographError, SurveyFileError
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_mask, read_photograph
@@ -18,6 +18,8 @@ from sfm.products.drafting.draft import draft_survey
 from sfm.survey.inputs.measurements import find_photographs
 from sfm.survey.inputs.survey import read_survey
 from sfm.survey.inputs.survey_file import read_survey_file
+from sfm.targets.detect import find_targets
+from sfm.targets.measure import EllipseFit, fit_ellipse_model
 from tests.survey.test_sources import CORNERS, write, write_given
 
 BLACK = slice(0, 220)  # columns of the masked part, px
@@ -49,6 +51,32 @@ def test_nothing_is_measured_under_black(tmp_path: Path) -> None:
         assert (seen.xy[(network.source == source) & of_last, 0] < BLACK.stop - 1).any()
     whole = run_survey(replace(survey, masks=None)).adjustment.network.image_points
     assert len(seen) < len(whole)
+
+
+def test_targets_under_black_are_neither_fitted_nor_reported_as_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time of a masked survey is that of what is seen."""
+    fitted: list[FloatArray] = []
+
+    def counted(photograph: AnyArray, xy: FloatArray, *others: FloatArray, **options: float) -> EllipseFit:
+        fitted.append(xy)
+        return fit_ellipse_model(photograph, xy, *others, **options)
+
+    monkeypatch.setattr("sfm.targets.detect.fit_ellipse_model", counted)
+    masked(tmp_path)
+    picture = read_photograph(tmp_path / "photo 1.png")
+    hidden = np.zeros(picture.shape, dtype=bool)
+    hidden[:, BLACK] = True
+    whole, shown = (find_targets(picture, codes="ring14", hidden=part) for part in (None, hidden))
+    seen = whole.select((whole.code >= 0) & (whole.xy[:, 0] > BLACK.stop - 0.5))
+    coded = shown.select(shown.code >= 0)
+    assert 0 < len(seen) < (whole.code >= 0).sum() and (coded.code == seen.code).all()
+    sigma = np.sqrt(np.einsum("kii->ki", seen.covariance))
+    assert (np.abs(coded.xy - seen.xy) < 0.05 * sigma).all()  # the noise of outlines is that of what is seen
+    assert (shown.xy[:, 0] > BLACK.stop - 1).all()
+    assert len(fitted[1]) < len(fitted[0])
+    assert (shown.rejected_xy[:, 0] > BLACK.stop - 1).all()
 
 
 def test_masks_are_among_the_photographs_if_these_are_elsewhere(tmp_path: Path) -> None:

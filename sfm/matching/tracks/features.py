@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from sfm.matching.radiometry import FULL_SCALE_8, grey_of_8_bit
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import is_shown
 
 FEATURES = 250  # of each photograph, the coarsest ones
 PARTNERS = 10  # of each photograph, by common features
@@ -108,17 +109,6 @@ def sift_features(
         np.radians([p.angle for p in described]),
         np.sqrt(descriptor / norm),
     )
-
-
-def is_shown(hidden: BoolArray, xy: FloatArray) -> BoolArray:
-    """Return which positions (px, (k, 2)) are on pixels that are not masked, (k,).
-
-    Args:
-        hidden: masked pixels, (H, W).
-        xy: positions in the photograph.
-    """
-    column, row = np.rint(xy).astype(np.int64).T
-    return np.asarray(~hidden[row, column])
 
 
 def shown_part(hidden: BoolArray | None, shape: tuple[int, ...]) -> tuple[slice, slice]:

@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 
 from sfm.matching.radiometry import grey_of, odd_window
-from sfm.matching.tracks.features import Features, is_shown, shown_part, sift_features
+from sfm.matching.tracks.features import Features, shown_part, sift_features
 from sfm.model.arguments import checked_arguments
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.display import counted
 from sfm.model.errors import GeometryError
 from sfm.runtime.compiling import compiled
+from sfm.runtime.sampling import is_shown
 
 DETECTORS = ("foerstner", "sift")
 # Foerstner and Guelch (1987): 0.5 <= q <= 0.75, and w >= 0.5 to 1.5 times its mean over the photograph.
@@ -105,28 +106,40 @@ def foerstner_points(
     return InterestPoints(position, covariance, weight[row, col], roundness)
 
 
-def textured_squares(
-    photograph: AnyArray, side_px: int, allowed: BoolArray, *, border_px: int = 0
-) -> FloatArray:
-    """Return the centres of squares with texture, side by side from the upper left, whole px, (k, 2).
+def textured_pixels(photograph: AnyArray, side_px: int, hidden: BoolArray | None = None) -> BoolArray:
+    """Return which pixels of a photograph are the middles of squares with texture, (H, W).
 
     Args:
         photograph: (H, W), 8 or 16 bit or float, grey or colour.
         side_px: odd side of the squares.
-        allowed: pixels that may be a centre, (H, W).
-        border_px: no centre may be this close to the border of the photograph.
+        hidden: masked pixels, (H, W); only the part around all others is searched.
 
     Source: the weight of Foerstner and Guelch (1987), ISPRS Intercommission Workshop Interlaken, p. 281.
     """
-    grey = grey_of(photograph)
+    shown = shown_part(hidden, photograph.shape)
+    grey = grey_of(photograph)[shown]
     weight = np.empty_like(grey)
     for first, end, begin, gx, gy in _strips(grey, side_px // 2):
-        weight[first:end] = _texture(gx, gy, side_px)[0][first - begin : end - begin]
-    free = allowed & (weight > TEXTURE_OF_MEAN * weight.mean())
+        det, trace = _invariants(gx, gy, side_px)
+        weight[first:end] = (det / trace)[first - begin : end - begin]
+    textured = np.zeros(photograph.shape[:2], dtype=bool)
+    textured[shown] = weight > TEXTURE_OF_MEAN * weight.mean()
+    return textured
+
+
+def squares_side_by_side(allowed: BoolArray, side_px: int, *, border_px: int = 0) -> FloatArray:
+    """Return the middles of disjoint squares, side by side from the upper left, whole px, (k, 2).
+
+    Args:
+        allowed: pixels that may be a middle, (H, W).
+        side_px: odd side of the squares.
+        border_px: no middle may be this close to the border of the photograph.
+    """
+    free = allowed.copy()
     margin = max(border_px, 1)
     free[:margin], free[-margin:], free[:, :margin], free[:, -margin:] = False, False, False, False
     corners = []  # line by line, each square disjoint from those before
-    for y in range(len(free)):
+    for y in np.flatnonzero(free.any(axis=1)).tolist():
         for x in np.flatnonzero(free[y]).tolist():
             if free[y, x]:
                 corners.append((x, y))
@@ -156,13 +169,18 @@ def _strips(grey: AnyArray, half: int) -> Iterator[tuple[int, int, int, AnyArray
 
 def _texture(gx: AnyArray, gy: AnyArray, side: int) -> tuple[AnyArray, AnyArray]:
     """Return weight and roundness of the window around every pixel, each (H, W), from gradients (H, W)."""
+    det, trace = _invariants(gx, gy, side)
+    return (det / trace).astype(np.float32), (4 * det / (trace * trace)).astype(np.float32)
+
+
+def _invariants(gx: AnyArray, gy: AnyArray, side: int) -> tuple[FloatArray, FloatArray]:
+    """Return determinant and trace of N of the window around every pixel, each (H, W)."""
     xx, xy, yy = (
         cv2.boxFilter(product, cv2.CV_64F, (side, side), normalize=False)
         for product in (gx * gx, gx * gy, gy * gy)
     )
     trace = np.maximum(xx + yy, 1e-12)
-    det = np.maximum(xx * yy - xy * xy, 0.0)
-    return (det / trace).astype(np.float32), (4 * det / (trace * trace)).astype(np.float32)
+    return np.maximum(xx * yy - xy * xy, 0.0), trace
 
 
 @compiled

@@ -17,7 +17,6 @@ import numpy as np
 from sfm.model.conventions import AnyArray, FloatArray, IntArray
 from sfm.model.display import counted, listed
 from sfm.model.errors import GeometryError, PhotographError
-from sfm.photographs.exif import read_metadata
 from sfm.photographs.masks import Masks
 from sfm.photographs.reading import read_photograph
 from sfm.products.drafting.ringed_dots import Ringed, ringed_dots
@@ -90,9 +89,8 @@ class _Files:
         return self.masks.cover(self.name(path), read_photograph(path))
 
     def measure(self, path: Path, family: str) -> Targets:
-        targets, _ = measure_photograph(path, TargetSettings(), code_family(family), self.store)
-        size_px = read_metadata(path).size_px
-        return targets.select(self.masks.visible(self.name(path), targets.xy, size_px))
+        codes, name = code_family(family), self.name(path)
+        return measure_photograph(path, TargetSettings(), codes, self.store, name=name, masks=self.masks)[0]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from sfm.matching.lsm.surface_planes import NEIGHBOURS, Planes, planes_at, tilte
 from sfm.matching.lsm.two_photo import COARSE_STEP, LsmMatches, LsmSettings, match_lsm
 from sfm.matching.lsm.window_slopes import ShiftedWindows, estimate_slopes, slope_equations
 from sfm.matching.radiometry import Grey, GreyPhotographs
-from sfm.matching.tracks.interest import textured_squares
+from sfm.matching.tracks.interest import squares_side_by_side, textured_pixels
 from sfm.model.conventions import AnyArray, BoolArray, FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
@@ -150,12 +150,22 @@ def find_covering_points(
     nothing = ImagePoints(none, none, np.zeros((0, 2)), np.zeros((0, 2, 2)))
     parts = [CoveringPoints(nothing, np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros((0, 2)), 0)]
 
+    usable: dict[int, AnyArray] = {}  # middles of squares with texture that are not hidden, one bit each
+
+    def usable_middles(i: int) -> BoolArray:
+        if i not in usable:
+            black = None if hidden is None else hidden.pixels(i).astype(bool)
+            middles = textured_pixels(grey[i].pixels, side_px, black)
+            if hidden is not None:
+                middles &= hidden.free_middles(i, window_px)
+            usable[i] = np.packbits(middles)
+        height, width = shapes[i]
+        return np.unpackbits(usable[i], count=height * width).reshape(height, width).astype(bool)
+
     def cover(i: int, rays: int, *, more: bool) -> None:
         """Take points that exactly `rays` photographs see, or at least so many if `more`."""
-        free_middles = covered.free_middles(i, side_px)
-        if hidden is not None:
-            free_middles &= hidden.free_middles(i, window_px)
-        xy = textured_squares(grey[i].pixels, side_px, free_middles, border_px=margin)
+        free_middles = covered.free_middles(i, side_px) & usable_middles(i)
+        xy = squares_side_by_side(free_middles, side_px, border_px=margin)
         planes = planes_at(estimate, camera, i, xy, seen.point[tie_rows[i]])
         squares = Squares(i, xy, planes).select(np.asarray(np.isfinite(planes.points).all(axis=1)))
         visible, free = _visible(estimate, camera, squares, covered, margin, side_px, window_px, hidden)

@@ -19,7 +19,7 @@ from typing import TypeVar
 import numpy as np
 
 from sfm.judgement.survey_result import FailedImage
-from sfm.model.conventions import AnyArray, FloatArray
+from sfm.model.conventions import AnyArray, BoolArray, FloatArray
 from sfm.model.display import counted, listed
 from sfm.model.errors import GeometryError, PhotographError
 from sfm.model.remarks.remark import Remark, remark
@@ -74,11 +74,12 @@ def measure_photographs(
         PhotographError: photographs of different sizes have the same camera.
         SurveyFileError: the code table or the start values of a camera are unusable.
     """
-    family = survey.family
+    family, masks = survey.family, Masks(survey.masks)
+    name_of = dict(zip(photographs.paths, photographs.names, strict=True))
 
     def read_and_measure(path: Path) -> tuple[Metadata, Targets, bool]:
         targets, stored = measure_photograph(
-            path, survey.targets, family, store
+            path, survey.targets, family, store, name=name_of[path], masks=masks
         )  # first: it reports faults of a file best
         return read_metadata(path), targets, stored
 
@@ -107,12 +108,7 @@ def measure_photographs(
             names,
             survey.start_cameras,
         ),
-        tuple(
-            measured[k][1].select(
-                Masks(survey.masks).visible(name, measured[k][1].xy, measured[k][0].size_px)
-            )
-            for k, name in zip(order, names, strict=True)
-        ),
+        tuple(measured[k][1] for k in order),
         failed,
         tuple(measured[k][2] for k in order),
     )
@@ -123,6 +119,9 @@ def measure_photograph(
     settings: TargetSettings,
     family: TargetFamily | None,
     store: MeasuredStore | None = None,
+    *,
+    name: str = "",
+    masks: Masks = Masks(),
 ) -> tuple[Targets, bool]:
     """Return the targets of one photograph, and whether they were read from the store.
 
@@ -133,17 +132,22 @@ def measure_photograph(
         settings: appearance of the targets.
         family: codes of the targets, None without codes.
         store: is searched first, and stores new measurements.
+        name: name of the photograph, by which its mask is found.
+        masks: what is black in that of the photograph has no targets.
 
     Raises:
-        PhotographError: the photograph cannot be read.
+        PhotographError: the photograph or its mask cannot be read.
+        SurveyFileError: the mask has another size than the photograph.
     """
-    return measured_once(
-        store,
-        path,
-        TARGETS,
-        target_settings(settings, family),
-        lambda: targets_in(read_photograph(path, channel=settings.channel), settings, family),
-    )
+    stated, mask = target_settings(settings, family), masks.path_of(name)
+    if mask is not None:
+        stated += "\0" + content_hash(mask)
+
+    def measured() -> Targets:
+        pixels = read_photograph(path, channel=settings.channel)
+        return targets_in(pixels, settings, family, hidden=masks.black(name, pixels.shape[1::-1]))
+
+    return measured_once(store, path, TARGETS, stated, measured)
 
 
 def target_settings(settings: TargetSettings, family: TargetFamily | None) -> str:
@@ -159,13 +163,23 @@ def target_settings(settings: TargetSettings, family: TargetFamily | None) -> st
     return settings.model_dump_json(include={"channel", "tone", "polarity", "min_diameter_px"}) + "\0" + codes
 
 
-def targets_in(photograph: AnyArray, settings: TargetSettings, family: TargetFamily | None) -> Targets:
-    """Return the targets of a photograph, (H, W), that was read in the channel of the settings."""
+def targets_in(
+    photograph: AnyArray,
+    settings: TargetSettings,
+    family: TargetFamily | None,
+    *,
+    hidden: BoolArray | None = None,
+) -> Targets:
+    """Return the targets of a photograph, (H, W), that was read in the channel of the settings.
+
+    hidden: masked pixels, which have no targets, (H, W).
+    """
     return find_targets(
         linearise_srgb(photograph) if settings.tone == "srgb" else photograph,
         polarity=settings.polarity,
         codes=family if family is not None else "none",
         min_diameter_px=settings.min_diameter_px,
+        hidden=hidden,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from sfm.photographs.masks import Masks
 from sfm.survey.inputs.settings import Section
 from sfm.survey.inputs.survey import Survey, survey_family
 from sfm.survey.inputs.survey_file import SurveyFile
@@ -21,7 +22,9 @@ def _measure_one(
         family = survey.family
     else:
         family = survey_family(survey.targets, survey.codes, survey.plates)
-    targets, stored = measure_photograph(path, survey.targets, family, store)
+    targets, stored = measure_photograph(
+        path, survey.targets, family, store, name=image, masks=Masks(survey.masks)
+    )
     return {"targets": len(targets), "rejected": len(targets.rejected_xy)}, stored
 
 

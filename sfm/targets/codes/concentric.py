@@ -172,8 +172,9 @@ def read_resolved(photograph: AnyArray) -> dict[str, IntArray]:
     noise, scale = estimate_noise(photograph), scale_of(photograph)
     families = [concentric_family(name) for name in WIDTHS]
     least = 2 * RESOLVED_PX / max(family.narrow for family in families)
-    limits = {"min_diameter_px": least, "max_diameter_px": math.inf}
-    outlines = find_outlines(photograph, (1, -1), noise=noise, scale=scale, **limits)
+    outlines = find_outlines(
+        photograph, (1, -1), noise=noise, scale=scale, min_diameter_px=least, max_diameter_px=math.inf
+    )
     return {
         family.name: find_concentric(photograph, family, outlines, noise=noise, scale=scale).code
         for family in families
