@@ -163,7 +163,7 @@ def interior_columns(
         camera = estimate.cameras[index]
         rows = np.flatnonzero(network.camera[seen.image] == index)
         UVW = _in_photographs(a, rows)
-        jacobian = np.nan_to_num(parameter_jacobian(camera, -UVW[:, :2] / UVW[:, 2:]))
+        jacobian = np.nan_to_num(parameter_jacobian(camera, UVW))
         largest = np.abs(jacobian).max(axis=(0, 1), initial=0.0)
         for (other, s), owner in zip(parameters, owners, strict=True):
             if other == index:
