@@ -113,6 +113,11 @@ class FileFormat:
         return self.keeps | {"free"} if frees else self.keeps
 
     @property
+    def only_points(self) -> bool:
+        """Whether it has object points and no photographs."""
+        return "object points" in self.keeps and "exterior orientations" not in self.keeps
+
+    @property
     def readable(self) -> bool:
         """Whether it has photographs and can be read."""
         return self.read is not None or self.read_all is not None
@@ -517,7 +522,7 @@ def write_content(path: Path, name: str, content: Content) -> None:
 def _refuse_unplaced(path: Path, form: FileFormat, content: Content) -> None:
     """Raise OutputError if nothing that was measured has coordinates; any part of a model may be missing."""
     network, estimate = content.result.network, content.result.estimate
-    if not form.models and not estimate.determined.any():
+    if form.only_points and not estimate.determined.any():
         raise OutputError(
             f"{path}: format {form.name} needs coordinates in the object, but no point has coordinates"
         )
@@ -576,7 +581,7 @@ def _refuse_cameras(form: FileFormat, cameras: tuple[Camera, ...]) -> None:
 def describe_stored(name: str, network: Network, estimate: Estimate) -> str:
     """Return in words which part of a network a format keeps."""
     form = format_named(name)
-    if not form.models:
+    if form.only_points:
         return counted(int(estimate.determined.sum()), "point")
     if name == "rig":
         rigs = [rig for rig in (estimate.mounts.rig if estimate.mounts is not None else ()) if rig]

@@ -41,7 +41,7 @@ _decoded: ContextVar[dict[tuple[Path, str], AnyArray] | None] = ContextVar("deco
 
 @contextmanager
 def decoding_once() -> Iterator[None]:
-    """Decode every file once, however often this thread reads it inside; at the end all pixels are freed.
+    """Decode every file once a channel, however often this thread reads it inside; then all pixels are freed.
 
     All who read a file receive the same array, which they leave as it is.
     """

@@ -364,3 +364,5 @@ def test_every_figure_of_the_report_is_explained(tmp_path: Path) -> None:
     assert len(names) > 60
     missing = sorted(one for one in names if one.lower() not in PAGE)
     assert not missing, missing
+    titles = [sections[key].title for key in ("worked", "quality", "rejected", "comparison")]
+    assert all(f"## {title}".lower() in PAGE for title in titles), titles

@@ -38,7 +38,7 @@ class Declared:
     """A source as surveys state it."""
 
     source: Source
-    table: str  # of the survey file
+    table: str  # attribute of surveys with the settings of its table in the survey file
     describe: Callable[[Any], str]  # the settings of the table in a few words
     stage: str = ""  # stage of the pipeline that measures it in photographs; empty if nothing is measured
     is_stated: Callable[[Any], bool] = lambda settings: settings is not None
