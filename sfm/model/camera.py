@@ -35,6 +35,7 @@ STEP_TOLERANCE = 1e-11
 # Fraction of the half diagonal, at the corner of the photograph, by which nominal focal lengths, sensors and
 # lenses differ from true ones. A parameter that the network determines worse is better held fixed.
 KNOWN_WITHOUT = 0.01
+INWARDS = np.linspace(0.0, 0.9, 451)  # from a place at the border to the middle of the format, in parts
 DIAGONAL_PLACES = 26  # from the corner to the middle of a wide-angle photograph; one of them has a ray
 
 
@@ -388,6 +389,24 @@ def within_reach(camera: Camera, xy_px: FloatArray, seen_px: FloatArray) -> Bool
     rays, measured = (rays_from_pixel(camera, places) for places in (xy_px, seen_px))
     rays, measured = (part / np.linalg.norm(part, axis=1)[:, None] for part in (rays, measured))
     return np.asarray(rays[:, 2] <= max(0.0, np.nanmax(measured[:, 2], initial=0.0)))
+
+
+def outermost_reached(camera: Camera, ends_px: FloatArray, seen_px: FloatArray) -> FloatArray:
+    """Return the places nearest to the border of the format that photographs of the camera may show.
+
+    Args:
+        camera: interior orientation.
+        ends_px: places at the border, px, (n, 2).
+        seen_px: image points, px, (k, 2); see `within_reach`.
+
+    Returns:
+        The outermost place within reach on each line from an end to the middle of the format, px, (n, 2); the
+        end if there is none.
+    """
+    middle = (np.array(camera.size_px) - 1) / 2
+    lines = ends_px[:, None] + INWARDS[:, None] * (middle - ends_px)[:, None]
+    reached = within_reach(camera, lines.reshape(-1, 2), seen_px).reshape(lines.shape[:2])
+    return np.asarray(lines[np.arange(len(lines)), reached.argmax(axis=1)])
 
 
 def angle_between(first: FloatArray, second: FloatArray) -> float:

@@ -235,7 +235,7 @@ def describe_rigs(rigs: Sequence[Rig], unit: str) -> Iterator[tuple[str, str]]:
 
 def fixed(value: float, decimals: int) -> str:
     """Write a number with a given number of decimals, and without a sign before zero."""
-    return f"{float(value):z.{decimals}f}"
+    return f"{float(value):z.{decimals}f}" if np.isfinite(value) else "not known"
 
 
 def scientific(value: float, decimals: int) -> str:

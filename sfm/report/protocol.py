@@ -25,7 +25,14 @@ from sfm.judgement.checks import (
     standard_deviations,
 )
 from sfm.judgement.survey_result import ControlCheck, SurveyResult
-from sfm.model.camera import Camera, angle_between, pixel_from_rays, rays_from_pixel
+from sfm.model.camera import (
+    Camera,
+    angle_between,
+    outermost_reached,
+    pixel_from_rays,
+    rays_from_pixel,
+    within_reach,
+)
 from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.distortion.models import Role
 from sfm.model.distributions import f_sf
@@ -79,7 +86,9 @@ def protocol_of(result: SurveyResult, given: Given) -> Protocol:
             *check_coordinates(result, placed=True),
         ),
         lenses=tuple(
-            _lens(camera) for k, camera in enumerate(a.estimate.cameras) if (a.network.camera == k).any()
+            _lens(camera, seen.xy[a.network.camera[seen.image] == k])
+            for k, camera in enumerate(a.estimate.cameras)
+            if (a.network.camera == k).any()
         ),
         cumulative=_cumulative(a),
     )
@@ -156,8 +165,13 @@ def _checked(a: Adjustment, check: ControlCheck | None) -> list[ControlCoordinat
     ]
 
 
-def _lens(camera: Camera) -> Lens:
-    """Return distortion along the edge, relative to the same c and principal point, and the field of view."""
+def _lens(camera: Camera, seen: FloatArray) -> Lens:
+    """Return distortion along the edge, relative to the same c and principal point, and the field of view.
+
+    Args:
+        camera: interior orientation.
+        seen: its image points, px, (k, 2); see `within_reach`.
+    """
     width, height = camera.size_px
     along = np.linspace(0.0, 1.0, EDGE_STEPS)
     x, y = (width - 1) * along, (height - 1) * along
@@ -169,13 +183,14 @@ def _lens(camera: Camera) -> Lens:
         ]
     )
     straight = camera.with_parameters(np.where(camera.parts[2], 0.0, camera.parameters))
+    edge = edge[within_reach(camera, edge, seen)]
     moved = np.linalg.norm(pixel_from_rays(straight, rays_from_pixel(camera, edge)) - edge, axis=1)
     middle = np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])
     upright = np.array([[(width - 1) / 2, 0.0], [(width - 1) / 2, height - 1.0]])
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     angles = []  # between the rays of opposite points, rad
     for pair in (middle, upright, corners):
-        rays = rays_from_pixel(camera, pair)
+        rays = rays_from_pixel(camera, outermost_reached(camera, pair, seen))
         angles.append(angle_between(rays[0], rays[1]))
     largest = float(moved[np.isfinite(moved)].max(initial=0.0)) if np.isfinite(moved).any() else np.nan
     return Lens(camera.name, largest, np.degrees(angles))

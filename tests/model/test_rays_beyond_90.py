@@ -7,7 +7,9 @@ import pytest
 
 from sfm.model.camera import (
     Camera,
+    angle_between,
     camera_from_values,
+    outermost_reached,
     parameter_jacobian,
     pixel_from_rays,
     pixel_from_tangents,
@@ -144,3 +146,14 @@ def test_models_of_tangents_give_their_rays_to_the_last_bit(model: str) -> None:
     assert (pixel_from_rays(camera, rays) == pixel_from_tangents(camera, uv)).all()
     with_rays, with_tangents = parameter_jacobian(camera, rays), parameter_jacobian(camera, uv)
     assert (with_rays == with_tangents).all()
+
+
+def test_the_format_of_a_fisheye_ends_where_image_points_end() -> None:
+    """An image circle in a format that is wider: the model alone would reach 2 x 149 degrees."""
+    camera = camera_from_values("wide", "simple_fisheye", (1600, 1200), (1.0, 1.0), c_mm=307.0)
+    ends = np.array([[0.0, 599.5], [1599.0, 599.5]])
+    seen = np.array([[799.5, 599.5 - 307.0 * np.radians(95.0)]])
+    left, right = rays_from_pixel(camera, outermost_reached(camera, ends, seen))
+    assert 186 < np.degrees(angle_between(left, right)) <= 190
+    tele = camera_from_values("tele", "brown", (1600, 1200), (1.0, 1.0), c_mm=3000.0)
+    assert np.array_equal(outermost_reached(tele, ends, seen), ends)

@@ -9,10 +9,14 @@ from typing import Annotated
 import typer
 
 from sfm.cli.options import Overwrite
-from sfm.cli.process import compile_first, loading
+from sfm.cli.process import FAILED, compile_first, loading
 from sfm.runtime.faults import working_on
 
 SHOWN = 4  # sections of the page whose tables are printed
+# of what a format may have, by its names in `adapters.formats.content`; rigs have a note of their own
+NOT_USED = (
+    "exterior", "interior", "checks", "rejected", "image covariances", "shared", "unplaced",
+)  # fmt: skip
 
 
 def audit(
@@ -49,38 +53,71 @@ def audit(
     reasons on the page, or a stage cannot go on; 2 if the input must be corrected.
     """
     with loading():
+        from adapters.formats.content import ALL, losses
         from adapters.formats.registry import read_content
-        from sfm.cli.console import exit_by, print_verdict
+        from sfm.cli.console import exit_by, print_unfinished, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
+        from sfm.model.display import listed
         from sfm.pipeline import run_survey
         from sfm.products.auditing.audit import audit_of, stated_of, survey_of_model
         from sfm.report.findings import findings_of
-        from sfm.report.output import folder_name, write_result
+        from sfm.report.output import (
+            Origin,
+            SurveyLog,
+            folder_name,
+            refuse_other_origin,
+            write_result,
+            write_unfinished,
+        )
         from sfm.report.pages import page_of, texts_of
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.survey import read_survey
+        from sfm.survey.unfinished import UnfinishedSurveyError
 
     with working_on(str(model)):
         content = read_content(model, from_format)
-        stated = stated_of(content.result)
+        stated_model = replace(content.result, name=model.resolve().name)  # of "." too
+        stated = stated_of(stated_model)
         held = tuple(name.strip() for name in fix.split(",") if name.strip())
         given = None if survey is None else read_survey(survey)
-        audited = survey_of_model(content.result, stated, fixed=held, given=given)
-    folder = out or Path("out") / f"{folder_name(model.resolve().name)}_audit"
+        audited = survey_of_model(stated_model, stated, fixed=held, given=given)
+    left = [f"{count} {kind.words}" for kind, count in losses(content, ALL.difference(NOT_USED))]
+    notes = (*content.notes, *([f"not used of the model: {listed(left)}"] if left else []))
+    folder = out or Path("out") / f"{folder_name(stated_model.name)}_audit"
     refuse_foreign_folder(folder)
+    origin = Origin(model, model.parent)
+    if not overwrite:
+        refuse_other_origin(folder, origin, survey=audited.name, photographs=False)
     compile_first()
-    with working_on(str(model)), drawn_progress() as progress, one_blas_thread():
-        result = run_survey(audited, jobs=cores(), progress=progress)
+    with (
+        working_on(str(model)),
+        drawn_progress() as drawn,
+        one_blas_thread(),
+        SurveyLog(watch=drawn) as log,
+    ):
+        log.start(audited.name, model, **origin.written(folder))
+        try:
+            result = run_survey(audited, jobs=cores(), progress=log)
+        except UnfinishedSurveyError as error:
+            reached = error.reached
+            report = write_unfinished(
+                reached, folder, finish=lambda part: log.close_into(part, reached), progress=log
+            )
+            print_unfinished(reached, report)
+            raise SystemExit(FAILED) from error
         findings = findings_of(result)
-        page = page_of(audit_of(content.result, stated, findings.result), report="report.html")
+        page = page_of(audit_of(stated_model, stated, findings.result, notes=notes), report="report.html")
 
-        def add_page(part: Path) -> None:
+        def finish(part: Path) -> None:
             for name, text in texts_of(page).items():
                 (part / name).write_text(text, encoding="utf-8", newline="")
+            log.close_into(part, findings)
 
-        write_result(findings, folder, finish=add_page, progress=progress)
+        write_result(findings, folder, finish=finish, progress=log)
     print_verdict(page.verdict)
+    for note in notes:
+        print(f"{model}: {note}")
     print(replace(page, sections=page.sections[:SHOWN]).text)
     print(f"Report: {folder / 'report.html'}")
     print(f"Audit: {folder / page.path}")

@@ -19,10 +19,10 @@ from sfm.adjustment.covariance import change_datum
 from sfm.adjustment.datum import Datum
 from sfm.judgement.checks import root_mean_square
 from sfm.judgement.survey_result import SurveyResult
-from sfm.matching.lsm.coverage import project_points
-from sfm.model.camera import Camera
+from sfm.model.camera import Camera, pixel_from_rays
 from sfm.model.conventions import MAD_TO_SIGMA, METRES, FloatArray, angles_from_rotation
 from sfm.model.errors import GeometryError
+from sfm.model.network import rows_of
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.products.refining.refinement import free_cameras
@@ -38,6 +38,7 @@ class Stated:
     """What a model states of itself, by its own projection of its points."""
 
     residuals: FloatArray  # computed minus measured, px, (k, 2)
+    unseen: int  # further image points, of points that their camera does not see where the model has both
     photographs: int  # with an orientation
     points: int  # with coordinates
 
@@ -77,6 +78,7 @@ class Audit:
     result: SurveyResult
     moved: tuple[Moved, ...]
     gauge: tuple[tuple[str, float, float], ...]  # datum, RMS of sX, sY, sZ of points and of photographs, unit
+    notes: tuple[str, ...] = ()  # what reading it changed, and what of it is not used
 
 
 def stated_of(model: Solution) -> Stated:
@@ -87,15 +89,22 @@ def stated_of(model: Solution) -> Stated:
     """
     network, estimate = model.network, model.estimate
     seen = network.image_points
-    projected = project_points(estimate, network.camera, seen.image, estimate.points[seen.point])
-    residuals = projected - seen.xy
+    seen = seen.select(estimate.oriented[seen.image] & estimate.determined[seen.point])
+    outward = estimate.points[seen.point] - estimate.position[seen.image]
+    rays = np.einsum("ki,kij->kj", outward, estimate.rotation[seen.image])
+    residuals = np.empty((len(seen), 2))
+    of_camera = rows_of(network.camera[seen.image], len(estimate.cameras))
+    for camera, rows in zip(estimate.cameras, of_camera, strict=True):
+        residuals[rows] = pixel_from_rays(camera, rays[rows]) - seen.xy[rows]
     residuals = residuals[np.isfinite(residuals).all(axis=1)]
     if not len(residuals):
         raise GeometryError(
             "audit: the model has no image points of oriented photographs and points with coordinates; "
             "poses, cameras or points alone cannot be tested"
         )
-    return Stated(residuals, int(estimate.oriented.sum()), int(estimate.determined.sum()))
+    return Stated(
+        residuals, len(seen) - len(residuals), int(estimate.oriented.sum()), int(estimate.determined.sum())
+    )
 
 
 def survey_of_model(
@@ -119,7 +128,7 @@ def survey_of_model(
     seen = network.image_points
     used = estimate.oriented[seen.image] & estimate.determined[seen.point]
     seen = seen.select(used)
-    oriented, determined = np.flatnonzero(estimate.oriented), np.flatnonzero(estimate.determined)
+    oriented, determined = np.unique(seen.image), np.unique(seen.point)  # those that have image points
     free = free_cameras(network, estimate, fixed)
     photographs = [
         [network.images[i] for i in oriented[network.camera[oriented] == k]] for k in range(len(free))
@@ -192,7 +201,8 @@ def _control(model: Solution) -> KnownPoints | None:
         return None
     names = [model.network.points[j] for j in control.point]
     variance = np.diagonal(control.covariance, axis1=1, axis2=2)
-    return KnownPoints.from_arrays(names, control.xyz, np.sqrt(variance))
+    known = KnownPoints.from_arrays(names, control.xyz, np.sqrt(variance))
+    return replace(known, covariances=control.covariance[:, (0, 0, 1), (1, 2, 2)])
 
 
 def _bars(model: Solution) -> tuple[ScaleBar, ...]:
@@ -202,13 +212,14 @@ def _bars(model: Solution) -> tuple[ScaleBar, ...]:
     return tuple(ScaleBar(names[i], names[j], length, sigma) for i, j, length, sigma in rows)
 
 
-def audit_of(model: Solution, stated: Stated, result: SurveyResult) -> Audit:
+def audit_of(model: Solution, stated: Stated, result: SurveyResult, *, notes: tuple[str, ...] = ()) -> Audit:
     """Return a model beside the adjustment of its image points.
 
     Args:
         model: the model.
         stated: what it states of itself.
         result: the survey of `survey_of_model`.
+        notes: what reading the model changed, and what of it is not used.
     """
     a = result.adjustment
     network, estimate = a.network, a.estimate
@@ -239,7 +250,7 @@ def audit_of(model: Solution, stated: Stated, result: SurveyResult) -> Audit:
         )
         for words, of in datums
     )
-    return Audit(model, stated, result, moved, gauge)
+    return Audit(model, stated, result, moved, gauge, notes)
 
 
 def _moved(kind: str, names: Sequence[str], off: FloatArray, covariance: FloatArray) -> Moved:

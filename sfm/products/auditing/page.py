@@ -88,6 +88,13 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
             (f"Standard deviation of a station, RMS [{unit}]", sigma_stations, stations),
         ],
     )
+    if stated.unseen:
+        yield Paragraph(
+            f"Left out of the model's residuals: {counted(stated.unseen, 'image point')}. The camera does "
+            "not see the point where the model has both."
+        )
+    for words in audit.notes:
+        yield Paragraph(f"{words[:1].upper()}{words[1:]}.")
     if model.network.moment is not None:
         yield Note("The rigs of the model are not kept: its photographs are adjusted one by one.")
     share = a.redundancy / (2 * len(v))
@@ -111,7 +118,7 @@ def _cameras(audit: Audit) -> Iterator[Part]:
         for p, (name, unit) in enumerate(zip(camera.names, camera.units, strict=True)):
             value, start = float(camera.parameters[p]), float(before.parameters[p])
             if not camera.free[p]:
-                held[name] = held.get(name, 0) + bool(value)
+                held[name] = held.get(name, 0) + bool(value or camera.parts[1][p])
                 continue
             times = (value - start) / sigma[p] if sigma[p] > 0 else np.nan
             rows.append(
@@ -142,7 +149,8 @@ def _cameras(audit: Audit) -> Iterator[Part]:
     kept = [f"{name} of {counted(count, 'camera')}" for name, count in held.items() if count]
     if kept:
         yield Paragraph(
-            f"Held at the model's values, by --fix or as few photographs do not tell them: {listed(kept)}."
+            f"Held at the model's values: {listed(kept)}. Few photographs do not tell them, the model holds "
+            "them, or --fix does."
         )
     strong = audit.result.orientation_correlations
     if strong:

@@ -18,7 +18,7 @@ from sfm.judgement.calibrated_cameras import InteriorParameter, interior_paramet
 from sfm.judgement.hypotheses.hypotheses import contradicted_parameters, free_network
 from sfm.judgement.survey_result import SurveyResult
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, angle_between, camera_families, rays_from_pixel
+from sfm.model.camera import Camera, angle_between, camera_families, outermost_reached, rays_from_pixel
 from sfm.model.conventions import BoolArray, FloatArray, IntArray
 from sfm.model.distributions import level_of_single
 from sfm.model.errors import GeometryError
@@ -72,13 +72,13 @@ class CameraCalibration:
 
     @property
     def degrees(self) -> tuple[float, float, float]:
-        """Angles of view along the rows, the columns and the diagonal, degrees; NaN beyond the last ray."""
+        """Angles of view along rows, columns and diagonal, up to where the camera reaches, degrees."""
         width, height = np.array(self.camera.size_px) - 0.5
         x, y = self.camera.principal_point_px - 0.5
         ends = ((-0.5, y), (width, y)), ((x, -0.5), (x, height)), ((-0.5, -0.5), (width, height))
         angles = []
         for pair in ends:
-            rays = rays_from_pixel(self.camera, np.array(pair))
+            rays = rays_from_pixel(self.camera, outermost_reached(self.camera, np.array(pair), self.xy))
             angles.append(float(np.degrees(angle_between(rays[0], rays[1]))))
         return angles[0], angles[1], angles[2]
 
@@ -283,6 +283,7 @@ def _remarks(
                 camera=camera.name,
                 field=(camera.field.rms_px, "px"),
                 p=camera.field.whole,
+                offered=None if camera.splined is None else camera.splined.camera.model,
             )
         elif camera.missing and not told:
             yield remark("parameters_missing", camera=camera.name, parameters=camera.missing)

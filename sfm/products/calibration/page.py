@@ -59,7 +59,7 @@ from sfm.report.page import (
     columns,
     facts,
 )
-from sfm.report.phrases import finer_unit_of, length_of, significant, with_exponent
+from sfm.report.phrases import finer_unit_of, fixed, length_of, significant, with_exponent
 
 HEADLINES: Mapping[Level, str] = {
     "good": "{found}.",
@@ -146,7 +146,7 @@ def _trust(calibration: Calibration) -> Iterator[Part]:
     a = calibration.result.adjustment
     for camera in calibration.cameras:
         width, height = camera.camera.size_px
-        degrees = [f"{angle:.1f}" if np.isfinite(angle) else "over 180" for angle in camera.degrees]
+        degrees = [fixed(angle, 1) for angle in camera.degrees]
         x, y = camera.camera.principal_point_px
         rows: list[tuple[str, str]] = [
             (
@@ -373,7 +373,7 @@ def _model_parts(camera: CameraCalibration, level: float, folder: str) -> Iterat
 def _splined_words(splined: SplinedCalibration, camera: CameraCalibration, folder: str) -> str:
     """Return what a splined camera describes, and how it is used."""
     return (
-        f"A splined camera describes the lens: its surface departs from {camera.camera.model} by "
+        f"A splined camera describes the lens better: its surface departs from {camera.camera.model} by "
         f"{significant(splined.sigma_px)} px, image points determine {splined.determined:.0f} of its "
         f"{int(splined.camera.free.sum())} coefficients, and sigma0 falls to "
         f"{significant(splined.adjustment.sigma0_px)} px. Use it with --camera "

@@ -30,7 +30,14 @@ from sfm.adjustment.quality.correlations import observed_part
 from sfm.adjustment.result import Adjustment
 from sfm.adjustment.solve import predict
 from sfm.model.arguments import checked_arguments
-from sfm.model.camera import Camera, parameter_jacobian, project, ray_jacobian, rays_from_pixel, within_reach
+from sfm.model.camera import (
+    Camera,
+    outermost_reached,
+    parameter_jacobian,
+    project,
+    ray_jacobian,
+    rays_from_pixel,
+)
 from sfm.model.conventions import FloatArray, IntArray, skew
 from sfm.model.network import ImagePoints
 from sfm.products.calibration.projection import (
@@ -46,7 +53,6 @@ TILTS_DEG = (-30.0, 0.0, 30.0)
 PLACES = (1 / 6, 1 / 2, 5 / 6)  # of the middle of the object, in widths and heights of the format
 ROLLS_DEG = (0.0, 90.0)
 MAX_POINTS = 60  # of the object in the search; the weights of the others are theirs
-DIAGONAL = np.linspace(0.0, 0.45, 46)  # from a corner towards the middle; where a fisheye has its first ray
 
 
 @dataclass(frozen=True)
@@ -108,14 +114,8 @@ def corners_of(camera: Camera, seen: FloatArray) -> FloatArray:
         camera: interior orientation.
         seen: its image points, px, (k, 2); see `within_reach`.
     """
-    size = np.array(camera.size_px) - 1.0
-    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size
-    places = []
-    for corner in corners:
-        line = corner + 2 * DIAGONAL[:, None] * (size / 2 - corner)
-        inner = within_reach(camera, line, seen)
-        places.append(line[int(inner.argmax())])
-    return np.array(places)
+    corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * (np.array(camera.size_px) - 1.0)
+    return outermost_reached(camera, corners, seen)
 
 
 def worst_corner(adjustment: Adjustment, camera: int, corners: FloatArray) -> float:

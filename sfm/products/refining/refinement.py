@@ -460,9 +460,7 @@ def free_cameras(network: Network, estimate: Estimate, fixed: tuple[str, ...]) -
     known = dict.fromkeys(name for camera in estimate.cameras for name in camera.names)
     for name in fixed:
         if name not in (*known, *_other_names(tuple(known)), *FOCAL_NAMES):
-            raise GeometryError(
-                f"refine: parameter '{name}' is to be held, expected one of {', '.join(known)}"
-            )
+            raise GeometryError(f"parameter '{name}' is to be held, expected one of {', '.join(known)}")
     photographs = np.bincount(network.camera[estimate.oriented], minlength=len(estimate.cameras))
     return tuple(
         _free_determined(camera, int(count), fixed)

@@ -13,6 +13,7 @@ from adapters.formats.registry import write_content
 from sfm.model.errors import GeometryError
 from sfm.model.estimate import Estimate
 from sfm.model.network import Network
+from sfm.model.observations.control_and_bars import ObjectPoints
 from sfm.model.similarity import fit_similarity
 from sfm.model.solution import Solution
 from sfm.pipeline import run_survey
@@ -21,6 +22,8 @@ from sfm.report.pages import html_of, page_of
 from sfm.survey.inputs.given_values import ScaleBar
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests import commands
+from tests.products.calibration.boards import SIGMA_PX
+from tests.products.calibration.fisheyes import fisheye_board
 from tests.synthetic import make_network, seed_of
 
 NOISE_PX = 0.3
@@ -131,6 +134,38 @@ def test_rigs_that_are_not_kept_are_said() -> None:
     assert "rigs of the model are not kept" in html_of(replace(audit, model=rigged), report="report.html")
 
 
+def test_image_points_that_the_camera_of_a_model_does_not_see_are_counted() -> None:
+    network, truth = network_of("turned away")
+    rotation = truth.rotation.copy()
+    rotation[2] = rotation[2] @ np.diag([-1.0, 1.0, -1.0])
+    model = model_of(network, replace(truth, rotation=rotation))
+    of_turned = int((network.image_points.image == 2).sum())
+    stated = stated_of(model)
+    assert stated.unseen == of_turned > 0
+    assert stated.rms_px == pytest.approx(NOISE_PX, rel=0.2)
+    right = audited(model_of(network, truth))
+    assert "Left out of the model's residuals" not in html_of(right, report="report.html")
+    page = html_of(replace(right, stated=stated), report="report.html")
+    assert f"Left out of the model&#39;s residuals: {of_turned} image points" in page
+
+
+def test_a_fisheye_states_residuals_beyond_90_degrees() -> None:
+    board = fisheye_board(seed_of("audited fisheye"))
+    stated = stated_of(model_of(board.noisy(seed_of("noise of a fisheye")), board.truth))
+    assert stated.unseen == 0 and len(stated.residuals) == len(board.network.image_points)
+    assert stated.rms_px == pytest.approx(SIGMA_PX, rel=0.1)
+
+
+def test_correlated_control_of_a_model_is_kept() -> None:
+    network, truth = network_of("control")
+    C = np.array([[4.0, 1.0, -0.5], [1.0, 3.0, 0.2], [-0.5, 0.2, 5.0]]) * 1e-6
+    control = ObjectPoints(np.arange(4), truth.points[:4], np.tile(C, (4, 1, 1)))
+    model = model_of(network.with_given(control), truth)
+    survey = survey_of_model(model, stated_of(model))
+    assert survey.control is not None
+    np.testing.assert_allclose(survey.control.covariance, control.covariance, rtol=1e-12)
+
+
 def test_poses_alone_are_refused() -> None:
     network, truth = network_of("poses")
     unseen = replace(truth, points=np.full_like(truth.points, np.nan))
@@ -154,3 +189,58 @@ def test_the_command_writes_page_and_report(tmp_path: Path, capsys: pytest.Captu
     assert commands.kolinear("audit", tmp_path / "poses.json", "--out", tmp_path / "none") == 2
     assert "poses, cameras or points alone" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+def test_what_of_a_model_takes_no_part_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network, truth = network_of("rejected")
+    seen, points = network.image_points, list(network.points)
+    content = Content(model_of(replace(network, image_points=seen.select(np.arange(len(seen)) > 1)), truth))
+    write_content(tmp_path / "model", "tables", replace(content, rejected=seen.select(np.arange(2))))
+    assert commands.kolinear("audit", tmp_path / "model", "--out", tmp_path / "audit") == 0
+    words = "ot used of the model: 2 rejected image points"
+    assert words in capsys.readouterr().out
+    assert words in (tmp_path / "audit" / "audit.html").read_text(encoding="utf-8")
+    nvm = [
+        "NVM_V3", "", "1", "a.jpg 1000 1 0 0 0 0 0 0 0 0", "", f"{len(points)}",
+        *(f"{x} {y} {5 + z} 0 0 0 2 0 0 {1000 * x / (5 + z)} {1000 * y / (5 + z)} 0 1 1 1"
+          for x, y, z in truth.points.tolist()), "", "0",
+    ]  # fmt: skip
+    (tmp_path / "twice.nvm").write_text("\n".join(nvm) + "\n", encoding="utf-8")
+    assert commands.kolinear("audit", tmp_path / "twice.nvm", "--out", tmp_path / "twice") in (0, 1)
+
+
+def test_a_result_of_another_model_is_replaced_only_if_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network, truth = network_of("first of two")
+    for folder in ("a", "b"):
+        write_content(tmp_path / folder / "0", "opensfm", Content(model_of(network, truth)))
+    out = tmp_path / "out"
+    assert commands.kolinear("audit", tmp_path / "a" / "0", "--out", out) == 0
+    assert commands.kolinear("audit", tmp_path / "a" / "0", "--out", out) == 0, "the same model again"
+    capsys.readouterr()
+    assert "--overwrite replaces" in commands.refused(capsys, "audit", tmp_path / "b" / "0", "--out", out)
+    assert commands.kolinear("audit", tmp_path / "b" / "0", "--out", out, "--overwrite") == 0
+
+
+def test_photographs_and_points_without_image_points_take_no_part() -> None:
+    network, truth = network_of("without image points")
+    seen = network.image_points
+    part = seen.select((seen.image != 3) & (seen.point != 7))
+    audit = audited(model_of(replace(network, image_points=part), truth))
+    a = audit.result.adjustment
+    assert set(network.images) - set(a.network.images) == {network.images[3]}
+    assert set(network.points) - set(a.network.points) == {network.points[7]}
+    assert (audit.stated.photographs, audit.stated.points) == (8, 40)
+
+
+def test_a_model_that_cannot_be_adjusted_ends_in_a_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One photograph with three image points."""
+    network, truth = network_of("three image points")
+    first = np.flatnonzero(network.image_points.image == 0)[:3]
+    alone = replace(network, image_points=network.image_points.select(first))
+    write_content(tmp_path / "model", "opensfm", Content(model_of(alone, truth)))
+    assert commands.kolinear("audit", tmp_path / "model", "--out", tmp_path / "out") == 1
+    assert "Report:" in capsys.readouterr().out and (tmp_path / "out" / "report.html").is_file()

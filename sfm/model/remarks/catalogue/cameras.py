@@ -132,8 +132,8 @@ ROWS = (
             also=Grade("surely", 0.25, 0.25, also=Grade("off_lenses", error=EXPECTED_SIGMAS)),
         ),
         "The adjusted principal point of camera {camera} is {share:%} of the diagonal from the centre of the "
-        "photograph (standard deviation {sigma:%})[[; that contradicts what lenses have by {off_lenses} "
-        "standard deviations]].",
+        "photograph (standard deviation {sigma:%})[[; with the spread of lenses in general, that is "
+        "{off_lenses} standard deviations]].",
         "a camera that the photographs hardly determine, wrong matches, or cropped photographs",
         "Hold it fixed, give uncropped photographs, or add photographs turned by 90 degrees.",
     ),
@@ -179,8 +179,8 @@ CALIBRATIONS = (
         "The model of camera {camera} is insufficient: residuals depend on the place in the format, by "
         "{field} RMS ({p:<}).",
         "distortion that the model cannot describe, or a sensor that is not flat",
-        "Free the parameters that the page names, use the splined camera that it offers, or choose another "
-        "model with --model.",
+        "Free the parameters that the page names[[, use the {offered} camera that it offers]], or choose "
+        "another model with --model.",
     ),
     Kind(
         "parameters_missing",
