@@ -144,7 +144,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         drawn_progress() as drawn,
         one_blas_thread(),
         plot_process(jobs) as plots,
-        _lock_folder(folder),
+        lock_folder(folder),
         SurveyLog(watch=drawn) as log,
     ):
         log.start(survey.name, survey_file, **origin.written(folder))
@@ -196,7 +196,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
 
 
 @contextmanager
-def _lock_folder(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock the result folder against other runs, and remove partial output of runs that were killed."""
     from sfm.files.open_folders import locked
     from sfm.files.whole_files import remove_leftovers

@@ -10,6 +10,7 @@ import typer
 
 from sfm.cli.options import Overwrite
 from sfm.cli.process import FAILED, compile_first, loading
+from sfm.cli.survey_runs import lock_folder
 from sfm.runtime.faults import working_on
 
 SHOWN = 4  # sections of the page whose tables are printed
@@ -94,6 +95,7 @@ def audit(
         working_on(str(model)),
         drawn_progress() as drawn,
         one_blas_thread(),
+        lock_folder(folder),
         SurveyLog(watch=drawn) as log,
     ):
         log.start(audited.name, model, **origin.written(folder))
