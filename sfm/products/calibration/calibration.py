@@ -283,7 +283,6 @@ def _remarks(
                 camera=camera.name,
                 field=(camera.field.rms_px, "px"),
                 p=camera.field.whole,
-                offered=None if camera.splined is None else camera.splined.camera.model,
             )
         elif camera.missing and not told:
             yield remark("parameters_missing", camera=camera.name, parameters=camera.missing)

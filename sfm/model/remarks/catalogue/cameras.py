@@ -179,8 +179,8 @@ CALIBRATIONS = (
         "The model of camera {camera} is insufficient: residuals depend on the place in the format, by "
         "{field} RMS ({p:<}).",
         "distortion that the model cannot describe, or a sensor that is not flat",
-        "Free the parameters that the page names[[, use the {offered} camera that it offers]], or choose "
-        "another model with --model.",
+        "Free the parameters that the page names, use a splined camera if it offers one, or choose another "
+        "model with --model.",
     ),
     Kind(
         "parameters_missing",
