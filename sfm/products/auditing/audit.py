@@ -31,6 +31,7 @@ from sfm.survey.inputs.survey import CameraSetup, Survey
 
 LEAST_SIGMA_PX = 1e-3  # of image points that a model fits without residuals, as those of a simulation
 MIN_FIXED = 3  # points that a datum needs
+DATUM = 7  # coordinates, angles and scale that image points do not tell
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Stated:
     unseen: int  # further image points, of points that their camera does not see where the model has both
     photographs: int  # with an orientation
     points: int  # with coordinates
+    redundancy: int  # of its image points, at least 1
 
     @property
     def rms_px(self) -> float:
@@ -54,8 +56,10 @@ class Stated:
 
     @property
     def sigma_px(self) -> float:
-        """Robust standard deviation of a coordinate, px."""
-        return max(MAD_TO_SIGMA * float(np.median(np.abs(self.residuals))), LEAST_SIGMA_PX)
+        """Robust standard deviation of a coordinate, px: residuals are smaller, by the root of its share."""
+        share = min(1.0, self.redundancy / self.residuals.size)
+        spread = MAD_TO_SIGMA * float(np.median(np.abs(self.residuals)))
+        return max(spread / float(np.sqrt(share)), LEAST_SIGMA_PX)
 
 
 @dataclass(frozen=True)
@@ -102,8 +106,13 @@ def stated_of(model: Solution) -> Stated:
             "audit: the model has no image points of oriented photographs and points with coordinates; "
             "poses, cameras or points alone cannot be tested"
         )
+    unknowns = 6 * len(np.unique(seen.image)) + 3 * len(np.unique(seen.point)) - DATUM
     return Stated(
-        residuals, len(seen) - len(residuals), int(estimate.oriented.sum()), int(estimate.determined.sum())
+        residuals,
+        len(seen) - len(residuals),
+        int(estimate.oriented.sum()),
+        int(estimate.determined.sum()),
+        max(2 * len(seen) - unknowns, 1),
     )
 
 
@@ -112,7 +121,8 @@ def survey_of_model(
 ) -> Survey:
     """Return the survey of a model's image points, with its cameras, photographs and points as start values.
 
-    The standard deviation of the image points is that of the model's residuals, unless they state their own.
+    The standard deviation of the image points is that of the model's residuals, unless they or the given
+    survey state their own.
 
     Args:
         model: the model.
@@ -164,6 +174,11 @@ def survey_of_model(
     )
     if given is None:
         return survey
+    own = {
+        name: value
+        for name, value in (("sigma_px", stated.sigma_px), ("reject", "tau"))
+        if name not in given.adjust.model_fields_set
+    }
     return replace(
         survey,
         unit=given.unit,
@@ -172,7 +187,7 @@ def survey_of_model(
         tables=given.tables,
         equipment=given.equipment,
         datum=given.datum,
-        adjust=given.adjust.model_copy(update={"sigma_px": stated.sigma_px, "reject": "tau"}),
+        adjust=given.adjust.model_copy(update=own),
     )
 
 

@@ -63,6 +63,7 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
     stated, result, model = audit.stated, audit.result, audit.model
     a = result.adjustment
     v = a.residuals[~a.rejected]
+    lost = len(stated.residuals) + stated.unseen - len(a.rejected)
     accepted = f"{len(v)} ({counted(int(a.rejected.sum()), 'gross error')} rejected)"
     covariances = (model.point_covariance, model.position_covariance)
     sigma_points, sigma_stations = (
@@ -80,7 +81,8 @@ def _figures(audit: Audit, unit: str) -> Iterator[Part]:
         [
             ("Photographs", stated.photographs, len(a.network.images)),
             ("Points", stated.points, len(a.network.points)),
-            ("Image points", len(stated.residuals), accepted),
+            ("Image points", len(stated.residuals) + stated.unseen, accepted),
+            *([("Image points of points or photographs that are left out", "", lost)] if lost else []),
             ("RMS residual per coordinate [px]", general(stated.rms_px, 4), general(a.rms_px, 4)),
             ("Mean length of a residual [px]", general(stated.mean_length_px, 4), general(mean, 4)),
             ("Standard deviation of an image coordinate [px]", "not stated", general(a.sigma0_px, 4)),

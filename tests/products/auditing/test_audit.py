@@ -20,6 +20,7 @@ from sfm.pipeline import run_survey
 from sfm.products.auditing.audit import Audit, audit_of, stated_of, survey_of_model
 from sfm.report.pages import html_of, page_of
 from sfm.survey.inputs.given_values import ScaleBar
+from sfm.survey.inputs.settings import AdjustSettings
 from sfm.survey.inputs.survey import CameraSetup, Survey
 from tests import commands
 from tests.products.calibration.boards import SIGMA_PX
@@ -94,6 +95,20 @@ def test_a_survey_gives_scale_to_a_model() -> None:
     a = audited(model, given=given).result.adjustment
     placing = fit_similarity(a.estimate.points, truth.points)
     assert placing.scale == pytest.approx(1.0, abs=1e-3)
+    stated = stated_of(model)
+    assert survey_of_model(model, stated, given=given).adjust.sigma_px == stated.sigma_px
+    own = replace(given, adjust=AdjustSettings(sigma_px=0.2, reject="none"))
+    adjust = survey_of_model(model, stated, given=own).adjust
+    assert (adjust.sigma_px, adjust.reject) == (0.2, "none")
+
+
+def test_the_precision_of_image_points_follows_from_residuals_and_redundancy() -> None:
+    """Few image points a point: residuals of the optimum are far smaller than the noise."""
+    network, truth = make_network(seed_of("few rays"), images=3, points=300, noise_px=NOISE_PX, free=())
+    settled = audited(model_of(network, truth)).result.adjustment
+    stated = stated_of(model_of(settled.network, settled.estimate))
+    assert stated.rms_px < 0.8 * NOISE_PX
+    assert stated.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
 
 
 def test_standard_deviations_depend_on_the_datum() -> None:
