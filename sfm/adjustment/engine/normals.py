@@ -144,7 +144,9 @@ def _parts(layout: Unknowns, terms: Terms, b: Blocks) -> Parts:
         g[first + fixed] = 0.0
     diagonal = np.concatenate([np.diagonal(b.U, axis1=1, axis2=2).ravel(), corner.diagonal()])
     scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).tiny))
-    return Parts(border, corner, coupled, g - b.Yy, scale)
+    with np.errstate(invalid="ignore"):  # equations that are not finite are refused when they are solved
+        g -= b.Yy
+    return Parts(border, corner, coupled, g, scale)
 
 
 def point_step(equations: Equations, reduced_step: FloatArray, layout: Unknowns) -> FloatArray:
