@@ -18,6 +18,7 @@ from sfm.model.estimate import Estimate
 from sfm.model.network import Network
 from sfm.pipeline import run_survey
 from sfm.report.findings import Findings
+from sfm.report.phrases import fixed
 from sfm.report.survey_report import text_report
 from sfm.report.tables.csv_files import write_tables
 from sfm.survey.inputs.given_values import KnownPoints
@@ -151,3 +152,8 @@ def residuals_of(network: Network, estimate: Estimate) -> FloatArray:
         for i, j in zip(seen.image, seen.point, strict=True)
     ]
     return np.array(xy) - seen.xy
+
+
+def test_a_number_that_is_not_known_is_not_written() -> None:
+    written = [fixed(value, 1) for value in (2.04, -0.01, float("nan"), float("inf"))]
+    assert written == ["2.0", "0.0", "not known", "not known"]
