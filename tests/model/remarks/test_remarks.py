@@ -472,8 +472,7 @@ def test_causes_and_remedies_have_the_parts_of_their_sentences() -> None:
     for name in KINDS:
         sentence, *others = texts_of(name)
         always = {field for field, _ in FIELD.findall(OPTIONAL.sub("", sentence))}
-        needed = (OPTIONAL.sub("", text) for text in others)
-        assert {field for text in needed for field, _ in FIELD.findall(text)} <= always, name
+        assert {field for text in others for field, _ in FIELD.findall(text)} <= always, name
 
 
 COUNTED = re.compile(rf" (?:common |planned |coded |stable |control )?(?:{NOUNS})\b")
