@@ -191,7 +191,7 @@ def describe_view(findings: Findings, name: str) -> str:
         if lens.camera == name:
             cx, cy = (fixed(place, 1) for place in cameras[name].principal_point_px - 0.5)
             f = fixed(cameras[name].c_px, 1)
-            in_px = f"f {f} px, cx {cx} px, cy {cy} px; " if cameras[name].in_mm else ""
+            in_px = f"f {f} px, cx {cx} px, cy {cy} px as OpenCV counts; " if cameras[name].in_mm else ""
             across, up, _ = (fixed(angle, 1) for angle in lens.field_of_view_deg)
             return f"{in_px}field of view {across} x {up} deg"
     return ""
