@@ -232,7 +232,7 @@ def test_the_head_of_a_calibration_has_f_and_the_principal_point_in_px() -> None
     assert cy == pytest.approx(749.5 - camera.value("y0") / 0.005, abs=0.06)
     edges = project(camera, np.zeros(3), np.eye(3), np.array([[np.tan(np.radians(across / 2)), 0, -1]]))
     assert abs(edges[0, 0] - cx) == pytest.approx(1000, rel=0.02) and up < across
-    assert view in text_report(findings) and view in " ".join(html_of(findings).split())
+    assert all(view in " ".join(page.split()) for page in (text_report(findings), html_of(findings)))
     assert describe_view(findings, "another camera") == ""
 
 
