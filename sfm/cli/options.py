@@ -103,3 +103,8 @@ Frames = Annotated[
         "as many as neighbours need to have points in common]",
     ),
 ]
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """Return the names of an option that are separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())

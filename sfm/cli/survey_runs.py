@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sfm.judgement.survey_result import SurveyResult
     from sfm.model.remarks.remark import Remark
     from sfm.products.drafting.draft import Draft
+    from sfm.report.output import SurveyLog
 
 RINGS_PICTURE = "-rings.png"  # after the name of a drafted survey file
 SURVEY_FILE = "survey.toml"  # name in a folder of photographs
@@ -67,7 +68,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     """Run a survey, write and print its result, and return the result folder."""
     begun = time.perf_counter()
     with loading():
-        from sfm.cli.console import print_result, print_unfinished
+        from sfm.cli.console import print_result
         from sfm.files.globs import nearest_name
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.library.results import read_result
@@ -81,7 +82,6 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
             folder_name,
             refuse_other_origin,
             write_result,
-            write_unfinished,
         )
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
@@ -93,7 +93,6 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         from sfm.survey.inputs.survey import survey_of_file, with_calibration
         from sfm.survey.inputs.survey_file import read_survey_file
         from sfm.survey.measuring.measured_store import MeasuredStore
-        from sfm.survey.unfinished import UnfinishedSurveyError
 
     if not survey_file.exists():
         raise KolinearError(f"{survey_file}: neither a survey file nor a folder{nearest_name(survey_file)}")
@@ -148,7 +147,7 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
         SurveyLog(watch=drawn) as log,
     ):
         log.start(survey.name, survey_file, **origin.written(folder))
-        try:
+        with reporting_unfinished(folder, log, jobs=workers):
             result = run_survey(
                 survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
             )
@@ -157,17 +156,6 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
                 result = run_survey(
                     survey, images_dir=images, jobs=workers, others=others, store=store, progress=log
                 )
-        except UnfinishedSurveyError as error:
-            reached = error.reached
-            page = write_unfinished(
-                reached,
-                folder,
-                finish=lambda part: log.close_into(part, reached),
-                jobs=workers,
-                progress=log,
-            )
-            print_unfinished(reached, page)
-            raise SystemExit(FAILED) from error
         findings = findings_of(result)
 
         def finish(part: Path) -> None:
@@ -193,6 +181,33 @@ def run_survey_file(survey_file: Path, options: RunOptions) -> Path:
     if not dependable:
         raise SystemExit(FAILED)
     return folder
+
+
+@contextmanager
+def reporting_unfinished(folder: Path, log: SurveyLog, *, jobs: int = 1) -> Iterator[None]:
+    """Write and print how far a survey came that a stage could not finish.
+
+    Args:
+        folder: of the result.
+        log: of the survey; it ends in the folder.
+        jobs: photographs drawn at the same time.
+
+    Raises:
+        SystemExit: the survey was not finished.
+    """
+    from sfm.cli.console import print_unfinished
+    from sfm.report.output import write_unfinished
+    from sfm.survey.unfinished import UnfinishedSurveyError
+
+    try:
+        yield
+    except UnfinishedSurveyError as error:
+        reached = error.reached
+        page = write_unfinished(
+            reached, folder, finish=lambda part: log.close_into(part, reached), jobs=jobs, progress=log
+        )
+        print_unfinished(reached, page)
+        raise SystemExit(FAILED) from error
 
 
 @contextmanager

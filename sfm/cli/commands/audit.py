@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from sfm.cli.options import Overwrite
-from sfm.cli.process import FAILED, compile_first, loading
-from sfm.cli.survey_runs import lock_folder
+from sfm.cli.options import Overwrite, names_in
+from sfm.cli.process import compile_first, loading
+from sfm.cli.survey_runs import lock_folder, reporting_unfinished
 from sfm.runtime.faults import working_on
 
 SHOWN = 4  # sections of the page whose tables are printed
@@ -56,7 +56,7 @@ def audit(
     with loading():
         from adapters.formats.content import ALL, losses
         from adapters.formats.registry import read_content
-        from sfm.cli.console import exit_by, print_unfinished, print_verdict
+        from sfm.cli.console import exit_by, print_verdict
         from sfm.files.open_folders import refuse_foreign_folder
         from sfm.model.display import listed
         from sfm.pipeline import run_survey
@@ -68,21 +68,18 @@ def audit(
             folder_name,
             refuse_other_origin,
             write_result,
-            write_unfinished,
         )
         from sfm.report.pages import page_of, texts_of
         from sfm.runtime.progress_bar import drawn_progress
         from sfm.runtime.threads import cores, one_blas_thread
         from sfm.survey.inputs.survey import read_survey
-        from sfm.survey.unfinished import UnfinishedSurveyError
 
     with working_on(str(model)):
         content = read_content(model, from_format)
         stated_model = replace(content.result, name=model.resolve().name)  # of "." too
         stated = stated_of(stated_model)
-        held = tuple(name.strip() for name in fix.split(",") if name.strip())
         given = None if survey is None else read_survey(survey)
-        audited = survey_of_model(stated_model, stated, fixed=held, given=given)
+        audited = survey_of_model(stated_model, stated, fixed=names_in(fix), given=given)
     left = [f"{count} {kind.words}" for kind, count in losses(content, ALL.difference(NOT_USED))]
     notes = (*content.notes, *([f"not used of the model: {listed(left)}"] if left else []))
     folder = out or Path("out") / f"{folder_name(stated_model.name)}_audit"
@@ -99,15 +96,8 @@ def audit(
         SurveyLog(watch=drawn) as log,
     ):
         log.start(audited.name, model, **origin.written(folder))
-        try:
+        with reporting_unfinished(folder, log):
             result = run_survey(audited, jobs=cores(), progress=log)
-        except UnfinishedSurveyError as error:
-            reached = error.reached
-            report = write_unfinished(
-                reached, folder, finish=lambda part: log.close_into(part, reached), progress=log
-            )
-            print_unfinished(reached, report)
-            raise SystemExit(FAILED) from error
         findings = findings_of(result)
         page = page_of(audit_of(stated_model, stated, findings.result, notes=notes), report="report.html")
 

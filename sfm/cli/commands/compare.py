@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import names_in
 from sfm.cli.process import loading
 from sfm.model.display import counted
 from sfm.runtime.faults import working_on
@@ -83,8 +84,7 @@ def compare(
         second = read_comparable(b, b_format)
     if first.name == second.name:
         first, second = replace(first, name=str(a)), replace(second, name=str(b))
-    names = tuple(name.strip() for name in control.split(",") if name.strip())
-    comparison = compare_results(first, second, align=align, control=names)
+    comparison = compare_results(first, second, align=align, control=names_in(control))
     place = {name: j for j, name in enumerate(first.network.points)}
     xyz = first.estimate.points[[place[name] for name in comparison.points]]
     page = write_page(comparison, out, xyz=xyz)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sfm.cli.options import names_in
 from sfm.cli.process import loading
 from sfm.model.errors import SurveyFileError
 from sfm.runtime.faults import working_on
@@ -81,14 +82,14 @@ def epochs(
     refuse_foreign_folder(out)
     if len(results) < 2:
         raise SurveyFileError(f"epochs: {len(results)} given, expected 2 or more")
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, tuple[str, ...]] = {}
     for text in group or ():
         name, equals, points = (part.strip() for part in text.partition("="))
         if not (name and equals and points):
             raise SurveyFileError(f"--group {text}: expected a name and its points, such as pier=P*,17")
         if name in groups:
             raise SurveyFileError(f"--group {name} is given twice")
-        groups[name] = _split_names(points)
+        groups[name] = names_in(points)
     for k, path in enumerate(results):
         if path.resolve() in [earlier.resolve() for earlier in results[:k]]:
             raise SurveyFileError(f"epochs: {path} is given twice")
@@ -98,7 +99,7 @@ def epochs(
     with working_on(" ".join(map(str, results))):
         series = analyse_epochs(
             given,
-            reference=_split_names(reference),
+            reference=names_in(reference),
             groups=groups,
             model=model,
             alpha=FALSE_ALARM if alpha is None else alpha,
@@ -129,7 +130,3 @@ def _read_epoch(path: Path) -> Epoch:
         given = read_given(folder, result.network)
     name = folder.resolve().name
     return Epoch(name, result, given.bars, given.control, given.interior, given.sigma0, given.sigma0_px)
-
-
-def _split_names(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]

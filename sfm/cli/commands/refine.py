@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sfm.cli.options import names_in
 from sfm.cli.process import FAILED, compile_first, loading
 from sfm.runtime.faults import working_on
 
@@ -103,7 +104,7 @@ def refine(
             RefineSettings(
                 window,
                 min_correlation,
-                fixed=tuple(name.strip() for name in fix.split(",") if name.strip()),
+                fixed=names_in(fix),
                 masks_dir=masks,
                 false_alarm=(AdjustSettings() if given is None else given.adjust).false_alarm,
             ),

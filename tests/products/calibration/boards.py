@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm.model.camera import Camera, camera_from_values, project
-from sfm.model.conventions import FloatArray
+from sfm.model.conventions import FloatArray, IntArray
 from sfm.model.estimate import Estimate
 from sfm.model.network import ImagePoints, Network, rows_of
 
@@ -48,6 +48,22 @@ def facing(tilt: FloatArray, roll: float) -> FloatArray:
     return np.asarray(x @ y @ z)
 
 
+def board_network(
+    image: list[IntArray], point: list[IntArray], xy: list[FloatArray], *, points: int
+) -> Network:
+    """Return the network of a board from the image points of each photograph, without control."""
+    k = sum(map(len, point))
+    return Network(
+        tuple(f"photo{i:03}" for i in range(len(image))),
+        np.zeros(len(image), dtype=np.int64),
+        tuple(f"p{j}" for j in range(points)),
+        ImagePoints(
+            np.concatenate(image), np.concatenate(point), np.vstack(xy),
+            np.tile(SIGMA_PX**2 * np.eye(2), (k, 1, 1)),
+        ),
+    )  # fmt: skip
+
+
 def simulated_board(
     rng: np.random.Generator,
     *,
@@ -79,19 +95,9 @@ def simulated_board(
         image.append(np.full(len(seen), i))
         point.append(seen)
         xy.append(pixels[seen])
-    k = sum(map(len, point))
-    names = tuple(f"p{j}" for j in range(len(points)))
-    network = Network(
-        tuple(f"photo{i:03}" for i in range(photographs)),
-        np.zeros(photographs, dtype=np.int64),
-        names,
-        ImagePoints(
-            np.concatenate(image), np.concatenate(point), np.vstack(xy),
-            np.tile(SIGMA_PX**2 * np.eye(2), (k, 1, 1)),
-        ),
-    )  # fmt: skip
+    network = board_network(image, point, xy, points=len(points))
     if fixed:
-        network = network.with_control(names, board_points(), 0.0)
+        network = network.with_control(network.points, board_points(), 0.0)
     truth = Estimate((camera,), np.array(position), np.array(rotation), points)
     return SimulatedBoard(network, truth)
 

@@ -7,9 +7,8 @@ import numpy as np
 from sfm.model.camera import Camera, camera_from_values, project
 from sfm.model.conventions import FloatArray
 from sfm.model.estimate import Estimate
-from sfm.model.network import ImagePoints, Network
 from sfm.orientation.image_rays import axes_along
-from tests.products.calibration.boards import SIGMA_PX, SimulatedBoard, board_points
+from tests.products.calibration.boards import SimulatedBoard, board_network, board_points
 
 REACH_DEG = 95.0  # half the field of view
 FISHEYE = camera_from_values(
@@ -50,17 +49,8 @@ def fisheye_board(
         image.append(np.full(len(seen), i))
         point.append(seen)
         xy.append(pixels[seen])
-    names = tuple(f"p{j}" for j in range(len(points)))
-    k = sum(map(len, point))
-    network = Network(
-        tuple(f"photo{i:03}" for i in range(photographs)),
-        np.zeros(photographs, dtype=np.int64),
-        names,
-        ImagePoints(
-            np.concatenate(image), np.concatenate(point), np.vstack(xy),
-            np.tile(SIGMA_PX**2 * np.eye(2), (k, 1, 1)),
-        ),
-    ).with_control(names, points, 0.0)  # fmt: skip
+    network = board_network(image, point, xy, points=len(points))
+    network = network.with_control(network.points, points, 0.0)
     return SimulatedBoard(network, Estimate((camera,), np.array(position), np.array(rotation), points))
 
 

@@ -24,7 +24,13 @@ ALL = 'free = ["c", "x0", "y0", "K1", "K2", "P1", "P2"]'
 
 
 def write_board_survey(
-    folder: Path, board: SimulatedBoard, *, name: str = "board", free: str = ALL, noise: bool = True
+    folder: Path,
+    board: SimulatedBoard,
+    *,
+    name: str = "board",
+    camera: str = CAMERA,
+    free: str = ALL,
+    noise: bool = True,
 ) -> Path:
     """Write the survey of a simulated board, with errors that depend on the name; return its file."""
     folder.mkdir(parents=True)
@@ -40,5 +46,5 @@ def write_board_survey(
     given += [f"p{j},{x!r},{y!r},{z!r}" for j, (x, y, z) in enumerate(board_points().tolist())]
     (folder / "control.csv").write_text("\n".join(given) + "\n", encoding="utf-8")
     path = folder / "survey.toml"
-    path.write_text(observed_text(name, "mm", CAMERA + free, further=GIVEN), encoding="utf-8")
+    path.write_text(observed_text(name, "mm", camera + free, further=GIVEN), encoding="utf-8")
     return path

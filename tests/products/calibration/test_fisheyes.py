@@ -15,9 +15,8 @@ from sfm.orientation.image_rays import axes_along
 from sfm.products.calibration import projection_uncertainty
 from tests.commands import kolinear
 from tests.products.calibration.fisheyes import FISHEYE, fisheye_board, off_axis
-from tests.products.calibration.surveys import GIVEN
+from tests.products.calibration.surveys import write_board_survey
 from tests.products.calibration.test_projection import projected
-from tests.surveys import observed_text
 from tests.synthetic import perturb, seed_of
 
 MIDDLE = FISHEYE.principal_point_px - 0.5
@@ -27,25 +26,12 @@ PLACES = MIDDLE + np.array([[0, 0], [300, 0], [0, -300], [-578, 0], [0, 578], [4
 
 def write_fisheye_survey(folder: Path, name: str, *, c_mm: float) -> Path:
     """Write the survey of a board in photographs of a fisheye; only c is known roughly."""
-    folder.mkdir(parents=True)
-    board = fisheye_board(seed_of("survey of a fisheye"))
-    network = board.noisy(seed_of(name))
-    seen = network.image_points
-    rows = ["image,point,x_px,y_px,sx_px,sy_px"]
-    rows += [
-        f"{network.images[i]},{network.points[j]},{x!r},{y!r},0.1,0.1"
-        for i, j, (x, y) in zip(seen.image, seen.point, seen.xy.tolist(), strict=True)
-    ]
-    (folder / "image_points.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    given = [f"p{j},{x!r},{y!r},{z!r}" for j, (x, y, z) in enumerate(board.truth.points.tolist())]
-    (folder / "control.csv").write_text("\n".join(["id,X,Y,Z", *given]) + "\n", encoding="utf-8")
     camera = (
         'name = "cam"\nsize_px = [1200, 1200]\npixel_mm = [0.005, 0.005]\nmodel = "opencv_fisheye"\n'
         f'c_mm = {c_mm}\nfree = ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]\n'
     )
-    path = folder / "survey.toml"
-    path.write_text(observed_text(name, "mm", camera, further=GIVEN), encoding="utf-8")
-    return path
+    board = fisheye_board(seed_of("survey of a fisheye"))
+    return write_board_survey(folder, board, name=name, camera=camera, free="")
 
 
 def test_points_beyond_90_degrees_are_adjusted() -> None:
