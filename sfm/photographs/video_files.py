@@ -72,6 +72,8 @@ class Video:
     def frames(self) -> Iterator[Frame]:
         """Decode all frames; those that are damaged are left out.
 
+        Damage that is valid code, such as some zeros, a decoder cannot know.
+
         Raises:
             PhotographError: there is no frame, or frames are too large.
         """
@@ -98,6 +100,8 @@ class Video:
                 packet = next(packets, None)
                 if packet is None:
                     return
+                if packet.is_corrupt:  # a truncated one, whose error a decoder with threads loses
+                    self.damaged_s.append(self.times_s[-1] if self.times_s else 0.0)
                 decoded_frames = packet.decode()
             except (av.FFmpegError, EOFError, ValueError):
                 whole = False  # what follows builds on what is missing, until a frame that stands alone
@@ -203,6 +207,7 @@ def opened_video(path: Path) -> Iterator[Video]:
             raise PhotographError(f"{path.name}: has no video, only {content}; give a file with pictures")
         stream = pictures[0]
         stream.thread_type = "AUTO"
+        stream.codec_context.options = {"err_detect": "explode"}  # an error, not a frame made up
         stated = float(container.duration or 0) / MICROSECONDS
         if stream.duration and stream.time_base:
             stated = float(stream.duration * stream.time_base)
