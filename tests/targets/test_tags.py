@@ -28,7 +28,15 @@ from sfm.products.rendering.scene import (
     square_tag,
 )
 from sfm.survey.inputs.survey import read_survey
-from sfm.targets.codes.tags import DICTIONARIES, corner_name, find_tags, tag_family, tag_modules
+from sfm.targets.codes.tags import (
+    DICTIONARIES,
+    LARGEST_DICTIONARIES,
+    corner_name,
+    find_tags,
+    read_dictionaries,
+    tag_family,
+    tag_modules,
+)
 from sfm.targets.detect import find_targets
 from sfm.targets.outlines import Flag
 from tests.surveys import C_MM, PIXEL_MM, SIZE_PX, stations
@@ -403,6 +411,36 @@ def test_no_tag_is_read_from_print_and_boxes(name: str) -> None:
         picture[y : y + h, x : x + w] = rng.integers(0, 255)
     found = find_targets(cv2.GaussianBlur(picture, (0, 0), 0.8), polarity="auto", codes=name)
     assert (found.code < 0).all()
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize("name", LARGEST_DICTIONARIES)
+def test_tags_of_all_dictionaries_are_read_together(name: str, inverted: bool) -> None:
+    family, rng = tag_family(name), np.random.default_rng(seed_of(name))
+    numbers = rng.choice(family.count, 4, replace=False)
+    picture, first = np.full((300, 1000), 220, np.uint8), {}
+    for k, number in enumerate(numbers):
+        tag = np.where(np.kron(tag_modules(family, int(number)), np.ones((16, 16))) > 0, 30, 220)
+        tag = np.rot90(tag, -k)  # clockwise
+        left = 60 + 240 * k
+        picture[60 : 60 + len(tag), left : left + len(tag)] = tag
+        far = len(tag) - 1
+        first[int(number)] = np.array([left, 60]) + [(0, 0), (far, 0), (far, far), (0, far)][k]
+    picture = cv2.GaussianBlur(picture, (0, 0), 1.0)
+    read = read_dictionaries(255 - picture if inverted else picture)
+    assert name in read
+    corners = {int(number): quad[0] for number, quad in zip(*read[name], strict=True)}
+    for number, corner in first.items():
+        np.testing.assert_allclose(corners[number], corner, atol=2.5)
+    assert sum(len(number) for number, _ in read.values()) <= 5, "a code of another may agree by chance"
+
+
+def test_squares_of_a_board_are_no_tags() -> None:
+    squares = np.where(np.indices((9, 12)).sum(axis=0) % 2, 30, 220).astype(np.uint8)
+    board = cv2.copyMakeBorder(
+        np.kron(squares, np.ones((50, 50), np.uint8)), 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=220
+    )
+    assert not read_dictionaries(cv2.GaussianBlur(board, (0, 0), 1.0))
 
 
 def test_names_of_corners() -> None:

@@ -454,7 +454,7 @@ def _look(grey: AnyArray) -> _Look:
     circles = max(map(len, many))
     if any(map(_shows_rings, (small, middle), many)):  # read faster than tags of a whole photograph
         return _Look(True, circles)
-    for picture in (small, grey):
+    for picture in (grey, small):  # OpenCV may see the edges of large or blurred ones in the small one only
         tags = read_dictionaries(picture)
         if any(len(number) >= MIN_CODES for number, _ in tags.values()):
             return _Look(True, 0, tags)
